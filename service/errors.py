@@ -1,0 +1,99 @@
+"""Everything that can go wrong and is worth telling a caller about.
+
+    SplatfixError
+      |-- BadInput           the caller's mistake
+      |     |-- InvalidImage, InvalidIntrinsics, InvalidPrior, InvalidOptions, InvalidRequest
+      |     `-- UnknownName  (a plug-in, scene or modification that does not exist; lists what does)
+      |-- SceneError
+      |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
+      |-- JobNotFound, JobNotReady
+      |-- QueueFull          too much work is waiting; try again later
+      |-- BackendMissing     a package or device that a plug-in needs is not here
+      `-- EstimatorFault     an estimator broke its contract (our mistake)
+
+"Not localized" is a result, never an exception. Each class has a stable `code`, which is part of the API.
+"""
+
+from __future__ import annotations
+
+
+class SplatfixError(Exception):
+    """An error with a stable code, the place it concerns and a way to mend it."""
+
+    code = "error"
+
+    def __init__(self, message: str, *, where: str = "", hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.where = where
+        """Field, file or element the error is about; empty if there is no such place."""
+        self.hint = hint
+        """What the caller can do; empty if the message says it."""
+
+    def __str__(self) -> str:
+        text = f"{self.where}: {self.message}" if self.where else self.message
+        return f"{text} {self.hint}" if self.hint else text
+
+
+class BadInput(SplatfixError):
+    code = "bad_input"
+
+
+class InvalidRequest(BadInput):
+    code = "invalid_request"
+
+
+class InvalidImage(BadInput):
+    code = "invalid_image"
+
+
+class InvalidIntrinsics(BadInput):
+    code = "invalid_intrinsics"
+
+
+class InvalidPrior(BadInput):
+    code = "invalid_prior"
+
+
+class InvalidOptions(BadInput):
+    code = "invalid_options"
+
+
+class UnknownName(BadInput):
+    code = "unknown_name"
+
+
+class SceneError(SplatfixError):
+    code = "scene_error"
+
+
+class SceneNotFound(SceneError):
+    code = "scene_not_found"
+
+
+class UnsupportedFormat(SceneError):
+    code = "unsupported_format"
+
+
+class CorruptScene(SceneError):
+    code = "corrupt_scene"
+
+
+class JobNotFound(SplatfixError):
+    code = "job_not_found"
+
+
+class JobNotReady(SplatfixError):
+    code = "job_not_ready"
+
+
+class QueueFull(SplatfixError):
+    code = "queue_full"
+
+
+class BackendMissing(SplatfixError):
+    code = "backend_missing"
+
+
+class EstimatorFault(SplatfixError):
+    code = "estimator_fault"

@@ -1,0 +1,3 @@
+from service.plugins import PluginFolder
+
+ESTIMATORS = PluginFolder("service.estimators", "run")

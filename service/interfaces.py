@@ -1,0 +1,122 @@
+"""The protocols behind which renderers, matchers and estimators are exchanged. numpy only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int32, UInt8
+
+from service.types import Camera, GaussianScene, IterationRecord, Query
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One render. float32."""
+
+    rgb: Float32[np.ndarray, "h w 3"]
+    """Over the scene's background, sRGB-encoded, 0..1 (a bright scene may exceed 1)."""
+    alpha: Float32[np.ndarray, "h w"]
+    depth: Float32[np.ndarray, "h w"]
+    """Expected z-depth: weighted mean over the ray; 0 where alpha is 0. Averages translucent surfaces."""
+    median_depth: Float32[np.ndarray, "h w"]
+    """z-depth of the Gaussian at which transmittance falls below one half; 0 where it never does."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneGradients:
+    """d loss / d parameter, for the activated parameters of `GaussianScene`."""
+
+    means: Float32[np.ndarray, "n 3"]
+    quats: Float32[np.ndarray, "n 4"]
+    """Of the quaternion as stored, through its normalization: tangential to the unit sphere."""
+    scales: Float32[np.ndarray, "n 3"]
+    opacities: Float32[np.ndarray, "n"]
+    sh: Float32[np.ndarray, "n k 3"]
+    means2d: Float32[np.ndarray, "n"]
+    """Norm of the gradient with respect to the projected centre, in pixels; 0 for unseen Gaussians."""
+
+
+class Rasterizer(Protocol):
+    """Renders ONE scene: upload and packing have a home. Safe to call from several threads."""
+
+    name: str
+
+    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+        """Render several cameras; independent ones may use idle cores."""
+        ...
+
+    def pose_gradient(
+        self,
+        camera: Camera,
+        d_rgb: Float32[np.ndarray, "h w 3"],
+        d_depth: Float32[np.ndarray, "h w"] | None = None,
+        d_alpha: Float32[np.ndarray, "h w"] | None = None,
+    ) -> Float64[np.ndarray, "6"]:
+        """d loss / d twist at 0, where world_from_camera becomes world_from_camera @ exp(twist).
+
+        The twist is (rotation, translation) in the camera frame. `d_rgb` is d loss / d rgb, and so on; `d_depth`
+        refers to the expected depth.
+        """
+        ...
+
+    def scene_gradients(
+        self,
+        camera: Camera,
+        d_rgb: Float32[np.ndarray, "h w 3"],
+        d_depth: Float32[np.ndarray, "h w"] | None = None,
+        d_alpha: Float32[np.ndarray, "h w"] | None = None,
+    ) -> SceneGradients:
+        """d loss / d every parameter of the scene."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Local features of one image."""
+
+    points_px: Float32[np.ndarray, "n 2"]
+    """Centre of the top-left pixel = (0.5, 0.5)."""
+    scores: Float32[np.ndarray, "n"]
+    """Descending."""
+    descriptors: Float32[np.ndarray, "n d"]
+    """Unit length: the dot product is the similarity."""
+
+
+class Matcher(Protocol):
+    """Finds local features and pairs them. Safe to call from several threads."""
+
+    name: str
+
+    def extract(self, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
+        """Return the `limit` strongest features; fewer, or none, if the image has no more."""
+        ...
+
+    def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
+        """Return pairs of indices into `a` and `b`; each index at most once."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Tools:
+    """What an estimator works with; bound to one scene and one job."""
+
+    scene: GaussianScene
+    rasterizer: Rasterizer
+    matcher: Matcher
+    rng: np.random.Generator
+    """Seeded by the job's seed: the only source of randomness."""
+    prepared: Any = None
+    """What the estimator's own `prepare` made for this scene, shared by all jobs; None if it has none."""
+
+
+class Estimator(Protocol):
+    """A plain generator function satisfies it. The last record's pose is the answer.
+
+    It yields at least one record; long stages yield per hypothesis, so that budget and cancel take effect. It
+    never prints, never sees the truth, and cleans up in `finally`.
+    """
+
+    def __call__(self, query: Query, tools: Tools, options: Any) -> Iterator[IterationRecord]: ...

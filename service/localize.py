@@ -1,0 +1,201 @@
+"""Read this first: a photo and a scene go in, a pose with its trace and its verdict comes out.
+
+This is the composition root: the one place where names become objects. It holds the driver that runs every
+estimator: it owns the clock, the budget and the cancel flag, stamps the records, and puts the same verification
+gate behind every method. Jobs, CLI, bench and tests call `localize`; nothing else iterates an estimator.
+
+    from service.localize import LoadedScene, localize
+    from service.images import read_query
+    scene = LoadedScene.load(Path("scenes/studio"))
+    estimate = localize(read_query(Path("photo.jpg").read_bytes()), scene)
+    print(estimate.verdict.status, estimate.pose.world_from_camera)
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.errors import EstimatorFault
+from service.estimators import ESTIMATORS
+from service.interfaces import Matcher, Rasterizer, Tools
+from service.matchers import MATCHERS
+from service.pose.gate import verify
+from service.render import RASTERIZERS
+from service.scene_formats import load_scene
+from service.types import (
+    GaussianScene,
+    IterationRecord,
+    PoseEstimate,
+    Query,
+    Reason,
+    StageTiming,
+    Status,
+)
+
+DEFAULT_ESTIMATOR = "view_index"
+DEFAULT_RASTERIZER = "cpu"
+DEFAULT_MATCHER = "xfeat"
+
+
+class Cancelled(Exception):
+    """Raised by `localize` between two records after `Request.cancel` was set; the estimator is closed."""
+
+
+@dataclass(slots=True)
+class LoadedScene:
+    """A scene in memory with the tools bound to it. Shared by all jobs on it; safe from several threads."""
+
+    scene: GaussianScene
+    rasterizer: Rasterizer
+    matcher: Matcher
+    cache_dir: Path | None = None
+    """Where prepared things (view indexes) are kept between runs; None: nowhere."""
+    _prepared: dict[str, Any] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    @classmethod
+    def load(
+        cls,
+        folder: Path,
+        *,
+        cache_dir: Path | None = None,
+        rasterizer: str = DEFAULT_RASTERIZER,
+        matcher: str = DEFAULT_MATCHER,
+    ) -> LoadedScene:
+        """Read a scene folder (or a bare scene file) and bind tools to it. Raises SceneError, UnknownName."""
+        return cls.of(load_scene(folder), cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+
+    @classmethod
+    def of(
+        cls,
+        scene: GaussianScene,
+        *,
+        cache_dir: Path | None = None,
+        rasterizer: str = DEFAULT_RASTERIZER,
+        matcher: str = DEFAULT_MATCHER,
+    ) -> LoadedScene:
+        return cls(
+            scene, RASTERIZERS.load(rasterizer).create(scene), MATCHERS.load(matcher).create(), cache_dir
+        )
+
+    def prepare(self, estimator: str) -> Any:
+        """Return what the estimator prepares for this scene (e.g. its view index), made once."""
+        make = getattr(ESTIMATORS.load(estimator), "prepare", None)
+        if make is None:
+            return None
+        with self._lock:
+            if estimator not in self._prepared:
+                tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0))
+                self._prepared[estimator] = make(tools, self.cache_dir)
+            return self._prepared[estimator]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """How to localize; the photo and the scene are passed beside it."""
+
+    estimator: str = DEFAULT_ESTIMATOR
+    options: Any = None
+    """The estimator's `Options`; None: its defaults."""
+    seed: int = 0
+    budget_s: float | None = None
+    """Wall time after which the best pose so far is the answer; None: until the estimator ends."""
+    cancel: threading.Event | None = None
+
+
+def localize(
+    query: Query,
+    loaded: LoadedScene,
+    request: Request | None = None,
+    on_record: Callable[[IterationRecord], None] | None = None,
+) -> PoseEstimate:
+    """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing."""
+    request = request or Request()
+    plugin = ESTIMATORS.load(request.estimator)
+    options = request.options if request.options is not None else plugin.Options()
+    tools = Tools(
+        loaded.scene,
+        loaded.rasterizer,
+        loaded.matcher,
+        np.random.default_rng(request.seed),
+        loaded.prepare(request.estimator),
+    )
+    clock = _Clock()
+    records: list[IterationRecord] = []
+    exhausted = False
+    with closing(plugin.run(query, tools, options)) as steps:
+        for record in _driven(steps, clock, request.cancel):
+            records.append(record)
+            if on_record:
+                on_record(record)
+            exhausted = request.budget_s is not None and clock.wall_s > request.budget_s
+            if exhausted:
+                break
+    if not records:
+        raise EstimatorFault(f"'{request.estimator}' ended without a record.")
+    pose = records[-1].pose
+    verdict = verify(query, pose, tools)
+    if exhausted and verdict.status is not Status.LOCALIZED:
+        verdict = replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
+    return PoseEstimate(
+        pose=pose,
+        verdict=verdict,
+        intrinsics=query.photo_intrinsics,
+        intrinsics_source=query.intrinsics_source,
+        scene_id=loaded.scene.info.id,
+        scene_sha256=loaded.scene.info.sha256,
+        estimator=request.estimator,
+        rasterizer=loaded.rasterizer.name,
+        matcher=loaded.matcher.name,
+        seed=request.seed,
+        budget_exhausted=exhausted,
+        timings=_timings(records, clock),
+        warnings=query.warnings + loaded.scene.info.warnings,
+        records=tuple(records),
+    )
+
+
+def _driven(
+    steps: Iterator[IterationRecord], clock: _Clock, cancel: threading.Event | None
+) -> Iterator[IterationRecord]:
+    """Number and stamp the records; stop between two of them when cancelled."""
+    for index, record in enumerate(steps):
+        if cancel is not None and cancel.is_set():
+            raise Cancelled
+        yield replace(record, index=index, elapsed_s=clock.wall_s, cpu_s=clock.cpu_s)
+
+
+class _Clock:
+    """Wall time, and CPU time of the calling thread: a job runs on one thread."""
+
+    def __init__(self) -> None:
+        self._wall, self._cpu = time.perf_counter(), time.thread_time()
+
+    @property
+    def wall_s(self) -> float:
+        return time.perf_counter() - self._wall
+
+    @property
+    def cpu_s(self) -> float:
+        return time.thread_time() - self._cpu
+
+
+def _timings(records: list[IterationRecord], clock: _Clock) -> tuple[StageTiming, ...]:
+    """Time by stage: a record's stage is charged with the time since the record before; the rest is the gate's."""
+    spent: dict[str, list[float]] = {}
+    wall = cpu = 0.0
+    for record in records:
+        entry = spent.setdefault(record.stage, [0.0, 0.0])
+        entry[0] += record.elapsed_s - wall
+        entry[1] += record.cpu_s - cpu
+        wall, cpu = record.elapsed_s, record.cpu_s
+    spent["verify"] = [clock.wall_s - wall, clock.cpu_s - cpu]
+    return tuple(StageTiming(stage, *times) for stage, times in spent.items())

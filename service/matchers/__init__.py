@@ -1,0 +1,3 @@
+from service.plugins import PluginFolder
+
+MATCHERS = PluginFolder("service.matchers", "create")

@@ -1,0 +1,3 @@
+from service.plugins import PluginFolder
+
+RASTERIZERS = PluginFolder("service.render", "create")

@@ -1,0 +1,350 @@
+"""The values that cross disk, HTTP and module borders: frozen, slotted, arrays really read-only.
+
+Conventions (CONTRIBUTING.md has them all): OpenCV camera axes (+x right, +y down, +z forward); transforms are
+named `target_from_source`; the centre of the top-left pixel is (0.5, 0.5); depth is z-depth; lengths are in scene
+units; quaternions are wxyz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from service.errors import InvalidIntrinsics, InvalidPrior
+
+
+def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
+    """Return a C-contiguous read-only array; copies only if it must to leave the caller's array writable."""
+    result = np.ascontiguousarray(array, dtype=dtype)
+    if result is array and array.flags.writeable:
+        result = array.copy()
+    result.flags.writeable = False
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A camera without its place. Refers to the upright image (EXIF orientation applied)."""
+
+    width: int
+    height: int
+    fx: float
+    """Pixels."""
+    fy: float
+    cx: float
+    """Pixels from the left edge: the centre of an image is at width / 2."""
+    cy: float
+    model: str = "PINHOLE"
+    """COLMAP's name of the camera model; renderers and estimators see PINHOLE only."""
+    distortion: tuple[float, ...] = ()
+    """COLMAP's parameters after the focal lengths and the principal point."""
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            if not 1 <= getattr(self, name) <= 100_000:
+                raise InvalidIntrinsics(f"must lie in 1..100000, is {getattr(self, name)}.", where=name)
+        for name in ("fx", "fy"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and 0 < value < 1e7):
+                raise InvalidIntrinsics(f"must be a positive focal length in pixels, is {value}.", where=name)
+        if not np.all(np.isfinite([self.cx, self.cy, *self.distortion])):
+            raise InvalidIntrinsics("cx, cy and distortion must be finite numbers.", where="cx, cy")
+
+    @property
+    def long_side(self) -> int:
+        return max(self.width, self.height)
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """Return the same camera for the image resampled to another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            width=width,
+            height=height,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=self.cx * sx,
+            cy=self.cy * sy,
+        )
+
+    def with_long_side(self, pixels: int) -> Intrinsics:
+        """Return the camera for the image resampled so that its long side has `pixels`, never enlarged."""
+        factor = min(1.0, pixels / self.long_side)
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where a camera is. World axes are the scene's own; units are scene units."""
+
+    world_from_camera: Float64[np.ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        matrix = frozen(self.world_from_camera, np.float64)
+        if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
+            raise InvalidPrior("a pose is a 4x4 matrix of finite numbers.", where="world_from_camera")
+        rotation = matrix[:3, :3]
+        # 1e-3: poses printed with 3 or 4 digits pass, scaled or sheared ones don't.
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+            raise InvalidPrior(
+                "the upper left 3x3 is not a rotation (orthonormal, determinant +1).",
+                where="world_from_camera",
+                hint="Remove scale and mirroring; columns are the camera's x, y and z axes in the world.",
+            )
+        if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
+            raise InvalidPrior("the last row must be 0 0 0 1.", where="world_from_camera")
+        object.__setattr__(self, "world_from_camera", matrix)
+
+    @property
+    def camera_from_world(self) -> Float64[np.ndarray, "4 4"]:
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.world_from_camera[:3, :3].T
+        inverse[:3, 3] = -inverse[:3, :3] @ self.world_from_camera[:3, 3]
+        return inverse
+
+    @property
+    def position_in_world(self) -> Float64[np.ndarray, "3"]:
+        return self.world_from_camera[:3, 3]
+
+    @property
+    def axis_in_world(self) -> Float64[np.ndarray, "3"]:
+        """The viewing direction, unit length."""
+        return self.world_from_camera[:3, 2]
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    intrinsics: Intrinsics
+    pose: Pose
+
+
+@dataclass(frozen=True, slots=True)
+class NamedCamera:
+    """A camera that the scene was trained with."""
+
+    name: str
+    """The photo's file name as the camera file gives it."""
+    camera: Camera
+
+
+@dataclass(frozen=True, slots=True)
+class SceneInfo:
+    """What is known of a scene besides its Gaussians."""
+
+    id: str
+    name: str
+    sha256: str
+    """Of the scene file's bytes, the manifest and the training cameras: the key of anything cached."""
+    format: str
+    """The reader's name: ply, compressed_ply, splat."""
+    background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Seen where alpha is 0; sRGB, 0..1."""
+    up_in_world: tuple[float, float, float] | None = None
+    metres_per_unit: float | None = None
+    render_mode: Literal["default", "antialiased"] = "default"
+    training_focal_px: float | None = None
+    """Median focal length of the training photos; the renderer scales its dilation by it."""
+    training_long_side_px: int | None = None
+    """Long side of the training photos, where the focal length is unknown."""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class GaussianScene:
+    """Gaussians with activated values: no exp or sigmoid left to do. In memory, read-only."""
+
+    means: Float32[np.ndarray, "n 3"]
+    """World frame."""
+    quats: Float32[np.ndarray, "n 4"]
+    """Unit, wxyz, world_from_gaussian."""
+    scales: Float32[np.ndarray, "n 3"]
+    """Standard deviations along the Gaussian's own axes."""
+    opacities: Float32[np.ndarray, "n"]
+    """0..1."""
+    sh: Float32[np.ndarray, "n k 3"]
+    """k = (degree + 1)^2 coefficients; colour = 0.5 + sum of basis times coefficient, clamped at 0, sRGB."""
+    info: SceneInfo
+    cameras: tuple[NamedCamera, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            object.__setattr__(self, name, frozen(getattr(self, name), np.float32))
+
+    @property
+    def count(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    @property
+    def nbytes(self) -> int:
+        return sum(getattr(self, n).nbytes for n in ("means", "quats", "scales", "opacities", "sh"))
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """A photo to localize: upright, undistorted, with a pinhole camera."""
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    """sRGB; decoded no larger than an estimator can use."""
+    intrinsics: Intrinsics
+    """Of `rgb`."""
+    intrinsics_source: Literal["given", "exif", "guessed"]
+    photo_intrinsics: Intrinsics
+    """Of the whole upright photo in its own resolution, with its distortion: what results report."""
+    prior: Pose | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+
+
+@dataclass(frozen=True, slots=True)
+class MatchVectors:
+    """Matches between the photo and a render, for looking at; at most 300."""
+
+    photo_px: Float32[np.ndarray, "m 2"]
+    """In pixels of `Query.rgb`."""
+    render_px: Float32[np.ndarray, "m 2"]
+    """In pixels of `render_camera`."""
+    inlier: Bool[np.ndarray, "m"]
+    render_camera: Camera
+
+    LIMIT = 300
+
+    @classmethod
+    def sample(
+        cls,
+        photo_px: Float32[np.ndarray, "m 2"],
+        render_px: Float32[np.ndarray, "m 2"],
+        inlier: Bool[np.ndarray, "m"],
+        render_camera: Camera,
+    ) -> MatchVectors:
+        """Keep an evenly spread choice of at most LIMIT matches, in their order."""
+        keep = np.unique(np.linspace(0, max(len(inlier) - 1, 0), min(len(inlier), cls.LIMIT)).astype(int))
+        return cls(
+            frozen(photo_px[keep], np.float32),
+            frozen(render_px[keep], np.float32),
+            frozen(inlier[keep], np.bool_),
+            render_camera,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Poses that a stage weighed against one another."""
+
+    world_from_camera: Float64[np.ndarray, "k 4 4"]
+    scores: Float64[np.ndarray, "k"]
+    """Higher is better; comparable within one record only."""
+
+
+@dataclass(frozen=True, slots=True)
+class IterationRecord:
+    """One line of the trace: what an estimator knows after a step. Small, no images."""
+
+    stage: str
+    pose: Pose
+    """The answer that the estimator would give if it were stopped here: best so far."""
+    loss: float | None = None
+    """The stage's own objective; comparable within a stage only."""
+    num_matches: int | None = None
+    num_inliers: int | None = None
+    step_deg: float | None = None
+    """How far the pose turned in this step."""
+    step_units: float | None = None
+    matches: MatchVectors | None = None
+    candidates: Candidates | None = None
+    index: int = 0
+    """Number of the record in the trace; stamped by the driver, like the times."""
+    elapsed_s: float = 0.0
+    """Wall time since the driver started."""
+    cpu_s: float = 0.0
+    """CPU time of the job's thread since the driver started."""
+
+
+class Status(StrEnum):
+    LOCALIZED = "localized"
+    UNCERTAIN = "uncertain"
+    NOT_LOCALIZED = "not_localized"
+
+
+class Reason(StrEnum):
+    """Why a result has its status: a closed list, part of the API. `HINTS` says what to do about each."""
+
+    AGREES = "agrees"
+    FEW_FEATURES = "few_features"
+    NO_MATCHING_VIEW = "no_matching_view"
+    RENDER_DISAGREES = "render_disagrees"
+    FEW_INLIERS = "few_inliers"
+    LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
+    BUDGET_EXHAUSTED = "budget_exhausted"
+
+
+HINTS: dict[Reason, str] = {
+    Reason.AGREES: "",
+    Reason.FEW_FEATURES: "The photo shows almost no texture: take it sharper, brighter or with more of the scene.",
+    Reason.NO_MATCHING_VIEW: "Nothing in the photo was recognised: check that it shows this scene, or send a prior.",
+    Reason.RENDER_DISAGREES: (
+        "The scene rendered at the best pose does not look like the photo: check the intrinsics, and whether the "
+        "scene has changed since it was captured."
+    ),
+    Reason.FEW_INLIERS: (
+        "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
+    ),
+    Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: photograph the captured part, or send a prior.",
+    Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the verification gate says of a pose."""
+
+    status: Status
+    reason: Reason
+    score: float
+    """0..1, the same meaning for every estimator: at least 0.5 is `localized`."""
+    inliers: int
+    """Matches between the photo and the render at the pose that agree with it."""
+    agreement: float
+    """Zero-normalized cross-correlation of the gradients of photo and render, -1..1."""
+    coverage: float
+    """Share of the photo in which the scene is rendered opaque."""
+    covariance: Float64[np.ndarray, "6 6"] | None
+    """Of the right perturbation (rotation in rad, translation in units) in the camera frame:
+    true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageTiming:
+    stage: str
+    wall_s: float
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """A finished localization: the answer, what it rests on, and how it came about."""
+
+    pose: Pose
+    verdict: Verdict
+    intrinsics: Intrinsics
+    """Used for the whole upright photo."""
+    intrinsics_source: Literal["given", "exif", "guessed"]
+    scene_id: str
+    scene_sha256: str
+    estimator: str
+    rasterizer: str
+    matcher: str
+    seed: int
+    budget_exhausted: bool
+    timings: tuple[StageTiming, ...]
+    warnings: tuple[str, ...]
+    records: tuple[IterationRecord, ...]
