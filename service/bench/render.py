@@ -1,9 +1,9 @@
 """Time the renderer on a synthetic room, always the same one: figures of different days can be compared.
 
-The room imitates what a 3DGS trainer makes of an interior seen from inside: flat Gaussians on the walls, floor,
-ceiling and on boxes and balls in between, sized so that they overlap, and a tenth of loose ones in the air. Six
-cameras inside, 4:3, see 7 to 10 % of the Gaussians; a pixel evaluates about 40 of them at 800 px, 100 at 100 px (with
-500,000 Gaussians: 200), counting every Gaussian that touches the pixel's 4x4 block until the block is opaque.
+The room imitates what a 3DGS trainer makes of an interior: flat Gaussians on walls, floor, ceiling and
+boxes, sized so that they overlap, and a tenth of loose ones in the air. Six cameras inside, 4:3, see 7 to
+10 % of them. A pixel evaluates about 40 at 800 px and 100 at 100 px (200 of 500,000), counting every
+Gaussian that touches the pixel's 4x4 block until the block is opaque.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float64
 
-from service.geometry import look_at, quat_from_rotation
+from service.geometry import look_at
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
 
 ROOM = np.array([8.0, 6.0, 3.0])
