@@ -1,0 +1,146 @@
+"""How domain values become the models of `schemas`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.api.schemas import (
+    Axes,
+    CameraOut,
+    CandidatesOut,
+    Covariance,
+    IntrinsicsOut,
+    MatchesOut,
+    Matrix,
+    NamedCameraOut,
+    PoseOut,
+    Record,
+    Result,
+    SceneRef,
+    Timing,
+    Transform,
+)
+from service.geometry import quat_from_rotation
+from service.types import HINTS, Camera, Intrinsics, IterationRecord, NamedCamera, Pose, PoseEstimate
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes: OpenGL's y points up and its z backwards. Its own inverse."""
+
+
+def rows(matrix: np.ndarray) -> Matrix:
+    """Return nested lists of Python floats."""
+    return np.asarray(matrix, np.float64).tolist()
+
+
+def transform_out(target_from_source: np.ndarray) -> Transform:
+    """Spell out a target_from_source."""
+    return Transform(
+        matrix=rows(target_from_source),
+        translation=target_from_source[:3, 3].tolist(),
+        quaternion_wxyz=quat_from_rotation(target_from_source[:3, :3]).tolist(),
+    )
+
+
+def pose_out(pose: Pose) -> PoseOut:
+    """Spell out a pose in both conventions of camera axes."""
+    opengl = Pose(pose.world_from_camera @ OPENCV_FROM_OPENGL)
+    return PoseOut(
+        position=pose.position_in_world.tolist(),
+        world_from_camera=transform_out(pose.world_from_camera),
+        camera_from_world=transform_out(pose.camera_from_world),
+        opengl=Axes(
+            world_from_camera=transform_out(opengl.world_from_camera),
+            camera_from_world=transform_out(opengl.camera_from_world),
+        ),
+    )
+
+
+def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
+    """Spell out a camera model."""
+    return IntrinsicsOut(
+        model=intrinsics.model,
+        width=intrinsics.width,
+        height=intrinsics.height,
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        distortion=list(intrinsics.distortion),
+    )
+
+
+def camera_out(camera: Camera) -> CameraOut:
+    """Spell out a camera."""
+    return CameraOut(
+        intrinsics=intrinsics_out(camera.intrinsics), world_from_camera=rows(camera.pose.world_from_camera)
+    )
+
+
+def named_camera_out(named: NamedCamera) -> NamedCameraOut:
+    """Spell out a training camera."""
+    return NamedCameraOut(name=named.name, **camera_out(named.camera).model_dump())
+
+
+def record_out(record: IterationRecord) -> Record:
+    """Spell out one step of a job."""
+    matches, candidates = record.matches, record.candidates
+    return Record(
+        index=record.index,
+        stage=record.stage,
+        world_from_camera=rows(record.pose.world_from_camera),
+        elapsed_s=record.elapsed_s,
+        cpu_s=record.cpu_s,
+        loss=record.loss,
+        num_matches=record.num_matches,
+        num_inliers=record.num_inliers,
+        step_deg=record.step_deg,
+        step_units=record.step_units,
+        matches=matches
+        and MatchesOut(
+            photo_px=rows(matches.photo_px),
+            render_px=rows(matches.render_px),
+            inlier=matches.inlier.tolist(),
+            render_camera=camera_out(matches.render_camera),
+        ),
+        candidates=candidates
+        and CandidatesOut(
+            world_from_camera=candidates.world_from_camera.tolist(), scores=candidates.scores.tolist()
+        ),
+    )
+
+
+def covariance_out(matrix: np.ndarray) -> Covariance:
+    """Spell out the covariance of a pose, with its two standard deviations."""
+    return Covariance(
+        matrix=rows(matrix),
+        sigma_deg=float(np.degrees(np.sqrt(np.trace(matrix[:3, :3])))),
+        sigma_units=float(np.sqrt(np.trace(matrix[3:, 3:]))),
+    )
+
+
+def result_out(estimate: PoseEstimate, decode: Timing, versions: dict[str, str]) -> Result:
+    """Spell out a finished estimate; `decode` is what reading the photo took."""
+    verdict = estimate.verdict
+    timings = [Timing(stage=t.stage, wall_s=t.wall_s, cpu_s=t.cpu_s) for t in estimate.timings]
+    return Result(
+        status=verdict.status,
+        reason=verdict.reason,
+        hint=HINTS[verdict.reason],
+        score=verdict.score,
+        pose=pose_out(estimate.pose),
+        intrinsics=intrinsics_out(estimate.intrinsics),
+        intrinsics_source=estimate.intrinsics_source,
+        inliers=verdict.inliers,
+        agreement=verdict.agreement,
+        coverage=verdict.coverage,
+        covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
+        timings=[decode, *timings],
+        budget_exhausted=estimate.budget_exhausted,
+        seed=estimate.seed,
+        estimator=estimate.estimator,
+        matcher=estimate.matcher,
+        rasterizer=estimate.rasterizer,
+        scene=SceneRef(id=estimate.scene_id, sha256=estimate.scene_sha256),
+        versions=versions,
+        warnings=list(estimate.warnings),
+    )

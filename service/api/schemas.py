@@ -1,0 +1,360 @@
+"""The JSON that the service speaks, as pydantic models.
+
+Matrices are row-major nested lists. Every pose is in OpenCV camera axes (+x right, +y down, +z forward) unless
+its field says `opengl`. The world is the scene's own frame; lengths are scene units. The centre of the top-left
+pixel is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.types import Reason, Status
+
+Matrix = list[list[float]]
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+SceneState = Literal["loading", "preparing", "ready", "failed"]
+
+
+class Model(BaseModel):
+    model_config = ConfigDict(use_attribute_docstrings=True, extra="forbid")
+
+
+class Problem(Model):
+    """What went wrong, as RFC 9457 has it: the body of every error, `application/problem+json`."""
+
+    type: str
+    """`urn:splatfix:error:<code>`, or `about:blank` where the status says it all."""
+    title: str
+    status: int
+    detail: str
+    instance: str
+    """The path that was asked for."""
+    code: str
+    """Stable, for programs."""
+    where: str = ""
+    """The field, file or element concerned; empty if there is none."""
+    hint: str = ""
+    """What to do about it."""
+
+
+class Transform(Model):
+    """A rigid motion target_from_source, in three spellings of the same thing."""
+
+    matrix: Matrix
+    """4x4, target_from_source."""
+    translation: list[float]
+    """The last column: where the source's origin lies in the target."""
+    quaternion_wxyz: list[float]
+    """The rotation, unit, w >= 0."""
+
+
+class Axes(Model):
+    world_from_camera: Transform
+    """The pose of the camera; its translation is the camera's position in the world."""
+    camera_from_world: Transform
+    """The inverse: COLMAP's and OpenCV's extrinsics."""
+
+
+class PoseOut(Axes):
+    """Where the camera is. `world_from_camera` and `camera_from_world` are in OpenCV camera axes."""
+
+    convention: Literal["opencv"] = "opencv"
+    position: list[float]
+    """The camera's centre in the world, scene units."""
+    opengl: Axes
+    """The same pose with OpenGL's camera axes (+y up, +z backwards), as Blender and nerfstudio use."""
+
+
+class IntrinsicsOut(Model):
+    """A camera model of the upright image, in pixels."""
+
+    model: str
+    """COLMAP's name."""
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: list[float]
+    """COLMAP's parameters after focal lengths and principal point."""
+
+
+class CameraOut(Model):
+    intrinsics: IntrinsicsOut
+    world_from_camera: Matrix
+
+
+class MatchesOut(Model):
+    """Matches between the photo and a render: row i of each list belongs together."""
+
+    photo_px: list[list[float]]
+    """x, y in pixels of the image that `/jobs/{id}/photo` returns."""
+    render_px: list[list[float]]
+    """x, y in pixels of `render_camera`, which need not have the photo's size."""
+    inlier: list[bool]
+    render_camera: CameraOut
+
+
+class CandidatesOut(Model):
+    """Poses that were weighed against one another."""
+
+    world_from_camera: list[Matrix]
+    scores: list[float]
+    """Higher is better; comparable within this record only."""
+
+
+class Record(Model):
+    """One step of a job."""
+
+    index: int
+    stage: str
+    world_from_camera: Matrix
+    """4x4: the best pose so far, which would be the answer if the job were stopped here."""
+    elapsed_s: float
+    """Wall time since the job's start."""
+    cpu_s: float
+    """CPU time since then."""
+    loss: float | None
+    """The stage's own objective; comparable within a stage only."""
+    num_matches: int | None
+    num_inliers: int | None
+    step_deg: float | None
+    step_units: float | None
+    matches: MatchesOut | None
+    candidates: CandidatesOut | None
+
+
+class Trace(Model):
+    """Everything that a job has told of itself so far."""
+
+    job: str
+    state: JobState
+    records: list[Record]
+
+
+class Covariance(Model):
+    """Of the right perturbation of world_from_camera: true = estimate @ exp(twist)."""
+
+    frame: Literal["camera"] = "camera"
+    order: list[str] = ["rx_rad", "ry_rad", "rz_rad", "tx_units", "ty_units", "tz_units"]
+    matrix: Matrix
+    """6x6."""
+    sigma_deg: float
+    """Square root of the trace of the rotation's block, in degrees."""
+    sigma_units: float
+    """Square root of the trace of the translation's block."""
+
+
+class Timing(Model):
+    stage: str
+    wall_s: float
+    cpu_s: float
+
+
+class SceneRef(Model):
+    id: str
+    sha256: str
+
+
+class Result(Model):
+    """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
+
+    status: Status
+    reason: Reason
+    hint: str
+    """What to do about the reason; empty if all is well."""
+    score: float
+    """0..1; at least 0.5 is `localized`."""
+    pose: PoseOut
+    """The best pose found. Don't use it unless `status` is `localized`."""
+    intrinsics: IntrinsicsOut
+    """Used for the whole upright photo."""
+    intrinsics_source: Literal["given", "exif", "guessed"]
+    inliers: int
+    agreement: float
+    """Correlation of the gradients of photo and render, -1..1."""
+    coverage: float
+    """Share of the photo in which the scene is rendered opaque."""
+    covariance: Covariance | None
+    timings: list[Timing]
+    """By stage, in order; `decode` is the photo's."""
+    budget_exhausted: bool
+    seed: int
+    estimator: str
+    matcher: str
+    rasterizer: str
+    scene: SceneRef
+    versions: dict[str, str]
+    warnings: list[str]
+
+
+class JobLinks(Model):
+    """Paths on this service, with its sub-path if it has one."""
+
+    self: str
+    events: str
+    photo: str
+    trace: str
+    render: str
+    """The scene rendered at the latest pose."""
+    viewer: str
+
+
+class PhotoOut(Model):
+    """The photo as it was decoded for the job: upright, undistorted, perhaps reduced."""
+
+    name: str
+    intrinsics: IntrinsicsOut
+    """Pinhole, of the image that `/jobs/{id}/photo` returns."""
+
+
+class JobSummary(Model):
+    id: str
+    state: JobState
+    scene: str
+    estimator: str
+    created: datetime
+    started: datetime | None
+    finished: datetime | None
+    records: int
+    """How many steps it has told of."""
+    stage: str | None
+    """Of the latest record."""
+    status: Status | None
+    """Of the result, when there is one."""
+    score: float | None
+    links: JobLinks
+
+
+class JobOut(JobSummary):
+    """A job with its result (state `succeeded`) or its error (state `failed`)."""
+
+    photo: PhotoOut
+    seed: int
+    budget_s: float | None
+    options: dict[str, Any]
+    prior: PoseOut | None
+    result: Result | None
+    error: Problem | None
+
+
+class JobList(Model):
+    jobs: list[JobSummary]
+    """Newest first."""
+    queued: int
+    running: int
+
+
+class SceneLinks(Model):
+    self: str
+    splats: str
+
+
+class SceneSummary(Model):
+    id: str
+    name: str
+    state: SceneState
+    gaussians: int | None
+    """None until it is loaded; so are the other counts."""
+    sh_degree: int | None
+    cameras: int | None
+    memory_bytes: int | None
+    error: Problem | None
+    """Why it failed to load."""
+    links: SceneLinks
+
+
+class NamedCameraOut(CameraOut):
+    name: str
+
+
+class SceneOut(SceneSummary):
+    sha256: str | None
+    format: str | None
+    background_rgb: list[float] | None
+    up_in_world: list[float] | None
+    metres_per_unit: float | None
+    render_mode: str | None
+    bounds_in_world: list[list[float]] | None
+    """Lower and upper corner of the box that holds the middle 98 % of the Gaussians along each axis."""
+    warnings: list[str]
+    training_cameras: list[NamedCameraOut]
+
+
+class SceneList(Model):
+    scenes: list[SceneSummary]
+
+
+class Capability(Model):
+    name: str
+    available: bool
+    reason: str | None
+    """Why it can't run here."""
+    default: bool = False
+
+
+class EstimatorCapability(Capability):
+    options_schema: dict[str, Any] | None
+    """JSON Schema of the form field `options`."""
+
+
+class Capabilities(Model):
+    estimators: list[EstimatorCapability]
+    matchers: list[Capability]
+    rasterizers: list[Capability]
+    scene_formats: list[Capability]
+    max_upload_bytes: int
+    max_wait_s: float
+
+
+class Readiness(Model):
+    ready: bool
+    awaited: list[str]
+    """What is not done yet; empty when ready."""
+    failed: list[str]
+    """Scenes that could not be loaded, with the reason."""
+
+
+class Liveness(Model):
+    alive: Literal[True] = True
+
+
+class PriorIn(Model):
+    """A guess of the pose: exactly one of the three spellings."""
+
+    convention: Literal["opencv", "opengl"] = "opencv"
+    """The camera axes of what is given."""
+    world_from_camera: Matrix | None = None
+    camera_from_world: Matrix | None = None
+    position: list[float] | None = Field(default=None, min_length=3, max_length=3)
+    """The camera's centre in the world; together with `quaternion_wxyz`."""
+    quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
+    """world_from_camera."""
+
+
+class LocalizeIn(Model):
+    """A request to localize a photo: JSON body, or multipart form with the same names.
+
+    In a form, `options`, `intrinsics` and `prior` are JSON text and `photo` is a file.
+    """
+
+    photo: str
+    """JPEG, PNG, WebP or HEIC; base64 in a JSON body."""
+    scene: str | None = None
+    """May be left out when the service has exactly one scene."""
+    estimator: str | None = None
+    """See `/capabilities`; left out: the default one."""
+    options: dict[str, Any] = {}
+    """The estimator's options; `/capabilities` has their schema."""
+    intrinsics: dict[str, Any] | None = None
+    """Of the upright photo: `width, height, fx, fy, cx, cy`, and COLMAP's `model` and `distortion`. Left out:
+    taken from the EXIF data, or guessed."""
+    prior: PriorIn | None = None
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
+    """Wall time after which the best pose so far is the answer."""

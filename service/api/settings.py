@@ -1,0 +1,38 @@
+"""What an operator can set: environment variables `SPLATFIX_*`, or arguments of `splatfix serve`."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+class Settings(BaseSettings):
+    model_config = SettingsConfigDict(env_prefix="SPLATFIX_", use_attribute_docstrings=True, extra="forbid")
+
+    scenes: list[Path] = []
+    """Scene folders, scene files, or folders of scene folders. In the environment: a JSON list."""
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, lt=65536)
+    """0: any free one."""
+    root_path: str = ""
+    """The sub-path under which a proxy shows the service, e.g. /fix; `X-Forwarded-Prefix` wins."""
+    workers: int = Field(default_factory=_cores, ge=1)
+    """Jobs that run at once; each has one thread."""
+    queue_size: int = Field(default=32, ge=1)
+    """Jobs that may wait; one more is refused with 503."""
+    keep_jobs: int = Field(default=200, ge=1)
+    """Finished jobs that are remembered."""
+    max_upload_bytes: int = Field(default=100_000_000, ge=1)
+    max_wait_s: float = Field(default=60.0, gt=0)
+    """The longest `Prefer: wait=N` that is honoured."""
+    cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
+    """Where view indexes are kept between runs; None: nowhere."""
+    viewer: bool = True
+    """Start the viewer and relay it under /viewer."""
