@@ -1,0 +1,234 @@
+"""The picture: every 4x4 block of pixels is one vector that runs through its Gaussians front to back.
+
+    tile 16x16 = 16 blocks          block = 16 lanes           batch of 128 Gaussians of the tile's list
+    +--+--+--+--+                   | 0| 1| 2| 3|              local [10 values][128]: structure of arrays
+    | 0| 1| 2| 3|                   | 4| 5| 6| 7|              lists [16 blocks][128 + 16]: which of the batch
+    | 4| ...                        | 8| ...                   touch the block (exact ellipse against rectangle)
+
+Semantics (gsplat's): alpha below 1/255 is skipped, alpha is clamped at 0.999, a Gaussian that would bring the
+transmittance T to 1e-4 or below is not added and ends the pixel. T goes on decaying unfrozen here: the loop-carried
+chain is one fma, and `T after > 1e-4` is the mask of what counts.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from service.jit import inline, kernel
+from service.render.project import LOG2_ALPHA_MIN, TILE
+from service.render.simd import (
+    as_float,
+    as_int,
+    bits,
+    compress,
+    fma,
+    iota,
+    isplat,
+    load,
+    popcount,
+    select,
+    splat,
+    store,
+    store_quarter,
+    store_rgb_rows,
+    to_float,
+    transpose16,
+    vmax,
+    vmin,
+)
+
+BATCH = 128
+LIST = BATCH + 16
+"""A list's room: a compressed vector is stored whole."""
+T_MIN = np.float32(1e-4)
+ALPHA_MAX = np.float32(0.999)
+# Rows of `local`: the record's first ten values, then the ellipse test's bound and slopes.
+X, Y, A, B, C, O, Z, R, G, BL = (i * BATCH for i in range(10))  # noqa: E741
+LOCAL = 16 * BATCH
+STATE = 7 * 16
+"""Floats of a block's state: T, r, g, b, depth sum, median depth, alpha."""
+
+
+@inline
+def exp2(x):
+    """2^x for x in -126..127: magic-number rounding, polynomial of degree 5 on -0.5..0.5; relative error 2e-7."""
+    shifted = x + 12582912.0
+    f = x - (shifted - 12582912.0)
+    p = fma(f, 0.0013400432, 0.009618073)
+    p = fma(p, f, 0.05550327)
+    p = fma(p, f, 0.24022652)
+    p = fma(p, f, 0.6931472)
+    p = fma(p, f, 1.0)
+    return as_float(as_int(p) + (as_int(shifted) << 23))
+
+
+@inline
+def gather_batch(records, entries, first, count, local):
+    """Bring up to 128 records into structure of arrays; pad with Gaussians that touch nothing."""
+    for group in range(0, count, 16):
+        base = LOCAL + group * 16
+        for lane in range(16):
+            at = min(group + lane, count - 1)
+            store(local, LOCAL + lane * 16, load(records, np.intp(entries[first + at]) * 16))
+        transpose16(local, LOCAL, 16, local, group, BATCH)
+        if group + 16 > count:
+            real = (iota() + isplat(group)) < isplat(count)
+            store(local, O + group, select(real, load(local, O + group), -1e9))
+    return base
+
+
+@inline
+def touching_lists(local, count, tile_x, tile_y, alive, lists, lengths):
+    """Fill the list of every block that is alive: Gaussians whose alpha reaches 1/255 on its pixel centres.
+
+    The least value of the quadratic form over a rectangle lies on the edges that face the centre: clamp the free
+    coordinate of each edge's minimum into the edge.
+    """
+    for block in range(16):
+        lengths[block] = 0
+    for group in range(0, count, 16):
+        mx, my = load(local, X + group), load(local, Y + group)
+        a, b, c = load(local, A + group), load(local, B + group), load(local, C + group)
+        bound = load(local, O + group) - LOG2_ALPHA_MIN
+        slope_y, slope_x = b / (c * -2.0), b / (a * -2.0)
+        index = iota() + isplat(group)
+        for row in range(4):
+            low_y = np.float32(tile_y + row * 4 + 0.5) - my
+            high_y = low_y + 3.0
+            dy = vmin(vmax(low_y, 0.0), high_y)
+            cdy = c * dy * dy
+            best_x = slope_x * dy
+            bdy = b * dy
+            for column in range(4):
+                block = row * 4 + column
+                if not (alive >> np.uint32(block)) & np.uint32(1):
+                    continue
+                low_x = np.float32(tile_x + column * 4 + 0.5) - mx
+                high_x = low_x + 3.0
+                dx = vmin(vmax(low_x, 0.0), high_x)
+                y = vmin(vmax(slope_y * dx, low_y), high_y)
+                x = vmin(vmax(best_x, low_x), high_x)
+                vertical = fma(dx, fma(a, dx, b * y), c * y * y)
+                horizontal = fma(x, fma(a, x, bdy), cdy)
+                hit = vmin(vertical, horizontal) <= bound
+                length = np.intp(lengths[block])
+                store(lists, block * LIST + length, compress(index, hit))
+                lengths[block] = length + popcount(bits(hit))
+
+
+@kernel
+def blend(records, starts, entries, width, height, background, local, lists, lengths, state,
+          rgb, alpha, depth, median):  # fmt: skip
+    """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each."""
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    lane_x = to_float(iota() & isplat(3))
+    lane_y = to_float(iota() >> isplat(2))
+    for tile in range(tiles_x * tiles_y):
+        tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
+        alive = np.uint32(0)
+        for block in range(16):
+            if tile_x + block % 4 * 4 < width and tile_y + block // 4 * 4 < height:
+                alive |= np.uint32(1) << np.uint32(block)
+        inside = alive
+        for block in range(16):
+            store(state, block * STATE, splat(1.0))
+            for k in range(1, 7):
+                store(state, block * STATE + k * 16, splat(0.0))
+        first, last = np.intp(starts[tile]), np.intp(starts[tile + 1])
+        while first < last and alive != 0:
+            count = min(BATCH, last - first)
+            gather_batch(records, entries, first, count, local)
+            touching_lists(local, count, tile_x, tile_y, alive, lists, lengths)
+            first += count
+            for block in range(16):
+                if not (alive >> np.uint32(block)) & np.uint32(1) or lengths[block] == 0:
+                    continue
+                px = lane_x + np.float32(tile_x + block % 4 * 4 + 0.5)
+                py = lane_y + np.float32(tile_y + block // 4 * 4 + 0.5)
+                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, state):
+                    alive &= ~(np.uint32(1) << np.uint32(block))
+        for block in range(16):
+            if (inside >> np.uint32(block)) & np.uint32(1):
+                x, y = tile_x + block % 4 * 4, tile_y + block // 4 * 4
+                _write_block(state, block, x, y, width, height, background, rgb, alpha, depth, median)
+
+
+@inline
+def _run_block(local, lists, block, length, px, py, state):
+    """Composite the block's list onto its state. False when every pixel is opaque."""
+    at = block * STATE
+    t, r, g = load(state, at), load(state, at + 16), load(state, at + 32)
+    b, d, m = load(state, at + 48), load(state, at + 64), load(state, at + 80)
+    total = load(state, at + 96)
+    going = True
+    for start in range(0, length, 16):
+        for k in range(start, min(start + 16, length)):
+            i = np.intp(lists[block * LIST + k])
+            dx = px - local[X + i]
+            dy = py - local[Y + i]
+            e = local[O + i] - fma(dx, fma(dx, local[A + i], dy * local[B + i]), dy * dy * local[C + i])
+            a = select(e >= LOG2_ALPHA_MIN, vmin(exp2(e), ALPHA_MAX), 0.0)
+            m = select((t > 0.5) & (e >= LOG2_ALPHA_MIN), local[Z + i], m)
+            w = a * t
+            t = fma(-a, t, t)
+            w = select(t > T_MIN, w, 0.0)
+            total = total + w
+            r = fma(w, local[R + i], r)
+            g = fma(w, local[G + i], g)
+            b = fma(w, local[BL + i], b)
+            d = fma(w, local[Z + i], d)
+        if bits(t > T_MIN) == 0:
+            going = False
+            break
+    store(state, at, t)
+    store(state, at + 16, r)
+    store(state, at + 32, g)
+    store(state, at + 48, b)
+    store(state, at + 64, d)
+    store(state, at + 80, m)
+    store(state, at + 96, total)
+    return going
+
+
+@inline
+def _write_block(state, block, x, y, width, height, background, rgb, alpha, depth, median):
+    """Put the background behind, normalize the depth, and write the part that lies inside the image."""
+    at = block * STATE
+    a = load(state, at + 96)
+    rest = 1.0 - a
+    r = fma(rest, background[0], load(state, at + 16))
+    g = fma(rest, background[1], load(state, at + 32))
+    b = fma(rest, background[2], load(state, at + 48))
+    d = select(a > 0.0, load(state, at + 64) / vmax(a, 1e-12), 0.0)
+    m = select(a >= 0.5, load(state, at + 80), 0.0)
+    pixel = y * width + x
+    if x + 4 <= width and y + 4 <= height:
+        store_rgb_rows(rgb, pixel * 3, width * 3, r, g, b)
+        _store_rows(alpha, pixel, width, a)
+        _store_rows(depth, pixel, width, d)
+        _store_rows(median, pixel, width, m)
+        return
+    store(state, at, r)
+    store(state, at + 16, g)
+    store(state, at + 32, b)
+    store(state, at + 48, a)
+    store(state, at + 64, d)
+    store(state, at + 80, m)
+    for row in range(min(4, height - y)):
+        for column in range(min(4, width - x)):
+            source, target = at + row * 4 + column, pixel + row * width + column
+            rgb[target * 3] = state[source]
+            rgb[target * 3 + 1] = state[source + 16]
+            rgb[target * 3 + 2] = state[source + 32]
+            alpha[target] = state[source + 48]
+            depth[target] = state[source + 64]
+            median[target] = state[source + 80]
+
+
+@inline
+def _store_rows(plane, pixel, width, vector):
+    store_quarter(plane, pixel, vector, 0)
+    store_quarter(plane, pixel + width, vector, 1)
+    store_quarter(plane, pixel + 2 * width, vector, 2)
+    store_quarter(plane, pixel + 3 * width, vector, 3)

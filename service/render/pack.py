@@ -1,0 +1,134 @@
+"""Gaussians in the order and layout that the kernels read.
+
+    Morton order, then 16 Gaussians a chunk, structure of arrays inside the chunk; 64 chunks a block:
+
+    geometry  [chunk][ mx | my | mz | Sxx | Sxy | Sxz | Syy | Syz | Szz | log2 opacity ][16 lanes]
+    sh        [chunk][ k0 r | k0 g | k0 b | k1 r | ... ][16 lanes]
+    spheres   [block][ x, y, z, radius ]     encloses every Gaussian of the block out to its visible edge
+
+S is the covariance in the world frame. The last chunk is filled up with Gaussians that are never visible.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Int32
+
+from service.jit import kernel
+from service.types import GaussianScene
+
+LANES = 16
+GEOMETRY = 10
+CHUNKS_PER_BLOCK = 64
+# exp(-x^2 / 2) = 1/255 at x = 3.33: beyond it even an opaque Gaussian is skipped.
+VISIBLE_SIGMAS = 3.33
+NEVER = -1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    count: int
+    sh_degree: int
+    order: Int32[np.ndarray, "padded"]
+    """Index into the scene of each packed place; filled up with the last Gaussian's."""
+    geometry: Float32[np.ndarray, "g"]
+    sh: Float32[np.ndarray, "s"]
+    spheres: Float32[np.ndarray, "blocks 4"]
+
+    @property
+    def chunks(self) -> int:
+        return len(self.order) // LANES
+
+
+def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
+    """Return an uninitialized array that starts at a cache line: a vector then never crosses one."""
+    itemsize = np.dtype(dtype).itemsize
+    raw = np.empty(count * itemsize + 64, np.uint8)
+    start = -raw.ctypes.data % 64
+    return raw[start : start + count * itemsize].view(dtype)
+
+
+def pack(scene: GaussianScene) -> Packed:
+    order = _morton_order(scene.means)
+    padded = -(-scene.count // LANES) * LANES
+    order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])
+    chunks = padded // LANES
+    coefficients = scene.sh.shape[1] * 3
+    packed = Packed(
+        scene.count,
+        scene.sh_degree,
+        order,
+        aligned(chunks * GEOMETRY * LANES),
+        aligned(chunks * coefficients * LANES),
+        np.empty((-(-chunks // CHUNKS_PER_BLOCK), 4), np.float32),
+    )
+    fill(packed, scene)
+    return packed
+
+
+def fill(packed: Packed, scene: GaussianScene) -> None:
+    """Write the scene's values into the packed arrays, in the order they have: for a scene under training."""
+    sh = scene.sh.reshape(scene.count, -1)
+    _fill(
+        scene.means, scene.quats, scene.scales, scene.opacities, sh, packed.count, packed.order,
+        packed.geometry, packed.sh, packed.spheres,
+    )  # fmt: skip
+
+
+def _morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
+    # Quantiles, not extremes: a few far floaters must not squeeze the rest into one cell.
+    low, high = np.quantile(means[:: max(1, len(means) // 20_000)], [0.01, 0.99], axis=0)
+    cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.uint32)
+    code = np.zeros(len(means), np.uint32)
+    for axis in range(3):
+        x = cells[:, axis]
+        for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+            x = (x | (x << np.uint32(shift))) & np.uint32(mask)
+        code |= x << np.uint32(axis)
+    return np.argsort(code, kind="stable").astype(np.int32)
+
+
+@kernel
+def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh, spheres):
+    coefficients = sh.shape[1]
+    for place in range(order.shape[0]):
+        i = order[place]
+        g = (place // 16) * 160 + (place & 15)
+        w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
+        s0, s1, s2 = scales[i, 0], scales[i, 1], scales[i, 2]
+        r00, r01, r02 = (1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2
+        r10, r11, r12 = 2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2
+        r20, r21, r22 = 2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2
+        geometry[g], geometry[g + 16], geometry[g + 32] = means[i, 0], means[i, 1], means[i, 2]
+        geometry[g + 48] = r00 * r00 + r01 * r01 + r02 * r02
+        geometry[g + 64] = r00 * r10 + r01 * r11 + r02 * r12
+        geometry[g + 80] = r00 * r20 + r01 * r21 + r02 * r22
+        geometry[g + 96] = r10 * r10 + r11 * r11 + r12 * r12
+        geometry[g + 112] = r10 * r20 + r11 * r21 + r12 * r22
+        geometry[g + 128] = r20 * r20 + r21 * r21 + r22 * r22
+        visible = place < count and opacities[i] > 0
+        geometry[g + 144] = np.float32(np.log2(opacities[i])) if visible else np.float32(NEVER)
+        at = (place // 16) * coefficients * 16 + (place & 15)
+        for k in range(coefficients):
+            packed_sh[at + k * 16] = sh[i, k]
+    for block in range(spheres.shape[0]):
+        first = block * 64 * 16
+        last = min(first + 64 * 16, order.shape[0])
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for place in range(first, last):
+            for axis in range(3):
+                low[axis] = min(low[axis], means[order[place], axis])
+                high[axis] = max(high[axis], means[order[place], axis])
+        radius = 0.0
+        for place in range(first, last):
+            i = order[place]
+            squared = 0.0
+            for axis in range(3):
+                squared += (means[i, axis] - 0.5 * (low[axis] + high[axis])) ** 2
+            extent = VISIBLE_SIGMAS * max(scales[i, 0], scales[i, 1], scales[i, 2])
+            radius = max(radius, np.sqrt(squared) + extent)
+        for axis in range(3):
+            spheres[block, axis] = 0.5 * (low[axis] + high[axis])
+        spheres[block, 3] = radius
