@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -27,16 +27,16 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class SceneGradients:
-    """d loss / d parameter, for the activated parameters of `GaussianScene`."""
+    """d loss / d parameter, for the activated parameters of `GaussianScene`: rows of the Gaussians in view only."""
 
-    means: Float32[np.ndarray, "n 3"]
-    quats: Float32[np.ndarray, "n 4"]
-    """Of the quaternion as stored, through its normalization: tangential to the unit sphere."""
-    scales: Float32[np.ndarray, "n 3"]
-    opacities: Float32[np.ndarray, "n"]
-    sh: Float32[np.ndarray, "n k 3"]
-    means2d: Float32[np.ndarray, "n"]
-    """Norm of the gradient with respect to the projected centre, in pixels; 0 for unseen Gaussians."""
+    index: Int32[np.ndarray, "v"]
+    """Which Gaussian of the scene each row belongs to; all others' gradients are 0."""
+    means: Float32[np.ndarray, "v 3"]
+    quats: Float32[np.ndarray, "v 4"]
+    """Through the quaternion's normalization: tangential to the unit sphere."""
+    scales: Float32[np.ndarray, "v 3"]
+    opacities: Float32[np.ndarray, "v"]
+    sh: Float32[np.ndarray, "v k 3"]
 
 
 class Rasterizer(Protocol):
@@ -110,6 +110,9 @@ class Tools:
     """Seeded by the job's seed: the only source of randomness."""
     prepared: Any = None
     """What the estimator's own `prepare` made for this scene, shared by all jobs; None if it has none."""
+    memo: dict[Any, Any] = field(default_factory=dict)
+    """What one part of the job computed and another wants too (the photo's features, the last render): a cache
+    of this job alone; it never changes a result's meaning."""
 
 
 class Estimator(Protocol):

@@ -1,0 +1,212 @@
+"""The default estimator: recognise the photo among rendered views, resect, align. Needs no prior.
+
+    features of the photo -> views that look like it (VLAD) -> matches, lifted to 3D -> PnP
+    -> while few agree: render there, match again -> align photometrically on two renders -> verification gate
+
+Only if the gate doesn't accept the answer are the dearer searches tried: a vote of features instead of VLAD, and
+the photo turned by quarters. A prior pose is one more candidate view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from service.geometry import pose_distance
+from service.interfaces import Features, Tools
+from service.pose.alignment import align
+from service.pose.gate import verify
+from service.pose.index import ViewIndex, prepared_index
+from service.pose.pnp import Resection, resection
+from service.pose.retrieval import top, vlad, vote
+from service.pose.views import (
+    PHOTO_PX,
+    Correspondences,
+    View,
+    correspondences,
+    photo_at,
+    photo_features,
+    rendered_frame,
+    rendered_view,
+)
+from service.types import Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Status
+
+MATCH_ERROR_PX = 4.0
+"""At PHOTO_PX; XFeat's points scatter by 1.5 px."""
+REMATCH_ERROR_PX = 3.0
+GOOD_MATCH = 60
+"""Inliers with one view that make further views needless."""
+HOPELESS = 12
+"""Fewer inliers than this are chance: photos of other scenes end at 9 to 27."""
+STRONG = 150
+"""Inliers with which alignment needs no further match."""
+SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
+"""A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    candidates: int = 5
+    """Index views that the photo is matched with in one search."""
+    rematches: int = 3
+    """Rounds of rendering at the pose and matching again, at most, where few matches agree."""
+    alignments: int = 2
+    """Rounds of rendering at the pose and aligning photometrically; 0 leaves the pose as matched."""
+    escalate: bool = True
+    """Search on (vote of features, quarter turns) while the verification gate doesn't accept the answer."""
+
+    __pydantic_config__ = {"extra": "forbid", "use_attribute_docstrings": True}
+
+
+def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
+    """Make or read the scene's view index: a second or two, once."""
+    return prepared_index(tools, cache_dir)
+
+
+def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    best_pose, best_score = None, -1.0
+    for search in _searches(query, tools, options):
+        last = None
+        for last in search:
+            yield last if best_pose is None else replace(last, pose=best_pose)
+        if last is None or (best_pose and (last.num_inliers or 0) < HOPELESS):
+            continue
+        verdict = verify(query, last.pose, tools)
+        if verdict.score > best_score:
+            best_pose, best_score = last.pose, verdict.score
+        yield IterationRecord("verify", best_pose, loss=1.0 - best_score, num_inliers=verdict.inliers)
+        if verdict.status is Status.LOCALIZED:
+            return
+
+
+def _searches(query: Query, tools: Tools, options: Options) -> Iterator[Iterator[IterationRecord]]:
+    """The ways to look for the photo in the index, cheapest first."""
+    index: ViewIndex = tools.prepared
+    photo = photo_features(query, tools)
+    yield _search(
+        "retrieve", photo, index.vectors @ vlad(photo.descriptors, index.words), query, tools, options
+    )
+    if not options.escalate:
+        return
+    votes = vote(photo.descriptors, [view.features.descriptors for view in index.views])
+    yield _search("vote", photo, votes, query, tools, options)
+    for quarter_turns in (1, 3, 2):
+        turned = photo_features(query, tools, quarter_turns)
+        scores = index.vectors @ vlad(turned.descriptors, index.words)
+        yield _search(f"turn_{90 * quarter_turns}", turned, scores, query, tools, options)
+
+
+def _search(
+    stage: str, photo: Features, scores: np.ndarray, query: Query, tools: Tools, options: Options
+) -> Iterator[IterationRecord]:
+    """Go from scored views to an aligned pose; end early where too few matches agree."""
+    index: ViewIndex = tools.prepared
+    chosen = top(scores, options.candidates)
+    views = [index.views[i] for i in chosen]
+    poses = np.stack([view.camera.pose.world_from_camera for view in views])
+    yield IterationRecord(
+        stage, views[0].camera.pose, candidates=Candidates(poses, scores[chosen].astype(np.float64))
+    )
+    if query.prior is not None and stage == "retrieve":
+        views.insert(0, rendered_view(query.prior, query, tools)[0])
+    found = yield from _matched(photo, views, query, tools)
+    if found is None:
+        return
+    if found.num_inliers < STRONG:
+        found = yield from _rematched(found, query, tools, options.rematches)
+    if found.num_inliers >= HOPELESS:
+        yield from _aligned(found, query, tools, options.alignments)
+
+
+def _matched(
+    photo: Features, views: Sequence[View], query: Query, tools: Tools
+) -> Generator[IterationRecord, None, Resection | None]:
+    """Match the photo with one view after the other until one explains it; else with all of them together."""
+    best: Resection | None = None
+    seen: list[Correspondences] = []
+    for view in views:
+        seen.append(correspondences(photo, view, tools.matcher))
+        found = _resected(seen[-1], query, MATCH_ERROR_PX)
+        if found and (best is None or found.num_inliers > best.num_inliers):
+            best = found
+        pose = best.pose if best else views[0].camera.pose
+        yield _match_record("match", pose, seen[-1], found, view.camera)
+        if best and best.num_inliers >= GOOD_MATCH:
+            return best
+    pooled = Correspondences(
+        *(np.concatenate([getattr(c, name) for c in seen]) for name in Correspondences.__slots__)
+    )
+    found = _resected(pooled, query, MATCH_ERROR_PX)
+    if found and (best is None or found.num_inliers > best.num_inliers):
+        best = found
+    if best:
+        yield IterationRecord(
+            "pool", best.pose, num_matches=len(pooled.photo_px), num_inliers=best.num_inliers
+        )
+    return best
+
+
+def _rematched(
+    found: Resection, query: Query, tools: Tools, rounds: int
+) -> Generator[IterationRecord, None, Resection]:
+    """Render at the pose and match with that, which looks more like the photo than any index view."""
+    photo = photo_features(query, tools)
+    for _ in range(rounds):
+        view, _ = rendered_view(found.pose, query, tools)
+        matches = correspondences(photo, view, tools.matcher)
+        again = _resected(matches, query, REMATCH_ERROR_PX)
+        if again is None or again.num_inliers < found.num_inliers // 2:
+            break
+        step_deg, step_units = pose_distance(found.pose, again.pose)
+        distance = np.median(np.linalg.norm(view.points_in_world - again.pose.position_in_world, axis=1))
+        found = again
+        yield replace(
+            _match_record("rematch", found.pose, matches, found, view.camera),
+            step_deg=step_deg,
+            step_units=step_units,
+        )
+        if step_deg < SETTLED_DEG and step_units < SETTLED_SHARE * distance:
+            break
+    return found
+
+
+def _aligned(found: Resection, query: Query, tools: Tools, rounds: int) -> Iterator[IterationRecord]:
+    pose = found.pose
+    for round_number in range(rounds):
+        frame, camera = rendered_frame(pose, query, tools)
+        levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
+        photo = photo_at(query, camera.intrinsics.width, camera.intrinsics.height)
+        result = align(photo, frame, camera, pose, levels)
+        if not np.isfinite(result.loss):
+            return
+        step_deg, step_units = pose_distance(pose, result.pose)
+        pose = result.pose
+        yield IterationRecord(
+            "align",
+            pose,
+            result.loss,
+            num_inliers=found.num_inliers,
+            step_deg=step_deg,
+            step_units=step_units,
+        )
+
+
+def _resected(matches: Correspondences, query: Query, max_error_px: float) -> Resection | None:
+    pixels = max_error_px * query.intrinsics.long_side / min(PHOTO_PX, query.intrinsics.long_side)
+    return resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels)
+
+
+def _match_record(
+    stage: str, pose: Pose, matches: Correspondences, found: Resection | None, camera: Camera
+) -> IterationRecord:
+    inlier = found.inlier if found else np.zeros(len(matches.photo_px), bool)
+    return IterationRecord(
+        stage,
+        pose,
+        num_matches=len(inlier),
+        num_inliers=int(inlier.sum()),
+        matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),
+    )

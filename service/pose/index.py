@@ -1,0 +1,114 @@
+"""The view index: renders of the scene from well spread places, made once, that a photo is recognised in."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from service.interfaces import Features, Tools
+from service.pose.retrieval import visual_words, vlad
+from service.pose.views import VIEW_FEATURES, View, render_views
+from service.pose.viewpoints import INDEX_PX, index_cameras
+from service.types import Camera, Intrinsics, Pose
+
+VERSION = 1
+"""Raise it with any change that makes stored indexes differ from fresh ones."""
+BATCH = 8
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ViewIndex:
+    views: tuple[View, ...]
+    words: Float32[np.ndarray, "words d"]
+    vectors: Float32[np.ndarray, "views size"]
+    """VLAD of each view."""
+
+
+def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
+    """Read the scene's index from the cache, or build it and store it there."""
+    path = cache_dir / f"view-index-{_key(tools)}.npz" if cache_dir else None
+    if path and path.exists():
+        try:
+            return _read(path)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
+    index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
+    if path:
+        _write(index, path)
+    return index
+
+
+def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
+    views: list[View] = []
+    for start in range(0, len(cameras), BATCH):
+        rendered = render_views(cameras[start : start + BATCH], tools.rasterizer, tools.matcher)
+        views += [view for view, _ in rendered if len(view.points_in_world)]
+    descriptors = [view.features.descriptors for view in views]
+    words = visual_words(np.concatenate(descriptors), tools.rng)
+    log.info("view index of %s: %d views", tools.scene.info.name, len(views))
+    return ViewIndex(tuple(views), words, np.stack([vlad(d, words) for d in descriptors]))
+
+
+def _key(tools: Tools) -> str:
+    """Everything that the index depends on; the scene's digest covers its training cameras."""
+    parts = (
+        VERSION,
+        tools.scene.info.sha256,
+        tools.matcher.name,
+        INDEX_PX,
+        VIEW_FEATURES,
+        len(tools.scene.cameras),
+    )
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
+
+
+def _write(index: ViewIndex, path: Path) -> None:
+    """Write to the side and rename, so that no reader sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cameras = [view.camera for view in index.views]
+    arrays = {
+        "words": index.words,
+        "vectors": index.vectors,
+        "counts": np.array([len(view.points_in_world) for view in index.views]),
+        "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
+        "pinholes": np.array(
+            [(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]
+        ),
+        "world_from_camera": np.stack([c.pose.world_from_camera for c in cameras]),
+        "points_px": np.concatenate([view.features.points_px for view in index.views]),
+        "scores": np.concatenate([view.features.scores for view in index.views]),
+        "descriptors": np.concatenate([view.features.descriptors for view in index.views]),
+        "points_in_world": np.concatenate([view.points_in_world for view in index.views]),
+    }
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _read(path: Path) -> ViewIndex:
+    with np.load(path, allow_pickle=False) as file:
+        stored = {name: file[name] for name in file.files}
+    stops = np.cumsum(stored["counts"])
+    views = []
+    for i, (start, stop) in enumerate(zip(stops - stored["counts"], stops, strict=True)):
+        width, height = (int(v) for v in stored["sizes"][i])
+        intrinsics = Intrinsics(width, height, *(float(v) for v in stored["pinholes"][i]))
+        features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
+        camera = Camera(intrinsics, Pose(stored["world_from_camera"][i]))
+        views.append(View(camera, features, stored["points_in_world"][start:stop]))
+    return ViewIndex(tuple(views), stored["words"], stored["vectors"])

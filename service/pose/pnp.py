@@ -1,0 +1,71 @@
+"""PoseLib, wrapped: the camera pose from pixels and the scene points seen in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+from jaxtyping import Bool, Float
+
+from service.geometry import project, transformed
+from service.types import Intrinsics, Pose
+
+MIN_POINTS = 4
+MAX_TRIALS = 2000
+"""RANSAC trials: found with 95 % certainty where one match in ten is right; 10 ms at the most."""
+
+
+@dataclass(frozen=True, slots=True)
+class Resection:
+    pose: Pose
+    inlier: Bool[np.ndarray, "m"]
+
+    @property
+    def num_inliers(self) -> int:
+        return int(self.inlier.sum())
+
+
+def resection(
+    photo_px: Float[np.ndarray, "m 2"],
+    points_in_world: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+    max_error_px: float,
+    seed: int = 0,
+) -> Resection | None:
+    """Return the pose that most of the matches agree with, refined on them; None if there is none."""
+    if len(photo_px) < MIN_POINTS:
+        return None
+    camera = {
+        "model": "PINHOLE",
+        "width": intrinsics.width,
+        "height": intrinsics.height,
+        "params": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
+    }
+    ransac = {
+        "max_reproj_error": max_error_px,
+        "min_iterations": 100,
+        "max_iterations": MAX_TRIALS,
+        "seed": seed,
+    }
+    found, info = poselib.estimate_absolute_pose(
+        np.asarray(photo_px, np.float64), np.asarray(points_in_world, np.float64), camera, ransac, {}
+    )
+    if info["num_inliers"] < MIN_POINTS or not np.all(np.isfinite(found.Rt)):
+        return None
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = found.R.T
+    world_from_camera[:3, 3] = -found.R.T @ found.t
+    return Resection(Pose(world_from_camera), np.array(info["inliers"], bool))
+
+
+def reprojection_error_px(
+    photo_px: Float[np.ndarray, "m 2"],
+    points_in_world: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+    pose: Pose,
+) -> Float[np.ndarray, "m"]:
+    """Return the distances in pixels; infinite for points behind the camera."""
+    points = transformed(pose.camera_from_world, points_in_world)
+    distance = np.linalg.norm(project(points, intrinsics) - photo_px, axis=1)
+    return np.where(points[:, 2] > 1e-9, distance, np.inf)
