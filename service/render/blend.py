@@ -19,7 +19,9 @@ from service.render.project import LOG2_ALPHA_MIN, TILE
 from service.render.simd import (
     as_float,
     as_int,
+    at,
     bits,
+    broadcast,
     compress,
     fma,
     iota,
@@ -68,8 +70,8 @@ def gather_batch(records, entries, first, count, local):
     for group in range(0, count, 16):
         base = LOCAL + group * 16
         for lane in range(16):
-            at = min(group + lane, count - 1)
-            store(local, LOCAL + lane * 16, load(records, np.intp(entries[first + at]) * 16))
+            entry = first + min(group + lane, count - 1)
+            store(local, LOCAL + lane * 16, load(records, at(entries, entry) * 16))
         transpose16(local, LOCAL, 16, local, group, BATCH)
         if group + 16 > count:
             real = (iota() + isplat(group)) < isplat(count)
@@ -157,37 +159,41 @@ def blend(records, starts, entries, width, height, background, local, lists, len
 @inline
 def _run_block(local, lists, block, length, px, py, state):
     """Composite the block's list onto its state. False when every pixel is opaque."""
-    at = block * STATE
-    t, r, g = load(state, at), load(state, at + 16), load(state, at + 32)
-    b, d, m = load(state, at + 48), load(state, at + 64), load(state, at + 80)
-    total = load(state, at + 96)
+    base = block * STATE
+    t, r, g = load(state, base), load(state, base + 16), load(state, base + 32)
+    b, d, m = load(state, base + 48), load(state, base + 64), load(state, base + 80)
+    total = load(state, base + 96)
     going = True
     for start in range(0, length, 16):
         for k in range(start, min(start + 16, length)):
-            i = np.intp(lists[block * LIST + k])
-            dx = px - local[X + i]
-            dy = py - local[Y + i]
-            e = local[O + i] - fma(dx, fma(dx, local[A + i], dy * local[B + i]), dy * dy * local[C + i])
+            i = at(lists, block * LIST + k)
+            dx = px - broadcast(local, X + i)
+            dy = py - broadcast(local, Y + i)
+            e = broadcast(local, O + i) - fma(
+                dx,
+                fma(dx, broadcast(local, A + i), dy * broadcast(local, B + i)),
+                dy * dy * broadcast(local, C + i),
+            )
             a = select(e >= LOG2_ALPHA_MIN, vmin(exp2(e), ALPHA_MAX), 0.0)
-            m = select((t > 0.5) & (e >= LOG2_ALPHA_MIN), local[Z + i], m)
+            m = select((t > 0.5) & (e >= LOG2_ALPHA_MIN), broadcast(local, Z + i), m)
             w = a * t
             t = fma(-a, t, t)
             w = select(t > T_MIN, w, 0.0)
             total = total + w
-            r = fma(w, local[R + i], r)
-            g = fma(w, local[G + i], g)
-            b = fma(w, local[BL + i], b)
-            d = fma(w, local[Z + i], d)
+            r = fma(w, broadcast(local, R + i), r)
+            g = fma(w, broadcast(local, G + i), g)
+            b = fma(w, broadcast(local, BL + i), b)
+            d = fma(w, broadcast(local, Z + i), d)
         if bits(t > T_MIN) == 0:
             going = False
             break
-    store(state, at, t)
-    store(state, at + 16, r)
-    store(state, at + 32, g)
-    store(state, at + 48, b)
-    store(state, at + 64, d)
-    store(state, at + 80, m)
-    store(state, at + 96, total)
+    store(state, base, t)
+    store(state, base + 16, r)
+    store(state, base + 32, g)
+    store(state, base + 48, b)
+    store(state, base + 64, d)
+    store(state, base + 80, m)
+    store(state, base + 96, total)
     return going
 
 

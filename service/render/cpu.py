@@ -12,12 +12,16 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
-from service.interfaces import Frame
-from service.render.blend import LIST, LOCAL, STATE, blend
-from service.render.pack import Packed, aligned, pack
+from service.interfaces import Frame, SceneGradients
+from service.render.backward import INPUT, WORK, blend_backward
+from service.render.blend import BATCH, LIST, LOCAL, STATE, blend
+from service.render.chain import ROW, pose_twist, scene_rows, unpack_rows
+from service.render.pack import LANES, Packed, aligned, pack
 from service.render.project import RECORD, TILE, project
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
@@ -46,7 +50,10 @@ def dilation_for(camera: Camera, info: SceneInfo) -> float:
 
 
 class CpuRasterizer:
-    """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest picture seen."""
+    """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest picture seen.
+
+    The gradients use the lists of the thread's last picture if it was of the same camera object, else they render first.
+    """
 
     name = "cpu"
 
@@ -61,32 +68,97 @@ class CpuRasterizer:
             return [self._render(cameras[0])]
         return list(_POOL.map(self._render, cameras))
 
-    def _render(self, camera: Camera) -> Frame:
-        scratch = self._scratch()
-        self._bin(camera, scratch)
-        width, height = camera.intrinsics.width, camera.intrinsics.height
-        rgb, planes = np.empty((height, width, 3), np.float32), np.empty((3, height, width), np.float32)
-        blend(
-            scratch.records, scratch.starts, scratch.entries, width, height, self._background, scratch.local,
-            scratch.lists, scratch.lengths, scratch.state, rgb.ravel(),
-            planes[0].ravel(), planes[1].ravel(), planes[2].ravel(),
+    def pose_gradient(
+        self,
+        camera: Camera,
+        d_rgb: Float32[np.ndarray, "h w 3"],
+        d_depth: Float32[np.ndarray, "h w"] | None = None,
+        d_alpha: Float32[np.ndarray, "h w"] | None = None,
+    ) -> Float64[np.ndarray, "6"]:
+        s = self._backward(camera, d_rgb, d_depth, d_alpha)
+        twist = np.empty(6)
+        pose_twist(s.records, s.sums, s.visible, *self._chain_arguments(camera, s), twist)
+        return twist
+
+    def scene_gradients(
+        self,
+        camera: Camera,
+        d_rgb: Float32[np.ndarray, "h w 3"],
+        d_depth: Float32[np.ndarray, "h w"] | None = None,
+        d_alpha: Float32[np.ndarray, "h w"] | None = None,
+    ) -> SceneGradients:
+        s = self._backward(camera, d_rgb, d_depth, d_alpha)
+        n, scene = s.visible, self.scene
+        rows = aligned((n + LANES) * ROW)
+        scene_rows(s.records, s.sums, n, *self._chain_arguments(camera, s), rows)
+        result = SceneGradients(
+            np.empty(n, np.int32),
+            np.empty((n, 3), np.float32),
+            np.empty((n, 4), np.float32),
+            np.empty((n, 3), np.float32),
+            np.empty(n, np.float32),
+            np.empty((n, *scene.sh.shape[1:]), np.float32),
+        )
+        unpack_rows(
+            rows, s.records, n, self.packed.order, scene.quats, scene.scales, scene.opacities, scene.sh_degree,
+            result.index, result.means, result.quats, result.scales, result.opacities, result.sh,
         )  # fmt: skip
-        return Frame(rgb, planes[0], planes[1], planes[2])
+        return result
+
+    def _render(self, camera: Camera) -> Frame:
+        s = self._scratch()
+        s.camera = None  # an error on the way must not leave another camera's lists behind
+        self._bin(camera, s)
+        k = camera.intrinsics
+        frame = Frame(
+            np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32)
+        )
+        blend(
+            s.records, s.starts, s.entries, k.width, k.height, self._background, s.local, s.lists, s.lengths, s.state,
+            frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1),
+        )  # fmt: skip
+        for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
+            image.flags.writeable = False
+        s.camera, s.frame = camera, frame
+        return frame
+
+    def _backward(self, camera: Camera, d_rgb: Any, d_depth: Any, d_alpha: Any) -> _Scratch:
+        """Fill `sums` for the picture of this camera; it is rendered first unless it was this thread's last."""
+        s = self._scratch()
+        frame = s.frame if s.camera is camera and s.frame is not None else self._render(camera)
+        width, height = camera.intrinsics.width, camera.intrinsics.height
+        zero = np.zeros(width * height, np.float32)
+        s.sums[: s.visible * RECORD] = 0
+        blend_backward(
+            s.records, s.starts, s.entries, width, height, self._background, frame.rgb.reshape(-1),
+            frame.alpha.reshape(-1), frame.depth.reshape(-1), _flat(d_rgb),
+            zero if d_depth is None else _flat(d_depth), zero if d_alpha is None else _flat(d_alpha),
+            s.local, s.lists, s.lengths, s.inputs, s.work, s.batch_sums, s.sums,
+        )  # fmt: skip
+        return s
+
+    def _chain_arguments(self, camera: Camera, s: _Scratch) -> tuple:
+        packed, k = self.packed, camera.intrinsics
+        return (
+            packed.geometry, packed.sh, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
+            *self._dilation(camera), s.local,
+        )  # fmt: skip
 
     def _scratch(self) -> _Scratch:
         if not hasattr(self._local, "scratch"):
             self._local.scratch = _Scratch(self.packed)
         return self._local.scratch
 
+    def _dilation(self, camera: Camera) -> tuple[np.float32, bool]:
+        info = self.scene.info
+        return np.float32(dilation_for(camera, info)), info.render_mode == "antialiased"
+
     def _bin(self, camera: Camera, s: _Scratch) -> None:
         """Project, sort and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
-        view = np.ascontiguousarray(camera.pose.camera_from_world[:3], np.float32).ravel()
-        lens = np.array([k.fx, k.fy, k.cx, k.cy], np.float32)
         s.visible, count = project(
-            packed.geometry, packed.sh, packed.spheres, packed.sh_degree, view, lens, k.width, k.height,
-            np.float32(dilation_for(camera, self.scene.info)), self.scene.info.render_mode == "antialiased",
-            np.float32(NEAR), s.records, s.depths, s.rects, s.local,
+            packed.geometry, packed.sh, packed.spheres, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
+            *self._dilation(camera), np.float32(NEAR), s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:
@@ -95,6 +167,16 @@ class CpuRasterizer:
             s.starts = np.empty(tiles_x * tiles_y + 1, np.int32)
         sort_by_depth(s.depths, s.visible, s.keys, s.swap, s.histogram)
         fill_tiles(s.keys, s.visible, s.rects, tiles_x, tiles_y, s.starts, s.entries)
+
+
+def _view_and_lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    k = camera.intrinsics
+    view = np.ascontiguousarray(camera.pose.camera_from_world[:3], np.float32).reshape(-1)
+    return view, np.array([k.fx, k.fy, k.cx, k.cy], np.float32)
+
+
+def _flat(image: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(image, np.float32).reshape(-1)
 
 
 class _Scratch:
@@ -115,3 +197,10 @@ class _Scratch:
         self.lengths = np.empty(16, np.int32)
         self.state = aligned(16 * STATE)
         self.visible = 0
+        self.camera: Camera | None = None
+        """Whose picture the lists belong to."""
+        self.frame: Frame | None = None
+        self.inputs = aligned(16 * INPUT)
+        self.work = aligned(WORK)
+        self.batch_sums = aligned(BATCH * RECORD)
+        self.sums = aligned(room * RECORD)

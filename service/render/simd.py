@@ -342,6 +342,28 @@ def iload(typingctx: Any, array: Any, offset: Any) -> Any:
 
 
 @intrinsic
+def broadcast(typingctx: Any, array: Any, offset: Any) -> Any:
+    """One float32 in every lane; unlike array[offset] without the test for a negative index."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        p = _pointer(context, builder, sig.args[0], args[0], args[1])
+        return _splat(builder, builder.load(p), _VF)
+
+    return f32x16(array, types.intp), codegen
+
+
+@intrinsic
+def at(typingctx: Any, array: Any, offset: Any) -> Any:
+    """array[offset] of a one-dimensional contiguous int32 array as an index, without the test for a negative one."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        p = _pointer(context, builder, sig.args[0], args[0], args[1])
+        return builder.zext(builder.load(p), _I64)
+
+    return types.intp(array, types.intp), codegen
+
+
+@intrinsic
 def store(typingctx: Any, array: Any, offset: Any, vector: Any) -> Any:
     """Write 16 consecutive elements (float32 or int32)."""
 
