@@ -1,0 +1,398 @@
+"""Bytes of a photo -> `Query`: upright, undistorted, uint8, no larger than needed, with a pinhole camera.
+
+JPEG, PNG, WebP and HEIC. The size is checked in the header before anything is decoded. Colour profiles are
+not applied: a phone's Display P3 comes out slightly paler, which gain and bias of the alignment absorb.
+
+Focal lengths without calibration: EXIF's 35 mm equivalent f is taken as fx = f / 36 mm x long side. Makers
+who define it by the diagonal (43.27 mm) instead mean 4 % more on a 4:3 sensor and the same on a 3:2 one.
+Without EXIF, fx = 0.78 x long side: 28 mm, near the main camera of phones (24 to 28 mm), whose photos lose
+their EXIF in messengers.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from pi_heif import HeifImageFile
+from PIL import ExifTags, Image
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.WebPImagePlugin import WebPImageFile
+
+from service.errors import InvalidImage, InvalidIntrinsics
+from service.types import Intrinsics, Pose, Query
+
+MAX_PIXELS = 64 * 1024 * 1024
+"""A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
+LONG_SIDE = 1600
+"""Of `Query.rgb`; matching uses 512 and alignment 400 pixels, the rest is for close looks."""
+MIN_SIDE = 32
+"""Of `Query.rgb`; the features need more anyway."""
+GUESSED_FOCAL = 0.78
+"""In long sides; see the module's docstring."""
+
+DISTORTION_COUNTS = {
+    "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8,
+    "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4,
+}  # fmt: skip
+"""COLMAP's camera models -> number of parameters after focal lengths and principal point."""
+_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+# The classes are called directly: Image.open would try every format that Pillow knows, and warn before we
+# check.
+_DECODERS = (
+    ("JPEG", JpegImageFile, lambda d: d.startswith(b"\xff\xd8\xff")),
+    ("PNG", PngImageFile, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
+    ("WebP", WebPImageFile, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
+    ("HEIC", HeifImageFile, lambda d: d[4:8] == b"ftyp"),
+)
+_ORIENTATIONS = {
+    1: (False, False, False),
+    2: (False, True, False),
+    3: (False, True, True),
+    4: (False, False, True),
+    5: (True, False, False),
+    6: (True, True, False),
+    7: (True, True, True),
+    8: (True, False, True),
+}
+"""EXIF orientation -> what makes the image upright: transpose, mirror left-right, mirror top-bottom."""
+log = logging.getLogger(__name__)
+
+
+def read_query(
+    data: bytes,
+    *,
+    intrinsics: Intrinsics | None = None,
+    prior: Pose | None = None,
+    background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Query:
+    """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
+
+    `intrinsics` refer to the upright photo in its full size. Transparent parts are filled with
+    `background_rgb` (0..1): pass the scene's, then a cut-out object looks as it does in a render.
+    """
+    name, photo = _open(data)
+    decoded = _decode(photo, name, background_rgb)
+    warnings = list(decoded.warnings)
+    if intrinsics is not None:
+        _require_size(intrinsics, decoded.width, decoded.height)
+        source = "given"
+    else:
+        focal_mm = _focal_35mm(photo)
+        source = "exif" if focal_mm else "guessed"
+        if not focal_mm:
+            warnings.append(
+                "The photo says nothing of its focal length; 28 mm (35 mm equivalent) is assumed. "
+                "Send intrinsics for an exact pose."
+            )
+        long_side = max(decoded.width, decoded.height)
+        focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
+        intrinsics = Intrinsics(
+            decoded.width, decoded.height, focal, focal, decoded.width / 2, decoded.height / 2
+        )
+    rgb, pinhole = undistorted(decoded.rgb, decoded.camera(intrinsics))
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
+
+
+def encode_jpeg(rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]) -> bytes:
+    """Return an image (uint8, or a render's float32 in 0..1) as JPEG for looking at."""
+    if rgb.dtype != np.uint8:
+        rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    encoded, data = cv2.imencode(".jpg", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    if not encoded:
+        raise ValueError(f"an image of shape {rgb.shape} can't be JPEG")
+    return data.tobytes()
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """Return width and height of the upright photo, from its header. Raises InvalidImage."""
+    _, photo = _open(path.read_bytes())
+    transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
+    return (photo.height, photo.width) if transpose else photo.size
+
+
+def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
+    """Parse `{width, height, fx, fy, cx, cy, model?, distortion?}`. Raises InvalidIntrinsics with the field.
+
+    `distortion` has COLMAP's parameters of `model` after the focal lengths and the principal point.
+    """
+    required = ("width", "height", "fx", "fy", "cx", "cy")
+    unknown = [key for key in mapping if key not in (*required, "model", "distortion")]
+    if unknown:
+        known = ", ".join((*required, "model", "distortion"))
+        raise InvalidIntrinsics(f"unknown; known: {known}.", where=str(unknown[0])[:40])
+    for key in required:
+        if key not in mapping:
+            raise InvalidIntrinsics("is missing.", where=key)
+    values = {key: _number(mapping[key], key) for key in required}
+    for key in ("width", "height"):
+        if values[key] != int(values[key]):
+            raise InvalidIntrinsics(f"must be a whole number of pixels, is {values[key]}.", where=key)
+    model = mapping.get("model", "PINHOLE")
+    if not isinstance(model, str) or model not in DISTORTION_COUNTS:
+        raise InvalidIntrinsics(
+            f"there is no camera model {str(model)[:40]!r}; known: {', '.join(DISTORTION_COUNTS)}.",
+            where="model",
+        )
+    distortion = mapping.get("distortion", ())
+    if not isinstance(distortion, list | tuple) or len(distortion) != DISTORTION_COUNTS[model]:
+        count = len(distortion) if isinstance(distortion, list | tuple) else "no list"
+        raise InvalidIntrinsics(
+            f"{model} has {DISTORTION_COUNTS[model]} parameters after the principal point, here are {count}.",
+            where="distortion",
+        )
+    if model in _ONE_FOCAL and values["fx"] != values["fy"]:
+        raise InvalidIntrinsics(f"{model} has one focal length: fy must equal fx.", where="fy")
+    return Intrinsics(
+        width=int(values["width"]),
+        height=int(values["height"]),
+        **{key: values[key] for key in required[2:]},
+        model=model,
+        distortion=tuple(_number(v, "distortion") for v in distortion),
+    )
+
+
+def undistorted(
+    rgb: UInt8[np.ndarray, "h w 3"], intrinsics: Intrinsics
+) -> tuple[UInt8[np.ndarray, "h w 3"], Intrinsics]:
+    """Return the image as a pinhole of the same focal length and size sees it; black where it sees more."""
+    pinhole = replace(intrinsics, model="PINHOLE", distortion=())
+    if not any(intrinsics.distortion) and "FISHEYE" not in intrinsics.model:
+        return rgb, pinhole
+    columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], -1)
+    source = distorted(rays.reshape(-1, 2), intrinsics).reshape(rays.shape)
+    x = source[..., 0] * pinhole.fx + pinhole.cx - 0.5  # cv2 counts from the centre of the first pixel
+    y = source[..., 1] * pinhole.fy + pinhole.cy - 0.5
+    maps: list[Float32[np.ndarray, "h w"]] = [np.nan_to_num(m, nan=-10.0).astype(np.float32) for m in (x, y)]
+    return cv2.remap(rgb, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), pinhole
+
+
+def distorted(rays: Float64[np.ndarray, "n 2"], intrinsics: Intrinsics) -> Float64[np.ndarray, "n 2"]:
+    """Return where a pinhole's points (x/z, y/z) lie on the distorted camera's plane z = 1.
+
+    nan where a ray lies beyond the radius up to which the model is monotonic: there the polynomial folds back
+    and shows the inside of the image once more.
+    """
+    k = np.zeros(8)
+    k[: len(intrinsics.distortion)] = intrinsics.distortion
+    radius = np.linalg.norm(rays, axis=1)
+    if "FISHEYE" in intrinsics.model:
+        theta = np.arctan(radius)
+        reach = _monotonic_up_to(lambda t: _fisheye(t, k), float(theta.max()))
+        factor = _fisheye(theta, k) / np.maximum(radius, 1e-12)
+        factor[radius < 1e-8] = 1.0
+        factor[theta > reach] = np.nan
+        return rays * factor[:, None]
+    if intrinsics.model in ("SIMPLE_RADIAL", "RADIAL"):
+        k[2:4] = 0.0  # p1, p2
+    reach = _monotonic_up_to(lambda r: r * _radial(r, k), float(radius.max()))
+    factor = _radial(radius, k)
+    factor[radius > reach] = np.nan
+    x, y = rays.T
+    p1, p2 = k[2], k[3]
+    tangential = [
+        2 * p1 * x * y + p2 * (radius**2 + 2 * x * x),
+        p1 * (radius**2 + 2 * y * y) + 2 * p2 * x * y,
+    ]
+    return rays * factor[:, None] + np.stack(tangential, 1)
+
+
+def _radial(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
+    """k1 k2 p1 p2 k3 k4 k5 k6, as in OPENCV and FULL_OPENCV."""
+    r2 = r * r
+    above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
+    return above / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+
+
+def _fisheye(theta: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
+    t2 = theta * theta
+    return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+
+
+def _monotonic_up_to(function, end: float) -> float:
+    """Return the largest argument in 0..end up to which the function grows."""
+    at = np.linspace(0, end, 1025)
+    falls = np.flatnonzero(np.diff(function(at)) <= 0)
+    return float(at[falls[0]]) if len(falls) else end
+
+
+@dataclass(frozen=True, slots=True)
+class _Decoded:
+    rgb: UInt8[np.ndarray, "h w 3"]
+    """Upright, reduced."""
+    width: int
+    """Of the upright photo in its full size."""
+    height: int
+    scale: tuple[float, float]
+    """Pixels of `rgb` per pixel of the photo."""
+    offset: tuple[float, float]
+    """Where the photo's corner lies in `rgb`: not exactly 0 after JPEG's own reduction and a mirroring."""
+    warnings: tuple[str, ...]
+
+    def camera(self, photo: Intrinsics) -> Intrinsics:
+        """Return the camera of `rgb` for that of the photo."""
+        (sx, sy), (ox, oy) = self.scale, self.offset
+        return replace(
+            photo,
+            width=self.rgb.shape[1],
+            height=self.rgb.shape[0],
+            fx=photo.fx * sx,
+            fy=photo.fy * sy,
+            cx=photo.cx * sx + ox,
+            cy=photo.cy * sy + oy,
+        )
+
+
+def _open(data: bytes) -> tuple[str, Image.Image]:
+    """Read the header and check the size. Raises InvalidImage."""
+    if not data:
+        raise InvalidImage("the photo is empty (0 bytes).", where="photo")
+    fitting = [(name, decoder) for name, decoder, fits in _DECODERS if fits(data)]
+    if not fitting:
+        raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
+    name, decoder = fitting[0]
+    try:
+        photo = decoder(BytesIO(data))
+    except Image.DecompressionBombError as error:
+        raise InvalidImage(f"too many pixels: {error}", where="photo") from None
+    except Exception as error:  # decoders raise almost anything on a broken file
+        raise InvalidImage(f"the {name} header is broken: {_short(error)}.", where="photo") from None
+    if photo.width * photo.height > MAX_PIXELS:
+        raise InvalidImage(
+            f"{photo.width} x {photo.height} are {photo.width * photo.height / 1e6:.0f} megapixels; "
+            f"the limit is {MAX_PIXELS / 1e6:.0f}.",
+            where="photo",
+            hint="Send it smaller: more than about 2 megapixels don't help.",
+        )
+    return name, photo
+
+
+def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float]) -> _Decoded:
+    raw_size = photo.size
+    factor = min(1.0, LONG_SIDE / max(raw_size))
+    target = [max(1, round(side * factor)) for side in raw_size]
+    if min(target) < MIN_SIDE:
+        raise InvalidImage(
+            f"{raw_size[0]} x {raw_size[1]} is too small or too narrow to localize: the short side must have "
+            f"{MIN_SIDE} pixels when the long one has at most {LONG_SIDE}.",
+            where="photo",
+        )
+    step = (1.0, 1.0)
+    if isinstance(photo, JpegImageFile):
+        drafted = photo.draft(None, (target[0], target[1]))  # decodes at 1/2, 1/4 or 1/8, never below target
+        if drafted:
+            step = (raw_size[0] / drafted[1][2], raw_size[1] / drafted[1][3])
+    try:
+        photo.load()
+        pixels, warnings = _rgb(photo, background_rgb)
+    except Exception as error:
+        raise InvalidImage(
+            f"the {name} can't be decoded, it is truncated or damaged: {_short(error)}.",
+            where="photo",
+            hint="Upload the file again.",
+        ) from None
+    covered = (pixels.shape[1] * step[0], pixels.shape[0] * step[1])
+    if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
+        raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
+    if pixels.shape[:2] != (target[1], target[0]):
+        pixels = cv2.resize(pixels, target, interpolation=cv2.INTER_AREA)
+    scale = [target[axis] / covered[axis] for axis in (0, 1)]
+    beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
+    transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
+    if transpose:
+        pixels, scale, beyond, raw_size = pixels.transpose(1, 0, 2), scale[::-1], beyond[::-1], raw_size[::-1]
+    pixels = pixels[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]
+    return _Decoded(
+        np.ascontiguousarray(pixels),
+        *raw_size,
+        scale=(scale[0], scale[1]),
+        offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
+        warnings=tuple(warnings),
+    )
+
+
+def _rgb(
+    photo: Image.Image, background_rgb: tuple[float, float, float]
+) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
+    if photo.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
+        gray = (np.asarray(photo).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
+        return np.repeat(gray[:, :, None], 3, axis=2), []
+    if photo.has_transparency_data:
+        rgba = photo.convert("RGBA")
+        alpha = rgba.getchannel("A")
+        canvas = Image.new("RGB", photo.size, tuple(round(255 * c) for c in background_rgb))
+        canvas.paste(rgba, mask=alpha)
+        opaque = alpha.getextrema()[0] == 255
+        return np.array(canvas), [] if opaque else ["Transparent parts were filled with one colour."]
+    return np.array(photo.convert("RGB")), []
+
+
+def _orientation(photo: Image.Image) -> int:
+    """Return 1 to 8; 1, upright, for what is missing or unreadable. HEIC is turned by its decoder."""
+    if isinstance(photo, HeifImageFile):
+        return 1
+    value = _exif(photo).get(ExifTags.Base.Orientation, 1)
+    return value if value in _ORIENTATIONS else 1
+
+
+def _focal_35mm(photo: Image.Image) -> float | None:
+    """Return EXIF's focal length in mm on 35 mm film, if it is there and possible."""
+    value = _exif(photo).get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+    try:
+        focal = float(value) if value is not None else 0.0
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return focal if 4.0 <= focal <= 2000.0 else None
+
+
+def _exif(photo: Image.Image) -> Image.Exif:
+    """Return the photo's EXIF; an empty one if it has none or a broken one."""
+    if "exif" not in photo.info:  # asking a PNG would decode it
+        return Image.Exif()
+    try:
+        exif = photo.getexif()
+        exif.get_ifd(ExifTags.IFD.Exif)
+        return exif
+    except Exception as error:
+        log.info("EXIF ignored: %s", _short(error))
+        return Image.Exif()
+
+
+def _require_size(given: Intrinsics, width: int, height: int) -> None:
+    if (given.width, given.height) == (width, height):
+        return
+    expected = f"they are for {given.width} x {given.height}, the upright photo has {width} x {height}"
+    if (given.width, given.height) == (height, width):
+        raise InvalidIntrinsics(
+            f"width and height are swapped: {expected}.",
+            where="intrinsics",
+            hint="They refer to the photo after its EXIF orientation was applied: swap fx, fy, cx, cy too.",
+        )
+    same_shape = abs(given.width * height - given.height * width) <= 0.01 * given.width * height
+    raise InvalidIntrinsics(
+        f"{expected}.",
+        where="intrinsics",
+        hint="Scale all of them by the ratio of the widths."
+        if same_shape
+        else "The photo may have been cropped.",
+    )
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InvalidIntrinsics(f"must be a number, is {str(value)[:40]!r}.", where=where)
+    return float(value)
+
+
+def _short(error: Exception) -> str:
+    return (str(error) or type(error).__name__)[:200].rstrip(".")

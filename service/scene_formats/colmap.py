@@ -1,0 +1,123 @@
+"""Training cameras from a COLMAP model (`sparse/0`), binary or text.
+
+COLMAP's axes, pixel centres and quaternion order are ours; it stores camera_from_world. Of a distorted
+camera the pinhole part is kept: 3DGS trains on undistorted photos, and views of the scene are rendered by a
+pinhole anyway.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from service.errors import CorruptScene, InvalidIntrinsics, InvalidPrior
+from service.geometry import rotation_from_quat
+from service.types import Camera, Intrinsics, NamedCamera, Pose
+
+_MODELS = {
+    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+}  # fmt: skip
+"""COLMAP's number of a camera model -> its name and number of parameters."""
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+MAX_FILE_BYTES = 2 * 1024**3
+
+
+@dataclass(frozen=True, slots=True)
+class _Image:
+    name: str
+    camera_id: int
+    quat_translation: tuple[float, ...]
+    """camera_from_world: wxyz, then x y z."""
+
+
+def read_cameras(folder: Path, keep: Callable[[str], bool]) -> tuple[NamedCamera, ...]:
+    """Return the cameras of the photos whose names are to be kept, by name. Raises CorruptScene."""
+    binary = (folder / "images.bin").is_file()
+    suffix = "bin" if binary else "txt"
+    paths = [folder / f"{name}.{suffix}" for name in ("cameras", "images")]
+    for path in paths:
+        if not path.is_file():
+            raise CorruptScene("the file is missing beside its twin.", where=f"{folder.name}/{path.name}")
+        if path.stat().st_size > MAX_FILE_BYTES:
+            raise CorruptScene(f"larger than {MAX_FILE_BYTES} bytes.", where=path.name)
+    try:
+        intrinsics = (_binary_cameras if binary else _text_cameras)(paths[0])
+        images = _binary_images(paths[1]) if binary else _text_images(paths[1])
+        cameras = [_camera(i, intrinsics[i.camera_id]) for i in images if keep(i.name)]
+    except (struct.error, ValueError, KeyError, IndexError) as error:
+        raise CorruptScene(f"not a COLMAP model: {error}.", where=str(folder.name)) from None
+    except (InvalidIntrinsics, InvalidPrior) as error:
+        raise CorruptScene(str(error), where=f"{folder.name}/*.{suffix}") from None
+    return tuple(sorted(cameras, key=lambda c: c.name))
+
+
+def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
+    data, at = path.read_bytes(), 8
+    result = {}
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        name, count = _MODELS[model]
+        result[number] = _intrinsics(
+            name, width, height, list(struct.unpack_from(f"<{count}d", data, at + 24))
+        )
+        at += 24 + 8 * count
+    return result
+
+
+def _binary_images(path: Path) -> list[_Image]:
+    data, at = path.read_bytes(), 8
+    result = []
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        values = struct.unpack_from("<i7di", data, at)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode("utf-8", "replace")
+        (points,) = struct.unpack_from("<Q", data, end + 1)
+        at = end + 9 + 24 * points
+        if at > len(data):
+            raise ValueError(f"images.bin ends within '{name}'")
+        result.append(_Image(name, values[8], values[1:8]))
+    return result
+
+
+def _text_cameras(path: Path) -> dict[int, Intrinsics]:
+    result = {}
+    for line in path.read_text("utf-8").splitlines():
+        if line.strip() and not line.startswith("#"):
+            number, model, width, height, *parameters = line.split()
+            result[int(number)] = _intrinsics(model, int(width), int(height), [float(p) for p in parameters])
+    return result
+
+
+def _text_images(path: Path) -> list[_Image]:
+    """Two lines an image; the second one, its points, may be empty."""
+    lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
+    result = []
+    for line in lines[::2]:
+        if line.strip():
+            words = line.split(maxsplit=9)
+            pose = tuple(float(word) for word in words[1:8])
+            result.append(_Image(words[9].strip(), int(words[8]), pose))
+    return result
+
+
+def _intrinsics(model: str, width: int, height: int, parameters: list[float]) -> Intrinsics:
+    if model in _ONE_FOCAL:
+        parameters = [parameters[0], *parameters]
+    fx, fy, cx, cy = parameters[:4]
+    return Intrinsics(width, height, fx, fy, cx, cy)
+
+
+def _camera(image: _Image, intrinsics: Intrinsics) -> NamedCamera:
+    quat, translation = np.array(image.quat_translation[:4]), np.array(image.quat_translation[4:])
+    if not np.linalg.norm(quat) > 1e-9:
+        raise ValueError(f"the quaternion of '{image.name}' has length zero")
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = rotation_from_quat(quat).T
+    world_from_camera[:3, 3] = -world_from_camera[:3, :3] @ translation
+    return NamedCamera(image.name, Camera(intrinsics, Pose(world_from_camera)))

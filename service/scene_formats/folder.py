@@ -1,0 +1,163 @@
+"""Load a scene: one scene file, an optional manifest and optional training cameras, checked and frozen."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from types import ModuleType
+
+import numpy as np
+
+from service.errors import CorruptScene, SceneNotFound, UnsupportedFormat
+from service.plugins import PluginFolder
+from service.scene_formats.colmap import read_cameras
+from service.scene_formats.gaussians import checked
+from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
+from service.scene_formats.nerfstudio import TransformsFile, transforms_path
+from service.scene_formats.similarity import moved_gaussians, moved_pose
+from service.types import GaussianScene, NamedCamera, SceneInfo
+
+SCENE_FORMATS = PluginFolder("service.scene_formats", "read")
+COLMAP_FOLDER = Path("sparse", "0")
+_HEAD_BYTES = 4096
+_SUFFIXES = (".ply", ".splat", ".spz", ".ksplat", ".sog")
+"""What looks like a scene file; one that no reader accepts is refused by name instead of overlooked."""
+log = logging.getLogger(__name__)
+
+
+def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: bool = True) -> GaussianScene:
+    """Read a scene folder, or a bare scene file. Raises SceneError.
+
+    `without_photos` are names of photos whose cameras are not even read (a bench's queries); see
+    `same_photo`. With `cameras=False` nothing is taken from the training cameras but the size of their
+    photos.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise SceneNotFound("there is no such file or folder.", where=str(path))
+    manifest = read_manifest(path) if path.is_dir() else Manifest()
+    file, reader = _scene_file(path, manifest)
+    raw = checked(reader.read(file), file.name)
+    mode = require_render_mode(manifest.render_mode or raw.render_mode or "default", file.name)
+
+    def keep(name: str) -> bool:
+        return not any(same_photo(name, photo) for photo in without_photos)
+
+    training = _training(path, manifest, keep) if path.is_dir() else _Training()
+    size = manifest.training_size or _median_size(training.cameras)
+    used = training.cameras if cameras else ()
+    focal_px = _training_focal_px(used, manifest.training_size)
+    if manifest.world_from_scene is not None:
+        raw = moved_gaussians(raw, manifest.world_from_scene)
+        used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
+    info = SceneInfo(
+        id=path.resolve().name if path.is_dir() else path.stem,
+        name=manifest.name or (path.resolve().name if path.is_dir() else path.stem),
+        sha256=_digest(file, path, used, (training.background, size, focal_px)),
+        format=reader.__name__.rsplit(".", 1)[-1],
+        background_rgb=manifest.background or training.background or (0.0, 0.0, 0.0),
+        up_in_world=manifest.up,
+        metres_per_unit=manifest.metres_per_unit,
+        render_mode=mode,
+        training_focal_px=focal_px,
+        training_long_side_px=max(size) if size else None,
+    )
+    log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
+    return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)
+
+
+def same_photo(a: str, b: str) -> bool:
+    """Whether two names may mean the same photo: one path is the tail of the other, suffixes apart.
+
+    "0001.png", "images/0001" and "./data/images/0001.jpg" are the same; "train/r_0" and "test/r_0" are not.
+    """
+    parts = [PurePosixPath(name.replace("\\", "/")).with_suffix("").parts for name in (a, b)]
+    shared = min(len(p) for p in parts)
+    return parts[0][-shared:] == parts[1][-shared:]
+
+
+@dataclass(frozen=True, slots=True)
+class _Training:
+    """What a folder's camera files say, in the scene file's frame."""
+
+    cameras: tuple[NamedCamera, ...] = ()
+    background: tuple[float, float, float] | None = None
+
+
+def _training(folder: Path, manifest: Manifest, keep: Callable[[str], bool]) -> _Training:
+    """transforms*.json wins over sparse/0: where both are, it was made from the other for this scene."""
+    transforms = transforms_path(folder)
+    if transforms is not None:
+        file = TransformsFile.open(transforms)
+        photos = [photo for photo in file.training_photos() if keep(photo)]
+        return _Training(tuple(file.camera(photo, manifest) for photo in photos), file.background())
+    if any((folder / COLMAP_FOLDER / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
+        return _Training(read_cameras(folder / COLMAP_FOLDER, keep))
+    return _Training()
+
+
+def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
+    """Return the scene file and its reader. Raises SceneNotFound, UnsupportedFormat, CorruptScene."""
+    if path.is_file():
+        candidates = [path]
+    elif manifest.file:
+        candidates = [path / manifest.file]
+        if not candidates[0].is_file():
+            raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
+    else:
+        candidates = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
+    if not candidates:
+        raise SceneNotFound("the folder has no scene file (.ply, .splat).", where=str(path))
+    if len(candidates) > 1:
+        raise CorruptScene(
+            f"several scene files: {', '.join(p.name for p in candidates[:5])}.",
+            where=str(path),
+            hint=f'Name one in {MANIFEST}: {{"file": "{candidates[0].name}"}}.',
+        )
+    with candidates[0].open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    for name in SCENE_FORMATS.names():
+        reader = SCENE_FORMATS.load(name)
+        if reader.accepts(head, candidates[0].suffix.lower()):
+            return candidates[0], reader
+    raise UnsupportedFormat(
+        f"not a scene file that is read here; known: {', '.join(SCENE_FORMATS.names())}.",
+        where=candidates[0].name,
+    )
+
+
+def _median_size(cameras: tuple[NamedCamera, ...]) -> tuple[int, int] | None:
+    if not cameras:
+        return None
+    sizes = [(c.camera.intrinsics.width, c.camera.intrinsics.height) for c in cameras]
+    return sorted(sizes)[len(sizes) // 2]
+
+
+def _training_focal_px(cameras: tuple[NamedCamera, ...], size: tuple[int, int] | None) -> float | None:
+    """The median focal length, at the size of training if the camera file is of larger photos."""
+    if not cameras:
+        return None
+    each = [c.camera.intrinsics for c in cameras]
+    return float(np.median([i.fx * (max(size) / i.long_side if size else 1.0) for i in each]))
+
+
+def _moved(camera: NamedCamera, world_from_scene: np.ndarray) -> NamedCamera:
+    return replace(
+        camera, camera=replace(camera.camera, pose=moved_pose(camera.camera.pose, world_from_scene))
+    )
+
+
+def _digest(file: Path, path: Path, cameras: tuple[NamedCamera, ...], *facts: object) -> str:
+    """sha256 of everything that a render or an index of the scene depends on."""
+    with file.open("rb") as stream:
+        digest = hashlib.file_digest(stream, "sha256")
+    if (path / MANIFEST).is_file():
+        digest.update((path / MANIFEST).read_bytes())
+    digest.update(repr(facts).encode())
+    for camera in cameras:
+        digest.update(repr((camera.name, camera.camera.intrinsics)).encode())
+        digest.update(camera.camera.pose.world_from_camera.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,85 @@
+"""The .ply of 3DGS trainers, read by property name: any order, any number type, with normals or without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from service.errors import CorruptScene, UnsupportedFormat
+from service.scene_formats.gaussians import RawGaussians, require_count, sh_from_channel_major
+from service.scene_formats.ply_header import element_records, read_header
+
+_REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}
+"""Number of f_rest properties -> SH degree."""
+
+
+def accepts(head: bytes, suffix: str) -> bool:
+    """Any PLY without the chunks of the compressed kind."""
+    return head.startswith(b"ply") and b"\nelement chunk " not in head
+
+
+def read(path: Path) -> RawGaussians:
+    """Scales are stored as logarithms, opacities as logits, f_rest channel by channel."""
+    header = read_header(path)
+    vertex = header.element("vertex")
+    if vertex is None or vertex.dtype is None:
+        raise UnsupportedFormat("no element 'vertex' of plain properties: not a 3DGS scene.", where=path.name)
+    require_count(vertex.count, path.name)
+    degree = _sh_degree(vertex.dtype.names or (), path)
+    records = element_records(path, header, "vertex")
+    with np.errstate(over="ignore"):  # what overflows is reported with its index by `checked`
+        sh = _columns(records, ["f_dc_0", "f_dc_1", "f_dc_2"])[:, None]
+        if degree:
+            rest = _columns(records, [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))])
+            sh = np.concatenate([sh, sh_from_channel_major(rest)], 1)
+        return RawGaussians(
+            means=_columns(records, ["x", "y", "z"]),
+            quats=_columns(records, [f"rot_{i}" for i in range(4)]),
+            scales=np.exp(_columns(records, [f"scale_{i}" for i in range(3)])),
+            opacities=1 / (1 + np.exp(-_columns(records, ["opacity"])[:, 0])),
+            sh=sh,
+            render_mode=_render_mode(header.comments),
+        )
+
+
+def _sh_degree(names: tuple[str, ...], path: Path) -> int:
+    """Check the property names and return the degree that they amount to."""
+    if "scale_0" in names and "scale_2" not in names:
+        raise UnsupportedFormat(
+            "a 2DGS scene (it has no scale_2); only 3DGS scenes can be rendered.", where=path.name
+        )
+    rest = [name for name in names if name.startswith("f_rest_")]
+    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    needed += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    needed += [f"f_rest_{i}" for i in range(len(rest))]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise UnsupportedFormat(
+            f"not a 3DGS scene: element 'vertex' has no {', '.join(missing[:5])}.", where=path.name
+        )
+    if len(rest) not in _REST_COUNTS:
+        raise CorruptScene(
+            f"{len(rest)} f_rest properties; 0, 9, 24 or 45 are SH degree 0 to 3.", where=path.name
+        )
+    return _REST_COUNTS[len(rest)]
+
+
+def _columns(records: np.ndarray, names: list[str]) -> Float32[np.ndarray, "n m"]:
+    result = np.empty((len(records), len(names)), np.float32)
+    for column, name in enumerate(names):
+        result[:, column] = records[name]
+    return result
+
+
+def _render_mode(comments: tuple[str, ...]) -> str | None:
+    """Brush writes 'SplatRenderMode: default|mip|2dgs', Postshot 'antialiased 0|1'; the last one wins."""
+    mode = None
+    for comment in comments:
+        words = comment.lower().replace(":", " ").split()
+        if len(words) == 2 and words[0] == "splatrendermode":
+            mode = {"mip": "antialiased"}.get(words[1], words[1])
+        elif len(words) == 2 and words[0] == "antialiased":
+            mode = {"0": "default", "1": "antialiased"}.get(words[1], mode)
+    return mode

@@ -1,0 +1,38 @@
+"""The .splat format of web viewers: records of 32 bytes, no header, colours without view dependence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from service.errors import CorruptScene
+from service.scene_formats.gaussians import RawGaussians, require_count, sh_from_rgb
+
+_RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+
+
+def accepts(head: bytes, suffix: str) -> bool:
+    """Tell by the suffix: the format has no header."""
+    return suffix == ".splat"
+
+
+def read(path: Path) -> RawGaussians:
+    """Scales are stored as they are, quaternions (wxyz) as 128 + 128 q."""
+    size = path.stat().st_size
+    if size % _RECORD.itemsize:
+        raise CorruptScene(
+            f"{size} bytes are not a whole number of {_RECORD.itemsize}-byte records.",
+            where=f"{path.name}, record {size // _RECORD.itemsize}",
+            hint="The file is truncated or no .splat: copy or export it again.",
+        )
+    require_count(size // _RECORD.itemsize, path.name)
+    records = np.fromfile(path, _RECORD)
+    rgba = records["rgba"].astype(np.float32) / np.float32(255)
+    return RawGaussians(
+        means=records["mean"].astype(np.float32),
+        quats=(records["rotation"].astype(np.float32) - 128) / 128,
+        scales=records["scale"].astype(np.float32),
+        opacities=rgba[:, 3],
+        sh=sh_from_rgb(rgba[:, :3]),
+    )
