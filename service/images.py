@@ -20,7 +20,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 from pi_heif import HeifImageFile
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
@@ -166,64 +166,46 @@ def undistorted(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], Intrinsics]:
     """Return the image as a pinhole of the same focal length and size sees it; black where it sees more."""
     pinhole = replace(intrinsics, model="PINHOLE", distortion=())
-    if not any(intrinsics.distortion) and "FISHEYE" not in intrinsics.model:
+    fisheye = "FISHEYE" in intrinsics.model
+    if not fisheye and not any(intrinsics.distortion):
         return rgb, pinhole
-    columns, rows = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
-    rays = np.stack([(columns - pinhole.cx) / pinhole.fx, (rows - pinhole.cy) / pinhole.fy], -1)
-    source = distorted(rays.reshape(-1, 2), intrinsics).reshape(rays.shape)
-    x = source[..., 0] * pinhole.fx + pinhole.cx - 0.5  # cv2 counts from the centre of the first pixel
-    y = source[..., 1] * pinhole.fy + pinhole.cy - 0.5
-    maps: list[Float32[np.ndarray, "h w"]] = [np.nan_to_num(m, nan=-10.0).astype(np.float32) for m in (x, y)]
-    return cv2.remap(rgb, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), pinhole
+    coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
+    coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
+    # cv2 counts pixels from the centre of the first one.
+    matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
+    make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
+    size = (pinhole.width, pinhole.height)
+    maps = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    straight = cv2.remap(rgb, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    straight[_folded(pinhole, coefficients, fisheye)] = 0
+    return straight, pinhole
 
 
-def distorted(rays: Float64[np.ndarray, "n 2"], intrinsics: Intrinsics) -> Float64[np.ndarray, "n 2"]:
-    """Return where a pinhole's points (x/z, y/z) lie on the distorted camera's plane z = 1.
+def _folded(
+    pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool
+) -> Bool[np.ndarray, "h w"]:
+    """Return the pixels beyond the radius at which the distortion's polynomial turns back.
 
-    nan where a ray lies beyond the radius up to which the model is monotonic: there the polynomial folds back
-    and shows the inside of the image once more.
+    There it would show the inside of the image once more.
     """
-    k = np.zeros(8)
-    k[: len(intrinsics.distortion)] = intrinsics.distortion
-    radius = np.linalg.norm(rays, axis=1)
-    if "FISHEYE" in intrinsics.model:
-        theta = np.arctan(radius)
-        reach = _monotonic_up_to(lambda t: _fisheye(t, k), float(theta.max()))
-        factor = _fisheye(theta, k) / np.maximum(radius, 1e-12)
-        factor[radius < 1e-8] = 1.0
-        factor[theta > reach] = np.nan
-        return rays * factor[:, None]
-    if intrinsics.model in ("SIMPLE_RADIAL", "RADIAL"):
-        k[2:4] = 0.0  # p1, p2
-    reach = _monotonic_up_to(lambda r: r * _radial(r, k), float(radius.max()))
-    factor = _radial(radius, k)
-    factor[radius > reach] = np.nan
-    x, y = rays.T
-    p1, p2 = k[2], k[3]
-    tangential = [
-        2 * p1 * x * y + p2 * (radius**2 + 2 * x * x),
-        p1 * (radius**2 + 2 * y * y) + 2 * p2 * x * y,
-    ]
-    return rays * factor[:, None] + np.stack(tangential, 1)
+    x = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
+    y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
+    radius = np.linspace(0.0, np.hypot(np.abs(x).max(), np.abs(y).max()), 1025)
+    turns = np.flatnonzero(np.diff((_fisheye if fisheye else _radial)(radius, coefficients)) <= 0)
+    reach = radius[turns[0]] if len(turns) else np.inf
+    return x[None] ** 2 + y[:, None] ** 2 > reach**2
 
 
 def _radial(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
-    """k1 k2 p1 p2 k3 k4 k5 k6, as in OPENCV and FULL_OPENCV."""
+    """The distorted radius, tangential terms apart."""
     r2 = r * r
-    above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))
-    return above / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
+    return r * (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
 
 
-def _fisheye(theta: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
+def _fisheye(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "n"]:
+    theta = np.arctan(r)
     t2 = theta * theta
     return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-
-
-def _monotonic_up_to(function, end: float) -> float:
-    """Return the largest argument in 0..end up to which the function grows."""
-    at = np.linspace(0, end, 1025)
-    falls = np.flatnonzero(np.diff(function(at)) <= 0)
-    return float(at[falls[0]]) if len(falls) else end
 
 
 @dataclass(frozen=True, slots=True)
