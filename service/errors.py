@@ -6,7 +6,8 @@
       |     `-- UnknownName  (a plug-in, scene or modification that does not exist; lists what does)
       |-- SceneError
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
-      |-- JobNotFound, JobNotReady
+      |     `-- SceneNotReady  (still loading; try again later)
+      |-- JobNotFound, RecordNotFound, JobNotReady
       |-- QueueFull          too much work is waiting; try again later
       |-- BackendMissing     a package or device that a plug-in needs is not here
       `-- EstimatorFault     an estimator broke its contract (our mistake)
@@ -79,8 +80,16 @@ class CorruptScene(SceneError):
     code = "corrupt_scene"
 
 
+class SceneNotReady(SceneError):
+    code = "scene_not_ready"
+
+
 class JobNotFound(SplatfixError):
     code = "job_not_found"
+
+
+class RecordNotFound(SplatfixError):
+    code = "record_not_found"
 
 
 class JobNotReady(SplatfixError):

@@ -21,7 +21,16 @@ from service.api.schemas import (
     Transform,
 )
 from service.geometry import quat_from_rotation
-from service.types import HINTS, Camera, Intrinsics, IterationRecord, NamedCamera, Pose, PoseEstimate
+from service.types import (
+    HINTS,
+    Camera,
+    Intrinsics,
+    IterationRecord,
+    NamedCamera,
+    Pose,
+    PoseEstimate,
+    StageTiming,
+)
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL's y points up and its z backwards. Its own inverse."""
@@ -118,10 +127,14 @@ def covariance_out(matrix: np.ndarray) -> Covariance:
     )
 
 
+def timing_out(timing: StageTiming) -> Timing:
+    """Spell out the time that a stage took."""
+    return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
+
+
 def result_out(estimate: PoseEstimate, decode: Timing, versions: dict[str, str]) -> Result:
     """Spell out a finished estimate; `decode` is what reading the photo took."""
     verdict = estimate.verdict
-    timings = [Timing(stage=t.stage, wall_s=t.wall_s, cpu_s=t.cpu_s) for t in estimate.timings]
     return Result(
         status=verdict.status,
         reason=verdict.reason,
@@ -134,7 +147,7 @@ def result_out(estimate: PoseEstimate, decode: Timing, versions: dict[str, str])
         agreement=verdict.agreement,
         coverage=verdict.coverage,
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
-        timings=[decode, *timings],
+        timings=[decode, *map(timing_out, estimate.timings)],
         budget_exhausted=estimate.budget_exhausted,
         seed=estimate.seed,
         estimator=estimate.estimator,

@@ -1,20 +1,22 @@
 """The JSON that the service speaks, as pydantic models.
 
-Matrices are row-major nested lists. Every pose is in OpenCV camera axes (+x right, +y down, +z forward) unless
-its field says `opengl`. The world is the scene's own frame; lengths are scene units. The centre of the top-left
-pixel is at (0.5, 0.5).
+Matrices are row-major nested lists. Every pose is in OpenCV camera axes (+x right, +y down, +z forward)
+unless its field says `opengl`. The world is the scene's own frame; lengths are scene units. The centre of
+the top-left pixel is at (0.5, 0.5).
 """
 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.types import Reason, Status
 
 Matrix = list[list[float]]
+Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
 SceneState = Literal["loading", "preparing", "ready", "failed"]
 
@@ -329,22 +331,17 @@ class PriorIn(Model):
 
     convention: Literal["opencv", "opengl"] = "opencv"
     """The camera axes of what is given."""
-    world_from_camera: Matrix | None = None
-    camera_from_world: Matrix | None = None
+    world_from_camera: Matrix4 | None = None
+    camera_from_world: Matrix4 | None = None
     position: list[float] | None = Field(default=None, min_length=3, max_length=3)
     """The camera's centre in the world; together with `quaternion_wxyz`."""
     quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
     """world_from_camera."""
 
 
-class LocalizeIn(Model):
-    """A request to localize a photo: JSON body, or multipart form with the same names.
+class LocalizeFields(Model):
+    """What is sent beside the photo."""
 
-    In a form, `options`, `intrinsics` and `prior` are JSON text and `photo` is a file.
-    """
-
-    photo: str
-    """JPEG, PNG, WebP or HEIC; base64 in a JSON body."""
     scene: str | None = None
     """May be left out when the service has exactly one scene."""
     estimator: str | None = None
@@ -358,3 +355,13 @@ class LocalizeIn(Model):
     seed: int = Field(default=0, ge=0, lt=2**63)
     budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
     """Wall time after which the best pose so far is the answer."""
+
+
+class LocalizeIn(LocalizeFields):
+    """A request to localize a photo, as a JSON body; a multipart form has the same names.
+
+    In a form, `options`, `intrinsics` and `prior` are JSON text and `photo` is a file.
+    """
+
+    photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
+    """JPEG, PNG, WebP or HEIC."""

@@ -36,3 +36,10 @@ class Settings(BaseSettings):
     """Where view indexes are kept between runs; None: nowhere."""
     viewer: bool = True
     """Start the viewer and relay it under /viewer."""
+
+    @property
+    def loopback_url(self) -> str:
+        """Where this machine reaches the service."""
+        everywhere = self.host in ("0.0.0.0", "::", "")
+        host = "127.0.0.1" if everywhere else f"[{self.host}]" if ":" in self.host else self.host
+        return f"http://{host}:{self.port}"

@@ -23,7 +23,7 @@ from service.types import GaussianScene, NamedCamera, SceneInfo
 SCENE_FORMATS = PluginFolder("service.scene_formats", "read")
 COLMAP_FOLDER = Path("sparse", "0")
 _HEAD_BYTES = 4096
-_SUFFIXES = (".ply", ".splat", ".spz", ".ksplat", ".sog")
+SCENE_SUFFIXES = (".ply", ".splat", ".spz", ".ksplat", ".sog")
 """What looks like a scene file; one that no reader accepts is refused by name instead of overlooked."""
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
         if not candidates[0].is_file():
             raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
     else:
-        candidates = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in _SUFFIXES)
+        candidates = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in SCENE_SUFFIXES)
     if not candidates:
         raise SceneNotFound("the folder has no scene file (.ply, .splat).", where=str(path))
     if len(candidates) > 1:

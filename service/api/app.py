@@ -1,0 +1,155 @@
+"""The HTTP service: `create_app` puts scenes, jobs, routes and the viewer's relay together.
+
+One process, one port, paths without a version. Behind a proxy that shows the service under a sub-path,
+links are right if the proxy sends `X-Forwarded-Prefix` or `SPLATFIX_ROOT_PATH` is set, whether or not the
+proxy strips the sub-path from what it hands on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import AsyncIterator, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import anyio
+from anyio import to_thread
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import FileResponse
+from pydantic.json_schema import models_json_schema
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service import __version__
+from service.api.jobs import Jobs
+from service.api.problems import install, problem_response
+from service.api.relay import Relay
+from service.api.routes import Parts, router
+from service.api.scenes import Scenes
+from service.api.schemas import LocalizeIn, Problem, Record
+from service.api.settings import Settings
+from service.api.viewer_child import ViewerChild
+from service.localize import LoadedScene
+
+_START_PAGE = Path(__file__).parent / "start.html"
+_BODY_OVERHEAD = 1_000_000
+"""Bytes that a body may have beyond the photo's limit: the other fields and the form's own lines."""
+
+
+def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScene] | None = None) -> FastAPI:
+    """Make the app. Scenes are found here and loaded after start-up; `scenes` are in memory already.
+
+    Raises SceneNotFound or BadInput if the settings name scenes that can't be.
+    """
+    settings = settings or Settings()
+    known = Scenes(settings.scenes, settings.cache_dir) if scenes is None else Scenes.of(scenes)
+    viewer = ViewerChild(settings.loopback_url) if settings.viewer else None
+    relay = Relay(viewer) if viewer else None
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        async with AsyncExitStack() as stack:
+            jobs = Jobs(settings.workers, settings.queue_size, settings.keep_jobs)
+            stack.push_async_callback(to_thread.run_sync, jobs.close)
+            known.start()
+            stack.push_async_callback(to_thread.run_sync, known.close)
+            limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
+            app.state.parts = Parts(settings, known, jobs, *limits)
+            if viewer and relay:
+                stack.push_async_callback(relay.close)
+                stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
+            yield
+
+    limit = settings.max_upload_bytes + _BODY_OVERHEAD
+    app = FastAPI(
+        title="splatfix",
+        version=__version__,
+        lifespan=lifespan,
+        max_body_size=limit,
+        generate_unique_id_function=lambda route: route.name,
+    )
+    install(app)
+    app.include_router(router)
+    app.add_api_route("/", _start_page, include_in_schema=False)
+    if relay:
+        app.include_router(relay.router)
+    app.add_middleware(SizeCheck, limit=limit)
+    app.add_middleware(SubPath, default=settings.root_path)
+    app.openapi = lambda: openapi(app)
+    return app
+
+
+async def _start_page() -> FileResponse:
+    return FileResponse(_START_PAGE, media_type="text/html")
+
+
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+
+
+def openapi(app: FastAPI) -> dict[str, Any]:
+    """Return the API's description; with the models that no route names by itself."""
+    if not app.openapi_schema:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=_SUMMARY,
+            description=_DESCRIPTION,
+            routes=app.routes,
+        )
+        _, extra = models_json_schema(
+            [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
+            ref_template="#/components/schemas/{model}",
+        )
+        components = schema.setdefault("components", {}).setdefault("schemas", {})
+        app.openapi_schema = schema
+        components |= {name: model for name, model in extra["$defs"].items() if name not in components}
+    return app.openapi_schema
+
+
+_SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
+_DESCRIPTION = """
+Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
+camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions are wxyz.
+A photo that can't be localized is an answer (`not_localized`, with a reason), not an error. Every error is a
+problem document (RFC 9457).
+"""
+
+
+class SubPath:
+    """Tells the app the sub-path under which a proxy shows it (ASGI: `path` includes `root_path`)."""
+
+    def __init__(self, app: ASGIApp, default: str) -> None:
+        self._app, self._default = app, default.rstrip("/")
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] in ("http", "websocket"):
+            given = Headers(scope=scope).get("x-forwarded-prefix", "").rstrip("/")
+            # Only what is a plain path: it ends up in links.
+            root = given if re.fullmatch(r"(/[\w~-][\w.~-]*){1,8}", given) else self._default
+            path = scope["path"]
+            if root and path != root and not path.startswith(f"{root}/"):
+                path = root + path
+            scope = {**scope, "root_path": root, "path": path}
+        await self._app(scope, receive, send)
+
+
+class SizeCheck:
+    """Refuses a body by its announced length, before a byte of it is read; FastAPI counts the unannounced."""
+
+    def __init__(self, app: ASGIApp, limit: int) -> None:
+        self._app, self._limit = app, limit
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        length = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
+        if length.isdecimal() and int(length) > self._limit:
+            error = HTTPException(413, f"The body may have {self._limit} bytes.")
+            await problem_response(error, scope["path"])(scope, receive, send)
+            return
+        await self._app(scope, receive, send)

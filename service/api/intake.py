@@ -1,0 +1,189 @@
+"""From the body of a request to a validated task: nothing is queued that could have been refused."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from anyio import to_thread
+from pydantic import TypeAdapter, ValidationError
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.requests import Request as HttpRequest
+
+from service.api.convert import OPENCV_FROM_OPENGL
+from service.api.jobs import Task
+from service.api.problems import described
+from service.api.schemas import LocalizeFields, PriorIn
+from service.errors import (
+    InvalidIntrinsics,
+    InvalidOptions,
+    InvalidPrior,
+    InvalidRequest,
+)
+from service.estimators import ESTIMATORS
+from service.geometry import rotation_from_quat
+from service.images import intrinsics_from, read_query
+from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
+from service.types import Intrinsics, Pose, Query, StageTiming
+
+_NESTED = ("options", "intrinsics", "prior")
+_FIELDS = frozenset(LocalizeFields.model_fields)
+_ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior}
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """What was sent, taken apart but not yet judged."""
+
+    photo: bytes
+    name: str
+    """Of the file; empty if it has none."""
+    fields: Mapping[str, Any]
+
+
+async def read_body(request: HttpRequest) -> Body:
+    """Take a multipart form or a JSON body apart. Raises InvalidRequest; HTTPException 415 for others."""
+    media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if media_type == "multipart/form-data":
+        return await _form_body(request)
+    if media_type == "application/json":
+        return await to_thread.run_sync(_json_body, await request.body())
+    raise HTTPException(415, f"Send multipart/form-data or application/json, not '{media_type}'.")
+
+
+async def _form_body(request: HttpRequest) -> Body:
+    async with request.form(max_files=1, max_fields=16) as form:
+        names = [name for name, _ in form.multi_items()]
+        _refuse_unknown(names)
+        repeated = sorted({name for name in names if names.count(name) > 1})
+        if repeated:
+            raise InvalidRequest("given more than once.", where=repeated[0])
+        photo = form.get("photo")
+        if not isinstance(photo, UploadFile):
+            raise InvalidRequest(
+                "a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg"
+            )
+        # Forms send an empty text for what was left empty.
+        texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
+        fields = {name: parsed_json(t, name) if name in _ERRORS else t for name, t in texts.items()}
+        return Body(await photo.read(), photo.filename or "", fields)
+
+
+def _json_body(text: bytes) -> Body:
+    value = parsed_json(text, "body")
+    if not isinstance(value, dict):
+        raise InvalidRequest("must be a JSON object.", where="body")
+    _refuse_unknown(value)
+    photo = value.pop("photo", None)
+    if not isinstance(photo, str):
+        raise InvalidRequest("the photo as base64 text is required here.", where="photo")
+    try:
+        data = base64.b64decode(photo, validate=True)
+    except ValueError as error:
+        raise InvalidRequest(f"not base64: {error}.", where="photo") from error
+    return Body(data, "", {name: v for name, v in value.items() if v is not None})
+
+
+def _refuse_unknown(names: Iterable[str]) -> None:
+    unknown = sorted(set(names) - _FIELDS)
+    if unknown:
+        known = ", ".join(sorted(_FIELDS))
+        raise InvalidRequest("there is no such field.", where=unknown[0], hint=f"Known: {known}.")
+
+
+def parsed_json(text: str | bytes, where: str) -> Any:
+    """Parse JSON from outside. Raises the error that belongs to the field `where`."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise _ERRORS.get(where, InvalidRequest)(f"not JSON: {error}.", where=where) from error
+
+
+def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
+    """Check the fields beside the photo. Raises the error that belongs to the first bad one."""
+    try:
+        return LocalizeFields.model_validate(values)
+    except ValidationError as error:
+        where, message = described(error.errors())
+        raise _ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
+
+
+def make_task(body: Body, fields: LocalizeFields, scene: LoadedScene) -> tuple[Task, Query]:
+    """Decode the photo and parse everything else. Slow: not for the event loop. Raises BadInput."""
+    estimator = fields.estimator or DEFAULT_ESTIMATOR
+    request = Request(
+        estimator=estimator,
+        options=options_from(estimator, fields.options),
+        seed=fields.seed,
+        budget_s=fields.budget_s,
+    )
+    intrinsics = None if fields.intrinsics is None else _intrinsics_from(fields.intrinsics)
+    prior = None if fields.prior is None else prior_from(fields.prior)
+    background = scene.scene.info.background_rgb
+    wall, cpu = time.perf_counter(), time.thread_time()
+    query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
+    decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
+    return Task(scene, request, fields.options, body.name, decode), query
+
+
+def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
+    """Return the estimator's `Options`. Raises UnknownName, BackendMissing, InvalidOptions."""
+    kind = ESTIMATORS.load(estimator).Options
+    known = {field.name for field in dataclasses.fields(kind)}
+    unknown = sorted(values.keys() - known)
+    if unknown:
+        raise InvalidOptions(
+            f"'{estimator}' has no such option; it has: {', '.join(sorted(known))}.",
+            where=f"options.{unknown[0]}",
+        )
+    try:
+        return TypeAdapter(kind).validate_python(dict(values))
+    except ValidationError as error:
+        where, message = described(error.errors())
+        raise InvalidOptions(message, where=f"options.{where}") from error
+
+
+def _intrinsics_from(values: Mapping[str, Any]) -> Intrinsics:
+    try:
+        return intrinsics_from(values)
+    except InvalidIntrinsics as error:
+        error.where = f"intrinsics.{error.where}"
+        raise
+
+
+def prior_from(prior: PriorIn) -> Pose:
+    """Return the pose in our conventions. Raises InvalidPrior."""
+    spellings = ("world_from_camera", "camera_from_world", "position")
+    given = [name for name in spellings if getattr(prior, name) is not None]
+    if len(given) != 1 or (prior.position is None) != (prior.quaternion_wxyz is None):
+        raise InvalidPrior(
+            "give exactly one of: world_from_camera; camera_from_world; position and quaternion_wxyz.",
+            where="prior",
+        )
+    try:
+        pose = _as_given(prior)
+    except InvalidPrior as error:
+        error.where = f"prior.{given[0]}"
+        raise
+    matrix = pose.camera_from_world if prior.camera_from_world else pose.world_from_camera
+    return Pose(matrix @ OPENCV_FROM_OPENGL if prior.convention == "opengl" else matrix)
+
+
+def _as_given(prior: PriorIn) -> Pose:
+    """Check what was given as a rigid motion, whatever its direction and axes."""
+    if prior.position is None or prior.quaternion_wxyz is None:
+        return Pose(np.array(prior.world_from_camera or prior.camera_from_world, np.float64))
+    # 1e-3, as for matrices: what was printed with 3 or 4 digits passes. NaN fails the comparison.
+    if not abs(np.linalg.norm(prior.quaternion_wxyz) - 1) < 1e-3:
+        raise InvalidPrior("quaternion_wxyz must have length 1.")
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_from_quat(np.array(prior.quaternion_wxyz))
+    matrix[:3, 3] = prior.position
+    return Pose(matrix)

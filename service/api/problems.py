@@ -1,0 +1,119 @@
+"""Every error as a problem document (RFC 9457), whoever raised it: our code, a validation, the router."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from starlette.exceptions import HTTPException
+
+from service.api.schemas import Problem
+from service.errors import (
+    BackendMissing,
+    BadInput,
+    InvalidRequest,
+    JobNotFound,
+    JobNotReady,
+    QueueFull,
+    RecordNotFound,
+    SceneError,
+    SceneNotFound,
+    SceneNotReady,
+    SplatfixError,
+)
+
+_log = logging.getLogger(__name__)
+
+MEDIA_TYPE = "application/problem+json"
+RETRY_AFTER_S = 5
+
+# The first class that fits decides; SplatfixError itself, hence EstimatorFault, is our mistake.
+_STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
+    (InvalidRequest, 400),
+    (BadInput, 422),
+    (SceneNotFound, 404),
+    (SceneNotReady, 503),
+    (SceneError, 422),
+    (JobNotFound, 404),
+    (RecordNotFound, 404),
+    (JobNotReady, 409),
+    (QueueFull, 503),
+    (BackendMissing, 501),
+    (SplatfixError, 500),
+)
+
+# Of HTTP itself; spelled out because Python's own phrases differ between versions.
+_HTTP_CODES = {
+    400: "bad_request",
+    404: "not_found",
+    405: "method_not_allowed",
+    413: "content_too_large",
+    415: "unsupported_media_type",
+    503: "unavailable",
+}
+
+
+def problem_of(error: Exception, instance: str) -> Problem:
+    """Describe an exception; what is not ours is told to the log, not to the caller."""
+    if isinstance(error, SplatfixError):
+        status = next(status for kind, status in _STATUS if isinstance(error, kind))
+        return _problem(status, error.code, error.message, instance, error.where, error.hint)
+    if isinstance(error, HTTPException):
+        code = _HTTP_CODES.get(error.status_code, "http_error")
+        return _problem(error.status_code, code, str(error.detail), instance)
+    return _problem(500, "internal_error", "The service failed; its log says why.", instance)
+
+
+def _problem(status: int, code: str, detail: str, instance: str, where: str = "", hint: str = "") -> Problem:
+    return Problem(
+        type=f"urn:splatfix:error:{code}",
+        title=code.replace("_", " ").capitalize(),
+        status=status,
+        detail=detail,
+        instance=instance,
+        code=code,
+        where=where,
+        hint=hint,
+    )
+
+
+def problem_response(error: Exception, path: str) -> Response:
+    """Answer with the error's problem document."""
+    problem = problem_of(error, path)
+    headers = dict(getattr(error, "headers", None) or {})
+    if problem.status == 503:
+        headers.setdefault("Retry-After", str(RETRY_AFTER_S))
+    return Response(problem.model_dump_json(), problem.status, headers, MEDIA_TYPE)
+
+
+def install(app: FastAPI) -> None:
+    """Make every error of the app a problem document."""
+
+    async def answer(request: Request, error: Exception) -> Response:
+        return problem_response(error, request.url.path)
+
+    async def answer_validation(request: Request, error: Exception) -> Response:
+        assert isinstance(error, RequestValidationError)
+        return problem_response(invalid_request(error.errors()), request.url.path)
+
+    app.add_exception_handler(SplatfixError, answer)
+    app.add_exception_handler(HTTPException, answer)
+    app.add_exception_handler(RequestValidationError, answer_validation)
+    app.add_exception_handler(Exception, answer)
+
+
+def described(errors: Sequence[Any]) -> tuple[str, str]:
+    """Return where and what of pydantic's errors: the first one's place, all their messages."""
+    places = [".".join(str(part) for part in e["loc"]) for e in errors]
+    told = [e["msg"] if p == places[0] else f"{p}: {e['msg']}" for p, e in zip(places, errors, strict=True)]
+    return places[0], "; ".join(told) + "."
+
+
+def invalid_request(errors: Sequence[Any]) -> InvalidRequest:
+    """Make our error of FastAPI's, which names the part of the request (query, path, header) first."""
+    where, message = described(errors)
+    return InvalidRequest(message, where=where)

@@ -1,0 +1,27 @@
+"""Which scenes lie at a path, without reading them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from service.errors import SceneNotFound
+from service.scene_formats.folder import SCENE_SUFFIXES
+from service.scene_formats.manifest import MANIFEST
+
+
+def find_scenes(path: Path) -> list[Path]:
+    """Return the path itself if it is a scene file or a scene folder, else the scene folders in it.
+
+    Raises SceneNotFound if there are none.
+    """
+    if path.is_file() or (path.is_dir() and _is_scene(path)):
+        return [path]
+    found = sorted(p for p in path.iterdir() if p.is_dir() and _is_scene(p)) if path.is_dir() else []
+    if not found:
+        raise SceneNotFound("there is no scene.", where=str(path))
+    return found
+
+
+def _is_scene(folder: Path) -> bool:
+    """A broken scene is one, too: it shall be refused by name, not overlooked."""
+    return (folder / MANIFEST).is_file() or any(p.suffix.lower() in SCENE_SUFFIXES for p in folder.iterdir())
