@@ -1,0 +1,250 @@
+"""A service for the viewer's tests: scripted jobs, answered with the API's own models; no renderer.
+
+`FakeService.transport` goes into `viewer.client.Service`. A job's events stay open until `finish`, so a test
+decides what has happened when.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+
+import httpx
+import numpy as np
+from PIL import Image
+
+from service.api.convert import intrinsics_out, named_camera_out, record_out, result_out
+from service.api.schemas import JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
+from service.api.splats import packed_splats
+from service.geometry import look_at
+from service.types import (
+    Camera,
+    Candidates,
+    GaussianScene,
+    Intrinsics,
+    IterationRecord,
+    MatchVectors,
+    NamedCamera,
+    Pose,
+    PoseEstimate,
+    Reason,
+    SceneInfo,
+    Status,
+    Verdict,
+)
+
+PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
+
+
+def jpeg(rgb: tuple[int, int, int], width: int = PHOTO.width, height: int = PHOTO.height) -> bytes:
+    """A picture of one colour."""
+    buffer = io.BytesIO()
+    Image.new("RGB", (width, height), rgb).save(buffer, "JPEG", quality=95)
+    return buffer.getvalue()
+
+
+def render_rgb(index: int, *, matched: bool) -> tuple[int, int, int]:
+    """The colour of a fake render: tells which record it is of, and from which camera."""
+    return (200 if matched else 20, (40 * index) % 256, 90)
+
+
+def orbit(share: float) -> Pose:
+    angle = 2 * np.pi * share
+    eye = np.array([3 * np.cos(angle), 3 * np.sin(angle), 1.0])
+    return look_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+
+
+def scene(count: int = 300, cameras: int = 12) -> GaussianScene:
+    """A coloured ball of Gaussians seen from all around."""
+    rng = np.random.default_rng(0)
+    return GaussianScene(
+        means=rng.normal(size=(count, 3)).astype(np.float32) * 0.5,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        scales=np.full((count, 3), 0.05, np.float32),
+        opacities=np.full(count, 0.9, np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+        info=SceneInfo("ball", "A ball", "0" * 64, "ply", up_in_world=(0.0, 0.0, 1.0)),
+        cameras=tuple(NamedCamera(f"{k}.jpg", Camera(PHOTO, orbit(k / cameras))) for k in range(cameras)),
+    )
+
+
+def records(count: int, seed: int = 0) -> list[IterationRecord]:
+    """A trace that turns towards its answer; the first record has candidates and every one has matches."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for k in range(count):
+        px = rng.uniform(0, 64, (20, 2)).astype(np.float32)
+        pose = orbit(0.1 + 0.1 / (k + 1))
+        result.append(
+            IterationRecord(
+                "retrieve" if k == 0 else "align",
+                pose,
+                loss=1.0 / (k + 1),
+                num_matches=100 + k,
+                num_inliers=50 + k,
+                step_deg=2.0 / (k + 1),
+                step_units=0.5 / (k + 1),
+                matches=MatchVectors(px, px + 1, np.arange(20) % 4 > 0, Camera(PHOTO, pose)),
+                candidates=Candidates(
+                    np.stack([orbit(s).world_from_camera for s in (0.1, 0.4, 0.7)]), np.array([0.9, 0.5, 0.2])
+                )
+                if k == 0
+                else None,
+                index=k,
+                elapsed_s=0.01 * k,
+            )
+        )
+    return result
+
+
+@dataclass
+class FakeJob:
+    id: str
+    records: list[IterationRecord] = field(default_factory=list)
+    estimate: PoseEstimate | None = None
+    created: datetime = field(default_factory=lambda: datetime.now(UTC))
+    changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def add(self, record: IterationRecord) -> None:
+        with self.changed:
+            self.records.append(replace(record, index=len(self.records)))
+            self.changed.notify_all()
+
+    def finish(self, status: Status = Status.LOCALIZED, reason: Reason = Reason.AGREES) -> None:
+        verdict = Verdict(status, reason, 0.93, 212, 0.8, 0.9, np.eye(6))
+        ending = PoseEstimate(
+            pose=self.records[-1].pose,
+            verdict=verdict,
+            intrinsics=PHOTO,
+            intrinsics_source="given",
+            scene_id="ball",
+            scene_sha256="0" * 64,
+            estimator="view_index",
+            rasterizer="cpu",
+            matcher="xfeat",
+            seed=0,
+            budget_exhausted=False,
+            timings=(),
+            warnings=(),
+            records=tuple(self.records),
+        )
+        with self.changed:
+            self.estimate = ending
+            self.changed.notify_all()
+
+    def out(self) -> JobOut:
+        versions = {"splatfix": "0"}
+        result = self.estimate and result_out(
+            self.estimate, Timing(stage="decode", wall_s=0, cpu_s=0), versions
+        )
+        links = dict.fromkeys(JobLinks.model_fields, "/")
+        return JobOut(
+            id=self.id,
+            state="succeeded" if result else "running",
+            scene="ball",
+            estimator="view_index",
+            created=self.created,
+            started=self.created,
+            finished=None,
+            records=len(self.records),
+            stage=None,
+            status=result and result.status,
+            score=result and result.score,
+            links=JobLinks(**links),
+            photo=PhotoOut(name="<b>holiday</b>.jpg", intrinsics=intrinsics_out(PHOTO)),
+            seed=0,
+            budget_s=None,
+            options={},
+            prior=None,
+            result=result,
+            error=None,
+        )
+
+    def events(self) -> Iterator[bytes]:
+        sent = 0
+        while True:
+            with self.changed:
+                if len(self.records) == sent and self.estimate is None:
+                    self.changed.wait(0.2)
+                fresh, done = self.records[sent:], self.estimate is not None
+            yield b": ping\n\n"
+            for record in fresh:
+                yield f"event: record\nid: {sent}\ndata: {record_out(record).model_dump_json()}\n\n".encode()
+                sent += 1
+            if done:
+                yield f"event: result\nid: end\ndata: {self.out().model_dump_json()}\n\n".encode()
+                return
+
+
+class FakeService:
+    """Jobs newest first, one scene."""
+
+    def __init__(self, gaussians: GaussianScene | None = None) -> None:
+        self.scene = gaussians or scene()
+        self.jobs: list[FakeJob] = []
+        self.asked: list[str] = []
+        """Paths, in order."""
+        self.transport = httpx.MockTransport(self._answer)
+
+    def job(self, job_id: str, steps: int = 0, *, finished: bool = False) -> FakeJob:
+        """Add a job, the newest from now on."""
+        job = FakeJob(job_id)
+        for record in records(steps):
+            job.add(record)
+        if finished:
+            job.finish()
+        self.jobs.insert(0, job)
+        return job
+
+    def _answer(self, request: httpx.Request) -> httpx.Response:
+        path = request.url.path
+        self.asked.append(path)
+        if path == "/jobs":
+            return httpx.Response(200, json={"jobs": [j.out().model_dump(mode="json") for j in self.jobs]})
+        if path == "/scenes":
+            return httpx.Response(200, json={"scenes": [self._scene_out().model_dump(mode="json")]})
+        if path == "/scenes/ball":
+            return httpx.Response(200, json=self._scene_out().model_dump(mode="json"))
+        if path == "/scenes/ball/splats":
+            return httpx.Response(200, content=packed_splats(self.scene, int(request.url.params["max"])))
+        match = re.fullmatch(r"/jobs/(\w+)(/.*)?", path)
+        job = next((j for j in self.jobs if match and j.id == match[1]), None)
+        return self._answer_of(job, (match and match[2]) or "", request) if job else httpx.Response(404)
+
+    def _answer_of(self, job: FakeJob, rest: str, request: httpx.Request) -> httpx.Response:
+        if rest == "":
+            return httpx.Response(200, json=job.out().model_dump(mode="json"))
+        if rest == "/events":
+            return httpx.Response(200, content=job.events())
+        if rest == "/photo":
+            return httpx.Response(200, content=jpeg((120, 160, 200)))
+        index = int(rest.split("/")[2])
+        matched = request.url.params.get("camera") == "matches"
+        return httpx.Response(200, content=jpeg(render_rgb(index, matched=matched)))
+
+    def _scene_out(self) -> SceneOut:
+        info = self.scene.info
+        return SceneOut(
+            id=info.id,
+            name=info.name,
+            state="ready",
+            gaussians=self.scene.count,
+            sh_degree=0,
+            cameras=len(self.scene.cameras),
+            memory_bytes=self.scene.nbytes,
+            error=None,
+            links=SceneLinks(self="/", splats="/"),
+            sha256=info.sha256,
+            format=info.format,
+            background_rgb=list(info.background_rgb),
+            up_in_world=info.up_in_world and list(info.up_in_world),
+            metres_per_unit=None,
+            render_mode="default",
+            bounds_in_world=None,
+            warnings=[],
+            training_cameras=[named_camera_out(c) for c in self.scene.cameras],
+        )

@@ -1,0 +1,39 @@
+"""`python -m viewer --service URL --port N`: show what a running service does. Ends with its parent."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import threading
+
+from viewer.app import Viewer
+from viewer.client import Service
+
+
+def main() -> None:
+    """Serve until SIGTERM or SIGINT, or until the process that started this one is gone."""
+    parser = argparse.ArgumentParser(prog="viewer", description=__doc__)
+    parser.add_argument("--service", required=True, help="base URL of the splatfix service")
+    parser.add_argument("--port", type=int, required=True, help="port to serve browsers on")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to serve browsers on (default: %(default)s)"
+    )
+    arguments = parser.parse_args()
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
+    ended = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: ended.set())
+    parent = os.getppid()
+    service = Service(arguments.service)
+    viewer = Viewer(service, arguments.host, arguments.port)
+    while not ended.wait(1.0) and os.getppid() == parent:
+        pass
+    viewer.stop()
+    service.close()
+
+
+if __name__ == "__main__":
+    main()

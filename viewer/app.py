@@ -1,0 +1,85 @@
+"""The viewer's server: one session per browser. The only file that touches viser's private parts."""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+
+import viser
+from viser import _messages
+
+from viewer.client import Service
+from viewer.feed import Library
+from viewer.session import Session
+
+log = logging.getLogger(__name__)
+
+_JOB_PATH = re.compile(r"/jobs/([A-Za-z0-9_-]{1,64})/?")
+
+
+class Viewer:
+    """Serves browsers from its construction until `stop`."""
+
+    def __init__(self, service: Service, host: str, port: int) -> None:
+        """`port` 0 takes any free one. Raises OSError if the port is taken."""
+        self._library = Library(service)
+        self._sessions: dict[int, Session] = {}
+        self._lock = threading.Lock()
+        self.server = viser.ViserServer(host=host, port=port, label="splatfix", verbose=False)
+        if port not in (0, self.server.get_port()):  # viser moves on to the next free port by itself
+            self.server.stop()
+            raise OSError(f"port {port} is taken")
+        forbid_sharing(self.server)
+        self.server.gui.configure_theme(
+            dark_mode=True, show_logo=False, show_share_button=False, brand_color=(230, 126, 20)
+        )
+        self._library.start()
+        self.server.on_client_connect(self._open)
+        self.server.on_client_disconnect(self._close)
+
+    def stop(self) -> None:
+        with self._lock:
+            sessions = list(self._sessions.values())
+        for session in sessions:
+            session.close()
+        self._library.close()
+        self.server.stop()
+
+    def _open(self, client: viser.ClientHandle) -> None:
+        session = Session(client, self._library, job_of(requested_path(self.server, client.client_id)))
+        with self._lock:
+            self._sessions[client.client_id] = session
+        session.start()
+
+    def _close(self, client: viser.ClientHandle) -> None:
+        with self._lock:
+            session = self._sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+
+
+def job_of(path: str) -> str | None:
+    """Return the job that an address asks for; None: whichever is the newest."""
+    match = _JOB_PATH.fullmatch(path.partition("?")[0])
+    return match.group(1) if match else None
+
+
+def requested_path(server: viser.ViserServer, client_id: int) -> str:
+    """Return the path of a browser's websocket, which viser 1.1 keeps private; "/" where it can't be told."""
+    try:
+        return server._websock_server._live_connections[client_id].request.path  # type: ignore[union-attr]
+    except (AttributeError, KeyError):
+        log.warning("viser does not tell the path of client %s; it is shown the newest job", client_id)
+        return "/"
+
+
+def forbid_sharing(server: viser.ViserServer) -> None:
+    """Take away viser's handler by which any browser could open a public tunnel to this server.
+
+    Raises RuntimeError if it isn't where it was in viser 1.1: better no viewer than an open one.
+    """
+    handlers = getattr(server._websock_server, "_incoming_handlers", {})
+    if handlers.pop(_messages.ShareUrlRequest, None) is None:
+        server.stop()
+        raise RuntimeError("this version of viser may open public tunnels: its handler was not found")

@@ -1,0 +1,259 @@
+"""The service as the viewer sees it: HTTP in, values of `service.types` out. The only file with httpx."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, cast
+
+import httpx
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from service.types import (
+    Camera,
+    Candidates,
+    Intrinsics,
+    IterationRecord,
+    MatchVectors,
+    NamedCamera,
+    Pose,
+    frozen,
+)
+
+FINISHED = frozenset({"succeeded", "failed", "cancelled"})
+
+
+class ServiceTrouble(Exception):
+    """The service does not answer, or answers with an error."""
+
+    def __init__(self, path: str, problem: object, status: int | None = None) -> None:
+        super().__init__(f"{path}: {problem if status is None else f'HTTP {status}'}")
+        self.status = status
+        """HTTP status; None if there was no answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneView:
+    id: str
+    name: str
+    gaussians: int
+    up_in_world: tuple[float, float, float] | None
+    cameras: tuple[NamedCamera, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Splats:
+    """A scene's most important Gaussians, the greatest first."""
+
+    centres: Float32[np.ndarray, "n 3"]
+    covariances: Float32[np.ndarray, "n 6"]
+    """xx, xy, xz, yy, yz, zz; world frame."""
+    rgba: UInt8[np.ndarray, "n 4"]
+    total: int
+    """How many the scene has."""
+
+
+@dataclass(frozen=True, slots=True)
+class JobSummary:
+    id: str
+    state: str
+    scene: str
+    created: str
+    """ISO 8601, UTC."""
+    status: str | None
+    """Of the result, when there is one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """How a job ended, in words and numbers."""
+
+    status: str
+    """localized, uncertain, not_localized; failed or cancelled where there is no result."""
+    reason: str
+    hint: str
+    score: float | None = None
+    inliers: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class JobView:
+    id: str
+    state: str
+    scene: str
+    estimator: str
+    photo_name: str
+    photo: Intrinsics
+    """Of the image that `Service.photo` returns."""
+    answer: Answer | None
+
+    @property
+    def finished(self) -> bool:
+        return self.state in FINISHED
+
+
+class Service:
+    """One running splatfix service. Safe to use from several threads."""
+
+    def __init__(self, url: str, transport: httpx.BaseTransport | None = None) -> None:
+        # Loopback: no proxy from the environment may stand between. A busy machine renders for seconds.
+        self._http = httpx.Client(base_url=url, timeout=30.0, trust_env=False, transport=transport)
+
+    def close(self) -> None:
+        self._http.close()
+
+    def first_scene(self) -> str | None:
+        """Return the id of the first scene that is in memory."""
+        scenes = self._json("/scenes")["scenes"]
+        return next((s["id"] for s in scenes if s["gaussians"] is not None), None)
+
+    def scene(self, scene_id: str) -> SceneView:
+        raw = self._json(f"/scenes/{scene_id}")
+        return SceneView(
+            raw["id"],
+            raw["name"],
+            raw["gaussians"] or 0,
+            cast("tuple[float, float, float] | None", raw["up_in_world"] and tuple(raw["up_in_world"])),
+            tuple(NamedCamera(c["name"], _camera(c)) for c in raw["training_cameras"]),
+        )
+
+    def splats(self, scene_id: str, limit: int) -> Splats:
+        return parsed_splats(self._bytes(f"/scenes/{scene_id}/splats", {"max": limit}))
+
+    def jobs(self) -> list[JobSummary]:
+        """Return the jobs, newest first."""
+        return [
+            JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"])
+            for j in self._json("/jobs")["jobs"]
+        ]
+
+    def job(self, job_id: str) -> JobView:
+        return _job(self._json(f"/jobs/{job_id}"))
+
+    def photo(self, job_id: str) -> bytes:
+        return self._bytes(f"/jobs/{job_id}/photo")
+
+    def render(self, job_id: str, index: int, *, matched: bool) -> bytes:
+        """Return a JPEG of the scene at a record's pose, or at the camera that its matches refer to."""
+        query = {"camera": "matches"} if matched else {}
+        return self._bytes(f"/jobs/{job_id}/iterations/{index}/render.jpg", query)
+
+    def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | JobView]:
+        """Yield a job's records from the first one on, at last the finished job; less if `stop` is set."""
+        # Pings come every 15 s; a stream that is silent for longer is dead.
+        timeout, path = httpx.Timeout(10.0, read=45.0), f"/jobs/{job_id}/events"
+        try:
+            with self._http.stream("GET", path, timeout=timeout) as response:
+                if response.is_error:
+                    raise ServiceTrouble(path, "", response.status_code)
+                for event, data in sse_events(response.iter_lines()):
+                    if stop.is_set():
+                        return
+                    if event == "record":
+                        yield parsed_record(json.loads(data))
+                    elif event in ("result", "error"):
+                        yield _job(json.loads(data))
+                        return
+        except httpx.HTTPError as error:
+            raise ServiceTrouble(path, error) from error
+
+    def _json(self, path: str) -> Any:
+        return json.loads(self._bytes(path))
+
+    def _bytes(self, path: str, query: dict[str, Any] | None = None) -> bytes:
+        try:
+            return self._http.get(path, params=query).raise_for_status().content
+        except httpx.HTTPStatusError as error:
+            raise ServiceTrouble(path, error, error.response.status_code) from error
+        except httpx.HTTPError as error:
+            raise ServiceTrouble(path, error) from error
+
+
+def sse_events(lines: Iterator[str]) -> Iterator[tuple[str, str]]:
+    """Yield (event, data) of a server-sent event stream; a comment, which is a ping, yields ("", "")."""
+    event, data = "message", []
+    for line in lines:
+        field, _, value = line.partition(":")
+        if line and not field:
+            yield "", ""
+        elif field == "event":
+            event = value.strip()
+        elif field == "data":
+            data.append(value.removeprefix(" "))
+        elif not line:
+            if data:
+                yield event, "\n".join(data)
+            event, data = "message", []
+
+
+def parsed_splats(data: bytes) -> Splats:
+    """Read the layout of `/scenes/{id}/splats`. Raises ValueError if it is cut short."""
+    start = 4 + int.from_bytes(data[:4], "little")
+    header = json.loads(data[4:start])
+    n = header["count"]
+    if len(data) != start + 40 * n:
+        raise ValueError(f"{len(data)} bytes for {n} splats")
+    floats = np.frombuffer(data, "<f4", 9 * n, start)
+    rgba = np.frombuffer(data, np.uint8, 4 * n, start + 36 * n)
+    return Splats(
+        floats[: 3 * n].reshape(n, 3), floats[3 * n :].reshape(n, 6), rgba.reshape(n, 4), header["total"]
+    )
+
+
+def parsed_record(raw: dict[str, Any]) -> IterationRecord:
+    """Read a record as `/jobs/{id}/events` gives it."""
+    matches, candidates = raw["matches"], raw["candidates"]
+    scalars = ("loss", "num_matches", "num_inliers", "step_deg", "step_units", "index", "elapsed_s", "cpu_s")
+    return IterationRecord(
+        stage=raw["stage"],
+        pose=_pose(raw),
+        matches=matches
+        and MatchVectors(
+            frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),
+            frozen(np.array(matches["render_px"]).reshape(-1, 2), np.float32),
+            frozen(np.array(matches["inlier"]), np.bool_),
+            _camera(matches["render_camera"]),
+        ),
+        candidates=candidates
+        and Candidates(
+            frozen(np.array(candidates["world_from_camera"]).reshape(-1, 4, 4), np.float64),
+            frozen(np.array(candidates["scores"]), np.float64),
+        ),
+        **{name: raw[name] for name in scalars},
+    )
+
+
+def _job(raw: dict[str, Any]) -> JobView:
+    return JobView(
+        raw["id"],
+        raw["state"],
+        raw["scene"],
+        raw["estimator"],
+        raw["photo"]["name"],
+        _intrinsics(raw["photo"]["intrinsics"]),
+        _answer(raw),
+    )
+
+
+def _answer(raw: dict[str, Any]) -> Answer | None:
+    result, error = raw["result"], raw["error"]
+    if result:
+        return Answer(result["status"], result["reason"], result["hint"], result["score"], result["inliers"])
+    if error:
+        return Answer(raw["state"], error["detail"], error["hint"])
+    return Answer(raw["state"], "", "") if raw["state"] in FINISHED else None
+
+
+def _intrinsics(raw: dict[str, Any]) -> Intrinsics:
+    return Intrinsics(**{**raw, "distortion": tuple(raw["distortion"])})
+
+
+def _camera(raw: dict[str, Any]) -> Camera:
+    return Camera(_intrinsics(raw["intrinsics"]), _pose(raw))
+
+
+def _pose(raw: dict[str, Any]) -> Pose:
+    return Pose(np.array(raw["world_from_camera"], np.float64))

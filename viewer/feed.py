@@ -1,0 +1,204 @@
+"""What several browsers share: the jobs' records as they come, their pictures, and the scenes.
+
+One background thread follows each job that somebody looks at, and one the list of jobs; never viser's own
+pool of callbacks, which long work would starve. When nobody looks any more, the thread ends and the data are
+dropped.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+
+from service.types import IterationRecord
+from viewer.client import JobSummary, JobView, SceneView, Service, ServiceTrouble, Splats
+from viewer.draw import decode
+from viewer.shapes import Extent, extent
+
+log = logging.getLogger(__name__)
+
+MAX_SPLATS = 400_000
+"""Drawn of a scene: 13 MB a browser, smooth on an integrated GPU."""
+_RENDERS_KEPT = 64
+_SCENES_KEPT = 2
+_POLL_S = 1.0
+
+Listener = Callable[[], None]
+
+
+class JobFeed:
+    """One job: grows while it runs. `records` is only ever appended to; read it from any thread."""
+
+    def __init__(self, service: Service, job_id: str) -> None:
+        self.id = job_id
+        self.records: list[IterationRecord] = []
+        self.job: JobView | None = None
+        """As it was at the start; with its answer once finished. None: not known yet."""
+        self.trouble = ""
+        """Why nothing comes, in words; empty while all is well."""
+        self.listeners: set[Listener] = set()
+        self._service = service
+        self._stop = threading.Event()
+        self._photo: UInt8[np.ndarray, "h w 3"] | None = None
+        self._renders: OrderedDict[tuple[int, bool], UInt8[np.ndarray, "h w 3"]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        threading.Thread(target=self._follow, name=f"feed-{self.id}", daemon=True).start()
+
+    def stop(self) -> None:
+        """Let the thread end at the next event or ping."""
+        self._stop.set()
+
+    @property
+    def finished(self) -> bool:
+        return self.job is not None and self.job.finished
+
+    def photo(self) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the job's photo, fetched once. Raises ServiceTrouble, ValueError."""
+        if self._photo is None:
+            self._photo = decode(self._service.photo(self.id))
+        return self._photo
+
+    def render(self, index: int, *, matched: bool) -> UInt8[np.ndarray, "h w 3"]:
+        """Return a record's render, one of the last few or fetched. Raises ServiceTrouble, ValueError."""
+        key = index, matched
+        with self._lock:
+            if key in self._renders:
+                self._renders.move_to_end(key)
+                return self._renders[key]
+        image = decode(self._service.render(self.id, index, matched=matched))
+        with self._lock:
+            self._renders[key] = image
+            if len(self._renders) > _RENDERS_KEPT:
+                self._renders.popitem(last=False)
+        return image
+
+    def _follow(self) -> None:
+        while not self._stop.is_set() and not self.finished:
+            try:
+                self.job = self._service.job(self.id)
+                self._tell()
+                for event in self._service.events(self.id, self._stop):
+                    self._take(event)
+                self.trouble = ""
+            except (ServiceTrouble, ValueError, KeyError) as error:
+                gone = isinstance(error, ServiceTrouble) and error.status == 404
+                log.warning("job %s: %s", self.id, error)
+                self.trouble = f"The service has no job {self.id} (any more)." if gone else str(error)
+                self._tell()
+                if gone:
+                    return
+                self._stop.wait(2.0)
+
+    def _take(self, event: IterationRecord | JobView) -> None:
+        if isinstance(event, JobView):
+            self.job = event
+        elif event.index == len(self.records):  # after a broken stream they come again from the first one on
+            self.records.append(event)
+        else:
+            return
+        self._tell()
+
+    def _tell(self) -> None:
+        for listener in tuple(self.listeners):
+            listener()
+
+
+@dataclass(frozen=True, slots=True)
+class SceneContent:
+    view: SceneView
+    splats: Splats
+    extent: Extent
+
+
+class Library:
+    """Everything that browsers share, by name."""
+
+    def __init__(self, service: Service) -> None:
+        self.service = service
+        self.jobs: tuple[JobSummary, ...] = ()
+        """Newest first, at most a second old while somebody listens."""
+        self._feeds: dict[str, JobFeed] = {}
+        self._scenes: OrderedDict[str, SceneContent] = OrderedDict()
+        self._listeners: set[Listener] = set()
+        self._awake = threading.Event()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        threading.Thread(target=self._watch, name="jobs", daemon=True).start()
+
+    def close(self) -> None:
+        self._closed.set()
+        self._awake.set()
+        with self._lock:
+            for feed in self._feeds.values():
+                feed.stop()
+
+    def listen(self, listener: Listener) -> None:
+        """Call `listener` whenever the list of jobs has changed, until `ignore`."""
+        with self._lock:
+            self._listeners.add(listener)
+        self._awake.set()
+
+    def ignore(self, listener: Listener) -> None:
+        with self._lock:
+            self._listeners.discard(listener)
+            if not self._listeners:
+                self._awake.clear()
+
+    def follow(self, job_id: str, listener: Listener) -> JobFeed:
+        """Return the job's feed, shared with everyone who follows it; `leave` it when done."""
+        with self._lock:
+            feed = self._feeds.get(job_id) or JobFeed(self.service, job_id)
+            feed.listeners.add(listener)
+            if job_id not in self._feeds:
+                self._feeds[job_id] = feed
+                feed.start()
+            return feed
+
+    def leave(self, feed: JobFeed, listener: Listener) -> None:
+        with self._lock:
+            feed.listeners.discard(listener)
+            if not feed.listeners and self._feeds.get(feed.id) is feed:
+                feed.stop()
+                del self._feeds[feed.id]
+
+    def scene(self, scene_id: str) -> SceneContent:
+        """Return a scene for drawing; the last few are kept. Raises ServiceTrouble, ValueError."""
+        with self._lock:
+            if scene_id in self._scenes:
+                self._scenes.move_to_end(scene_id)
+                return self._scenes[scene_id]
+        view = self.service.scene(scene_id)
+        splats = self.service.splats(scene_id, MAX_SPLATS)
+        cameras = [named.camera for named in view.cameras]
+        content = SceneContent(view, splats, extent(splats.centres, cameras, view.up_in_world))
+        with self._lock:
+            self._scenes[scene_id] = content
+            if len(self._scenes) > _SCENES_KEPT:
+                self._scenes.popitem(last=False)
+        return content
+
+    def _watch(self) -> None:
+        """Poll the list of jobs while somebody listens."""
+        while self._awake.wait() and not self._closed.is_set():
+            try:
+                jobs = tuple(self.service.jobs())
+            except (ServiceTrouble, ValueError, KeyError) as error:
+                log.warning("list of jobs: %s", error)
+                jobs = self.jobs
+            if jobs != self.jobs:
+                self.jobs = jobs
+                with self._lock:
+                    listeners = tuple(self._listeners)
+                for listener in listeners:
+                    listener()
+            self._closed.wait(_POLL_S)

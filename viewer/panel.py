@@ -1,0 +1,48 @@
+"""The widgets of one browser: a control panel, and a window with photo and render."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import viser
+
+from viewer.draw import MODES
+from viewer.stage import Layer
+
+NO_JOB: str = "no job yet"
+_PICTURE_WIDTH_PX = 620
+
+
+class Panel:
+    """The handles, by what they are for. What happens on a click is wired in `session`."""
+
+    def __init__(self, client: viser.ClientHandle) -> None:
+        gui = client.gui
+        gui.main_panel.float(x=-12, y=12, width=350)
+        self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
+        self.newest = gui.add_checkbox(
+            "follow newest", True, hint="Change to every new job as soon as it appears."
+        )
+        self.headline = gui.add_html("")
+        self.step = gui.add_slider("step", 0, 0, 1, 0, disabled=True)
+        self.play = gui.add_button_group("", ("◀ previous", "play / pause", "next ▶"))
+        self.numbers = gui.add_html("")
+        self.look_through = gui.add_button("look through this camera", disabled=True)
+        self.fly = gui.add_button("fly to result", disabled=True)
+        with gui.add_folder("show"):
+            self.layers = {layer: gui.add_checkbox(layer, True) for layer in get_args(Layer)}
+            self.scene = gui.add_html("")
+        self._add_picture(gui)
+
+    def _add_picture(self, gui: viser.GuiApi) -> None:
+        self.window = gui.add_panel(visible=False)
+        with self.window.add_tab("photo and render"):
+            self.mode = gui.add_button_group("compare", MODES)
+            self.picture = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88)
+            self.caption = gui.add_html("")
+            self.matches = gui.add_checkbox("match vectors", True)
+            self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
+        self.window.float(x=12, y=-12, width=_PICTURE_WIDTH_PX)
+        # The page is viser's file, with its title; this is the one way to another title from here.
+        gui.add_html("<img src='data:,' style='display:none' onerror=\"document.title='splatfix'\">")

@@ -1,0 +1,177 @@
+"""Which record of a job is shown, and what is said of it. Pure logic: no viser, no HTTP."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from html import escape
+
+from service.types import IterationRecord, MatchVectors
+from viewer.client import Answer, JobSummary, JobView
+from viewer.draw import INLIER, OUTLIER, Mode
+
+STATUS_COLOURS = {
+    "localized": (60, 180, 90),
+    "uncertain": (235, 165, 40),
+    "not_localized": (215, 65, 65),
+    "failed": (215, 65, 65),
+    "cancelled": (140, 140, 140),
+}
+PENDING_COLOUR = (40, 120, 200)
+
+
+@dataclass(slots=True)
+class Playback:
+    """A position in a list of records that may still grow."""
+
+    count: int = 0
+    index: int = 0
+    playing: bool = False
+    live: bool = True
+    """At the newest record, and moving on with it."""
+
+    @property
+    def at_end(self) -> bool:
+        return self.index >= self.count - 1
+
+    def grow(self, count: int) -> None:
+        self.count = count
+        if self.live and not self.playing:
+            self.index = max(0, count - 1)
+
+    def go(self, index: int) -> None:
+        """Jump; at the newest record it stays with the newest."""
+        self.index = max(0, min(index, self.count - 1))
+        self.live = self.at_end
+
+    def step(self, by: int) -> None:
+        self.playing = False
+        self.go(self.index + by)
+
+    def toggle(self) -> None:
+        """Play or pause; played to the end, play starts over."""
+        self.playing = not self.playing and self.count > 1
+        if self.playing and self.at_end:
+            self.go(0)
+
+    def tick(self) -> None:
+        """Show the next record while playing."""
+        if self.playing:
+            self.go(self.index + 1)
+            self.playing = not self.at_end
+
+
+def job_label(job: JobSummary) -> str:
+    """One line for a list of jobs; the id makes it unique."""
+    started = datetime.fromisoformat(job.created).astimezone()
+    return f"{started:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"
+
+
+def headline_html(job: JobView | None, records: int, trouble: str) -> str:
+    """Status, reason and hint, or how far the job is."""
+    if trouble:
+        return _block(_badge("no connection", (215, 65, 65)), trouble)
+    if job is None:
+        return _block(_badge("waiting", PENDING_COLOUR), "for a first job: POST a photo to /localize.")
+    title = f"{job.photo_name} in {job.scene}, by {job.estimator}"
+    if job.answer is None:
+        word = "queued" if not records else "running"
+        return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title)
+    answer = job.answer
+    return _block(
+        _badge(answer.status.replace("_", " "), STATUS_COLOURS[answer.status]),
+        _why(answer),
+        title,
+        answer.hint,
+    )
+
+
+def record_html(record: IterationRecord) -> str:
+    """The numbers of one record as a small table."""
+    rows = [
+        ("stage", escape(record.stage)),
+        ("after", f"{record.elapsed_s * 1000:.0f} ms"),
+        ("CPU time", f"{record.cpu_s * 1000:.0f} ms"),
+        ("matches", _or_dash(record.num_matches, "d")),
+        ("inliers", _or_dash(record.num_inliers, "d")),
+        ("loss", _or_dash(record.loss, ".4g")),
+        ("turned", _or_dash(record.step_deg, ".3g", "°")),
+        ("moved", _or_dash(record.step_units, ".3g", " units")),
+    ]
+    cells = "".join(
+        f"<div><div style='opacity:.6;font-size:.8em'>{name}</div>"
+        f"<div style='white-space:nowrap'>{value}</div></div>"
+        for name, value in rows
+    )
+    return _padded(
+        f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>"
+    )
+
+
+def caption_html(mode: Mode, matches: MatchVectors | None) -> str:
+    """What the picture shows."""
+    if mode == "blend":
+        return _small("photo and render at this step's pose, blended")
+    if mode == "difference":
+        return _small("difference of photo and render at this step's pose, doubled")
+    if matches is None:
+        return _small("left: photo · right: render at this step's pose")
+    inliers = int(matches.inlier.sum())
+    return _small(
+        f"left: photo · right: render that was matched · lines: {_coloured(f'{inliers} agree', INLIER)}, "
+        f"{_coloured(f'{len(matches.inlier) - inliers} do not', OUTLIER)}"
+    )
+
+
+def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:
+    """How much of the scene is drawn, and what viser can't draw."""
+    of = f"{drawn:,} splats" if drawn == total else f"{drawn:,} of {total:,} splats, the most important ones"
+    return _small(f"{escape(name)}: {of}, without view-dependent colour; {cameras} training cameras")
+
+
+def answer_colour(answer: Answer | None) -> tuple[int, int, int]:
+    """Return the colour that stands for a verdict, or for its absence."""
+    return STATUS_COLOURS[answer.status] if answer else PENDING_COLOUR
+
+
+def _why(answer: Answer) -> str:
+    words = [answer.reason.replace("_", " ")]
+    if answer.score is not None:
+        words.append(f"score {answer.score:.2f}")
+    if answer.inliers is not None:
+        words.append(f"{answer.inliers} inliers")
+    return ", ".join(w for w in words if w)
+
+
+def _block(badge: str, text: str, title: str = "", hint: str = "") -> str:
+    parts = [f"{badge} <span>{escape(text)}</span>"]
+    if title:
+        parts.append(f"<div style='opacity:.6;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}</div>")
+    if hint:
+        parts.append(f"<div style='margin-top:.3em'>{escape(hint)}</div>")
+    return _padded("".join(parts))
+
+
+def _badge(text: str, colour: tuple[int, int, int]) -> str:
+    # Dark text on a light ground and the other way round, whichever is readable.
+    ink = "#000" if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 120 else "#fff"
+    return (
+        f"<span style='background:rgb{colour};color:{ink};border-radius:.3em;padding:.1em .6em;"
+        f"font-weight:600'>{escape(text)}</span>"
+    )
+
+
+def _small(html: str) -> str:
+    return f"<div style='padding:0 .6em .2em;font-size:.8em;opacity:.75'>{html}</div>"
+
+
+def _coloured(text: str, colour: tuple[int, int, int]) -> str:
+    return f"<b style='color:rgb{colour}'>{text}</b>"
+
+
+def _padded(inner: str) -> str:
+    return f"<div style='padding:.2em .6em;font-size:.9em;line-height:1.5'>{inner}</div>"
+
+
+def _or_dash(value: float | None, spec: str, unit: str = "") -> str:
+    return "–" if value is None else f"{value:{spec}}{unit}"
