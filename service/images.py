@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -103,13 +103,15 @@ def read_query(
     return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
 
 
-def encode_jpeg(rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"]) -> bytes:
-    """Return an image (uint8, or a render's float32 in 0..1) as JPEG for looking at."""
+def encode_image(
+    rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"], kind: Literal["jpg", "png"] = "jpg"
+) -> bytes:
+    """Return an image (uint8, or a render's float32 in 0..1) as a file for looking at."""
     if rgb.dtype != np.uint8:
         rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    encoded, data = cv2.imencode(".jpg", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    encoded, data = cv2.imencode(f".{kind}", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
     if not encoded:
-        raise ValueError(f"an image of shape {rgb.shape} can't be JPEG")
+        raise ValueError(f"an image of shape {rgb.shape} can't be {kind}")
     return data.tobytes()
 
 
@@ -373,6 +375,8 @@ def _require_size(given: Intrinsics, width: int, height: int) -> None:
 def _number(value: Any, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InvalidIntrinsics(f"must be a number, is {str(value)[:40]!r}.", where=where)
+    if not abs(value) < 1e12:  # also nan
+        raise InvalidIntrinsics(f"must be a finite number, is {str(value)[:40]}.", where=where)
     return float(value)
 
 
