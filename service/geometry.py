@@ -38,6 +38,7 @@ def so3_log(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
 
 
 def se3_exp(twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
+    """The motion of a twist."""
     phi, rho = np.asarray(twist[:3], np.float64), np.asarray(twist[3:], np.float64)
     angle = float(np.linalg.norm(phi))
     k = hat(phi)
@@ -53,6 +54,7 @@ def se3_exp(twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
 
 
 def se3_log(transform: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
+    """The twist of a motion; its rotation vector has length 0..pi."""
     phi = so3_log(transform[:3, :3])
     angle = float(np.linalg.norm(phi))
     k = hat(phi)
@@ -131,9 +133,7 @@ def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
     return angle, float(np.linalg.norm(a.position_in_world - b.position_in_world))
 
 
-def look_at(
-    position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
-) -> Pose:
+def look_at(position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Pose:
     """Return the pose of a camera at `position` whose axis points at `target` and whose -y is near `up`."""
     forward = np.asarray(target, np.float64) - position
     forward /= np.linalg.norm(forward)

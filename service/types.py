@@ -298,7 +298,7 @@ HINTS: dict[Reason, str] = {
     Reason.FEW_INLIERS: (
         "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
     ),
-    Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: photograph the captured part, or send a prior.",
+    Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: show the captured part, or send a prior.",
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }
 

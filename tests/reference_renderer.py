@@ -1,7 +1,7 @@
 """The specification of the renderer: dense, float64, differentiable by autograd, slow, short.
 
-Every Gaussian meets every pixel, near to far. Written from the equations of EWA splatting (Zwicker 2001) and of 3DGS
-(Kerbl 2023) with gsplat's conventions; shares no code with the kernels.
+Every Gaussian meets every pixel, near to far. Written from the equations of EWA splatting (Zwicker 2001) and
+of 3DGS (Kerbl 2023) with gsplat's conventions; shares no code with the kernels.
 """
 
 from __future__ import annotations
@@ -72,20 +72,27 @@ def render(
     dull = sharp + dilation * torch.eye(2, dtype=means.dtype)
     if antialiased:
         opacities = opacities * torch.sqrt(torch.clamp(torch.det(sharp) / torch.det(dull), min=1e-30))
-    conic = torch.linalg.inv(dull)
+    conics = torch.linalg.inv(dull)
     eye = -r.T @ t
     directions = torch.nn.functional.normalize(means[order] - eye, dim=-1)
     colours = torch.clamp((sh_basis(directions, sh.shape[1])[:, :, None] * sh).sum(1) + 0.5, min=0)
+    centres = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
+    return composite(centres, conics, z, colours, opacities, width, height, background)
+
+
+def composite(
+    centres: Tensor, conics: Tensor, depths: Tensor, colours: Tensor, opacities: Tensor, width: int, height: int,
+    background: Tensor,
+) -> Picture:  # fmt: skip
+    """Blend ellipses that are sorted from near to far; `conics` are 2x2 inverses of covariances."""
     py, px = torch.meshgrid(
-        torch.arange(height, dtype=means.dtype) + 0.5,
-        torch.arange(width, dtype=means.dtype) + 0.5,
+        torch.arange(height, dtype=depths.dtype) + 0.5,
+        torch.arange(width, dtype=depths.dtype) + 0.5,
         indexing="ij",
     )
-    dx = (fx * x / z + cx)[:, None] - px.reshape(1, -1)
-    dy = (fy * y / z + cy)[:, None] - py.reshape(1, -1)
-    sigma = (
-        0.5 * (conic[:, 0, 0, None] * dx**2 + conic[:, 1, 1, None] * dy**2) + conic[:, 0, 1, None] * dx * dy
-    )
+    dx = centres[:, 0, None] - px.reshape(1, -1)
+    dy = centres[:, 1, None] - py.reshape(1, -1)
+    sigma = 0.5 * (conics[:, 0, 0, None] * dx**2 + conics[:, 1, 1, None] * dy**2) + conics[:, 0, 1, None] * dx * dy
     alphas = torch.clamp(opacities[:, None] * torch.exp(-sigma), max=ALPHA_MAX)
     alphas = torch.where(alphas >= ALPHA_MIN, alphas, torch.zeros_like(alphas))
     after = torch.cumprod(1 - alphas, 0)
@@ -94,8 +101,8 @@ def render(
     weights = torch.where(counted, alphas * before, torch.zeros_like(alphas))
     alpha = weights.sum(0)
     rgb = weights.T @ colours + (1 - alpha)[:, None] * background
-    depth = torch.where(alpha > 0, (weights * z[:, None]).sum(0) / torch.clamp(alpha, min=1e-12), 0.0)
+    depth = torch.where(alpha > 0, (weights * depths[:, None]).sum(0) / torch.clamp(alpha, min=1e-12), 0.0)
     crossing = (before > 0.5) & (after <= 0.5) & counted
-    median = torch.where(crossing, z[:, None], torch.zeros_like(sigma)).amax(0)
+    median = torch.where(crossing, depths[:, None], torch.zeros_like(sigma)).amax(0)
     shape = (height, width)
     return Picture(rgb.reshape(*shape, 3), alpha.reshape(shape), depth.reshape(shape), median.reshape(shape))

@@ -78,9 +78,7 @@ def blend_backward(records, starts, entries, width, height, background, rgb, alp
             x, y = tile_x + block % 4 * 4, tile_y + block // 4 * 4
             if x < width and y < height:
                 alive |= np.uint32(1) << np.uint32(block)
-                _read_block(
-                    inputs, block, x, y, width, height, background, rgb, alpha, depth, d_rgb, d_depth, d_alpha
-                )
+                _read_block(inputs, block, x, y, width, height, background, rgb, alpha, depth, d_rgb, d_depth, d_alpha)
         while first < last and alive != 0:
             count = min(BATCH, last - first)
             gather_batch(records, entries, first, count, local)
@@ -91,9 +89,7 @@ def blend_backward(records, starts, entries, width, height, background, rgb, alp
                 if not (alive >> np.uint32(block)) & np.uint32(1) or lengths[block] == 0:
                     continue
                 x, y = tile_x + block % 4 * 4, tile_y + block // 4 * 4
-                if not _run_block(
-                    local, lists, block, np.intp(lengths[block]), x, y, inputs, work, batch_sums
-                ):
+                if not _run_block(local, lists, block, np.intp(lengths[block]), x, y, inputs, work, batch_sums):
                     alive &= ~(np.uint32(1) << np.uint32(block))
             for i in range(count):
                 target = at(entries, first + i) * 16

@@ -1,7 +1,7 @@
-"""From a record's ten sums (`backward`) to the camera's and the Gaussians' parameters: the chain rule behind `project`.
+"""From a record's ten sums (`backward`) to the parameters of camera and Gaussians: the chain rule of `project`.
 
-Written for j_a = (fx/z, 0, -fx u/z) and j_b = (0, fy/z, -fy v/z), the rows of the perspective Jacobian, and a = R^T j_a,
-b = R^T j_b, their images in the world: covariance in the picture = [a; b] S [a; b]^T + dilation I.
+Written for j_a = (fx/z, 0, -fx u/z) and j_b = (0, fy/z, -fy v/z), the rows of the perspective Jacobian, and
+a = R^T j_a, b = R^T j_b, their images in the world: covariance in the picture = [a; b] S [a; b]^T + dilation I.
 
 Twist: world_from_camera @ exp(rotation, translation), so a point in the camera moves by -(rotation x p) - translation.
 """
@@ -31,7 +31,6 @@ from service.render.simd import (
     as_int,
     fma,
     gather,
-    iota,
     isplat,
     load,
     select,

@@ -21,7 +21,7 @@ from service.interfaces import Frame, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
 from service.render.blend import BATCH, LIST, LOCAL, STATE, blend
 from service.render.chain import ROW, pose_twist, scene_rows, unpack_rows
-from service.render.pack import LANES, Packed, aligned, pack
+from service.render.pack import LANES, Packed, aligned, fill, pack
 from service.render.project import RECORD, TILE, project
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
@@ -37,6 +37,7 @@ _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
 
 
 def create(scene: GaussianScene) -> CpuRasterizer:
+    """Pack the scene; takes some 50 ms per 100,000 Gaussians, and the kernels' compilation once per machine."""
     return CpuRasterizer(scene)
 
 
@@ -52,7 +53,8 @@ def dilation_for(camera: Camera, info: SceneInfo) -> float:
 class CpuRasterizer:
     """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest picture seen.
 
-    The gradients use the lists of the thread's last picture if it was of the same camera object, else they render first.
+    The gradients use the lists of the thread's last picture if it was of the same camera object; else they
+    render first.
     """
 
     name = "cpu"
@@ -62,6 +64,10 @@ class CpuRasterizer:
         self.packed = pack(scene)
         self._background = np.asarray(scene.info.background_rgb, np.float32)
         self._local = threading.local()
+
+    def refresh(self) -> None:
+        """Take in the scene's values again, for a scene under training: its arrays are views of changing ones."""
+        fill(self.packed, self.scene)
 
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         if len(cameras) == 1:
@@ -110,9 +116,7 @@ class CpuRasterizer:
         s.camera = None  # an error on the way must not leave another camera's lists behind
         self._bin(camera, s)
         k = camera.intrinsics
-        frame = Frame(
-            np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32)
-        )
+        frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))
         blend(
             s.records, s.starts, s.entries, k.width, k.height, self._background, s.local, s.lists, s.lengths, s.state,
             frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1),

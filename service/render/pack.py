@@ -51,6 +51,7 @@ def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
 
 
 def pack(scene: GaussianScene) -> Packed:
+    """Order the Gaussians along a space-filling curve and lay them out."""
     order = _morton_order(scene.means)
     padded = -(-scene.count // LANES) * LANES
     order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])

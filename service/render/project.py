@@ -189,9 +189,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
             inverse = HALF_LOG2E / determinant
             dx, dy, dz = mx - eye_x, my - eye_y, mz - eye_z
             length = 1.0 / sqrt(fma(dx, dx, fma(dy, dy, dz * dz)))
-            red, green, blue = colour(
-                sh, chunk * coefficients * 16, degree, dx * length, dy * length, dz * length
-            )
+            red, green, blue = colour(sh, chunk * coefficients * 16, degree, dx * length, dy * length, dz * length)
             store(scratch, 0, px)
             store(scratch, 16, py)
             store(scratch, 32, dyy * inverse)

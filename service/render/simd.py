@@ -183,9 +183,7 @@ def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         values = [_widened(context, builder, v, t, f32x16) for v, t in zip(args, sig.args, strict=True)]
-        fn = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(_VF, [_VF] * 3), "llvm.fma.v16f32"
-        )
+        fn = cgutils.get_or_insert_function(builder.module, ir.FunctionType(_VF, [_VF] * 3), "llvm.fma.v16f32")
         return builder.call(fn, values)
 
     return f32x16(a, b, c), codegen
@@ -483,21 +481,15 @@ def store_rgb_rows(typingctx: Any, array: Any, offset: Any, row_stride: Any, r: 
         # Interleave row by row: two-source shuffles first (r, g), then blue is put between.
         for row in range(4):
             first = 4 * row
-            rg = ir.Constant(
-                _VI, [first + i // 3 + (LANES if i % 3 == 1 else 0) for i in range(12)] + [0] * 4
-            )
+            rg = ir.Constant(_VI, [first + i // 3 + (LANES if i % 3 == 1 else 0) for i in range(12)] + [0] * 4)
             pair = builder.shuffle_vector(red, green, rg)
             mix = [LANES + first + i // 3 if i % 3 == 2 else i for i in range(12)]
             mixed = builder.shuffle_vector(pair, blue, ir.Constant(ir.VectorType(_I32, 12), mix))
             at = builder.add(args[1], builder.mul(args[2], ir.Constant(_I64, row)))
             for start, size in ((0, 8), (8, 4)):
                 lanes = ir.Constant(ir.VectorType(_I32, size), [start + i for i in range(size)])
-                part = builder.shuffle_vector(
-                    mixed, ir.Constant(ir.VectorType(_F32, 12), ir.Undefined), lanes
-                )
-                p = _pointer(
-                    context, builder, sig.args[0], args[0], builder.add(at, ir.Constant(_I64, start))
-                )
+                part = builder.shuffle_vector(mixed, ir.Constant(ir.VectorType(_F32, 12), ir.Undefined), lanes)
+                p = _pointer(context, builder, sig.args[0], args[0], builder.add(at, ir.Constant(_I64, start)))
                 builder.store(part, builder.bitcast(p, ir.VectorType(_F32, size).as_pointer()), align=4)
         return context.get_dummy_value()
 

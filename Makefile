@@ -1,0 +1,42 @@
+# Two commands matter: `make demo` and `make test`. Both set up what they need, in .venv.
+PYTHON ?= python3
+PORT ?= 8000
+BIN := .venv/bin
+STUDIO_BIN := scenes/studio/.venv/bin
+
+.PHONY: setup demo test lint check studio clean
+
+setup: .venv/ready
+
+.venv/ready: pyproject.toml constraints.txt
+	$(PYTHON) -c "import sys; assert sys.version_info >= (3, 11), 'Python 3.11 or newer is needed; set PYTHON='"
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	$(BIN)/splatfix doctor --warm
+	touch .venv/ready
+
+demo: setup
+	$(BIN)/splatfix serve scenes/studio --port $(PORT)
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+test: check
+	$(BIN)/pytest
+
+lint: setup
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# Rebuilds the demo scene from nothing: some 30 minutes of path tracing and 10 of training on two cores.
+studio: setup
+	$(PYTHON) -m venv scenes/studio/.venv
+	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
+	cd scenes/studio && .venv/bin/python build.py --out build
+	$(BIN)/python scenes/studio/train_studio.py
+
+clean:
+	rm -rf .venv scenes/studio/.venv
