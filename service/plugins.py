@@ -26,9 +26,12 @@ class PluginFolder:
         self._marker = f"\ndef {marker}("
 
     def names(self) -> tuple[str, ...]:
-        folder = Path(importlib.import_module(self.package).__file__ or "").parent
-        found = (info.name for info in pkgutil.iter_modules([str(folder)]))
-        return tuple(sorted(n for n in found if self._marker in (folder / f"{n}.py").read_text("utf-8")))
+        found = pkgutil.iter_modules(importlib.import_module(self.package).__path__)
+        return tuple(sorted(info.name for info in found if not info.ispkg and self._is_plugin(info)))
+
+    def _is_plugin(self, info: pkgutil.ModuleInfo) -> bool:
+        source = Path(info.module_finder.path, f"{info.name}.py")  # type: ignore[union-attr]
+        return self._marker in source.read_text("utf-8")
 
     def missing(self, name: str) -> str | None:
         """Return why the plug-in can't run on this machine, or None if it can."""

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import anyio
+import yaml
 from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
@@ -46,7 +47,10 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     Raises SceneNotFound or BadInput if the settings name scenes that can't be.
     """
     settings = settings or Settings()
-    known = Scenes(settings.scenes, settings.cache_dir) if scenes is None else Scenes.of(scenes)
+    if scenes is None:
+        known = Scenes(settings.scenes, settings.estimator, settings.cache_dir)
+    else:
+        known = Scenes.of(scenes, settings.estimator)
     viewer = ViewerChild(settings.loopback_url) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
 
@@ -113,12 +117,22 @@ def openapi(app: FastAPI) -> dict[str, Any]:
     return app.openapi_schema
 
 
+def openapi_yaml() -> str:
+    """Return the text of openapi.yaml; it doesn't depend on any setting."""
+    return yaml.safe_dump(
+        create_app(Settings(scenes=[], viewer=False)).openapi(),
+        sort_keys=False,
+        width=100,
+        allow_unicode=True,
+    )
+
+
 _SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
 _DESCRIPTION = """
 Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
-camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions are wxyz.
-A photo that can't be localized is an answer (`not_localized`, with a reason), not an error. Every error is a
-problem document (RFC 9457).
+camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
+are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
+Every error is a problem document (RFC 9457).
 """
 
 

@@ -112,9 +112,7 @@ def record_out(record: IterationRecord) -> Record:
             render_camera=camera_out(matches.render_camera),
         ),
         candidates=candidates
-        and CandidatesOut(
-            world_from_camera=candidates.world_from_camera.tolist(), scores=candidates.scores.tolist()
-        ),
+        and CandidatesOut(world_from_camera=candidates.world_from_camera.tolist(), scores=candidates.scores.tolist()),
     )
 
 

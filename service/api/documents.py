@@ -28,7 +28,7 @@ from service.api.schemas import (
 )
 from service.api.settings import Settings
 from service.estimators import ESTIMATORS
-from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, DEFAULT_RASTERIZER
+from service.localize import DEFAULT_MATCHER, DEFAULT_RASTERIZER
 from service.matchers import MATCHERS
 from service.plugins import PluginFolder
 from service.render import RASTERIZERS
@@ -127,9 +127,7 @@ def scene_document(entry: Entry, root: str) -> SceneOut:
         up_in_world=list(info.up_in_world) if info and info.up_in_world else None,
         metres_per_unit=info and info.metres_per_unit,
         render_mode=info and info.render_mode,
-        bounds_in_world=np.quantile(scene.means, [0.01, 0.99], axis=0).tolist()
-        if scene and scene.count
-        else None,
+        bounds_in_world=np.quantile(scene.means, [0.01, 0.99], axis=0).tolist() if scene and scene.count else None,
         warnings=list(info.warnings) if info else [],
         training_cameras=[named_camera_out(c) for c in scene.cameras] if scene else [],
     )
@@ -161,7 +159,7 @@ def capabilities(settings: Settings) -> Capabilities:
                 if plugin.reason
                 else TypeAdapter(ESTIMATORS.load(plugin.name).Options).json_schema(),
             )
-            for plugin in plugins(ESTIMATORS, DEFAULT_ESTIMATOR)
+            for plugin in plugins(ESTIMATORS, settings.estimator)
         ],
         matchers=plugins(MATCHERS, DEFAULT_MATCHER),
         rasterizers=plugins(RASTERIZERS, DEFAULT_RASTERIZER),

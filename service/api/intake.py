@@ -20,7 +20,7 @@ from starlette.requests import Request as HttpRequest
 from service.api.convert import OPENCV_FROM_OPENGL
 from service.api.jobs import Task
 from service.api.problems import described
-from service.api.schemas import LocalizeFields, PriorIn
+from service.api.schemas import LocalizeFields, LocalizeIn, PriorIn
 from service.errors import (
     InvalidIntrinsics,
     InvalidOptions,
@@ -34,7 +34,7 @@ from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 from service.types import Intrinsics, Pose, Query, StageTiming
 
 _NESTED = ("options", "intrinsics", "prior")
-_FIELDS = frozenset(LocalizeFields.model_fields)
+_FIELDS = frozenset(LocalizeIn.model_fields)
 _ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior}
 
 
@@ -67,9 +67,7 @@ async def _form_body(request: HttpRequest) -> Body:
             raise InvalidRequest("given more than once.", where=repeated[0])
         photo = form.get("photo")
         if not isinstance(photo, UploadFile):
-            raise InvalidRequest(
-                "a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg"
-            )
+            raise InvalidRequest("a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg")
         # Forms send an empty text for what was left empty.
         texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
         fields = {name: parsed_json(t, name) if name in _ERRORS else t for name, t in texts.items()}
@@ -115,9 +113,11 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
         raise _ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
 
 
-def make_task(body: Body, fields: LocalizeFields, scene: LoadedScene) -> tuple[Task, Query]:
+def make_task(
+    body: Body, fields: LocalizeFields, scene: LoadedScene, default_estimator: str = DEFAULT_ESTIMATOR
+) -> tuple[Task, Query]:
     """Decode the photo and parse everything else. Slow: not for the event loop. Raises BadInput."""
-    estimator = fields.estimator or DEFAULT_ESTIMATOR
+    estimator = fields.estimator or default_estimator
     request = Request(
         estimator=estimator,
         options=options_from(estimator, fields.options),

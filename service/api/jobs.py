@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 from service.api.schemas import JobState
 from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound
-from service.images import encode_jpeg
+from service.images import encode_image
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.types import IterationRecord, PoseEstimate, Query, StageTiming
 
@@ -82,7 +82,7 @@ class Job:
     def jpeg(self) -> bytes:
         """Return the photo as the estimator saw it: upright, undistorted, perhaps reduced."""
         query = self._query  # read before _jpeg, since `shrink` writes them in the other order
-        return self._jpeg or (encode_jpeg(query.rgb) if query else b"")
+        return self._jpeg or (encode_image(query.rgb) if query else b"")
 
     def run(self) -> None:
         """Localize on the calling thread, unless the job was cancelled while it waited."""
@@ -187,9 +187,7 @@ class ThreadExecutor:
         self._closed = False
         self._idle = workers
         # Daemons: a job that doesn't come to its next record must not keep the process from ending.
-        self._threads = [
-            threading.Thread(target=self._work, name=f"job-{i}", daemon=True) for i in range(workers)
-        ]
+        self._threads = [threading.Thread(target=self._work, name=f"job-{i}", daemon=True) for i in range(workers)]
         for thread in self._threads:
             thread.start()
 

@@ -46,7 +46,7 @@ from service.api.schemas import (
     Trace,
 )
 from service.api.settings import Settings
-from service.images import encode_jpeg
+from service.images import encode_image
 from service.types import Camera
 
 MAX_SPLATS = 2_000_000
@@ -156,15 +156,13 @@ async def localize_photo(
     response: Response,
     parts: PartsOf,
     root: RootOf,
-    prefer: Annotated[
-        str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")
-    ] = "",
+    prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
 ) -> JobOut:
     """Find where a photo was taken. What is wrong with the request is told at once; the search is a job."""
     body = await read_body(request)
     fields = read_fields(body.fields)
     scene = parts.scenes.get(fields.scene)
-    prepare = partial(make_task, body, fields, scene)
+    prepare = partial(make_task, body, fields, scene, parts.settings.estimator)
     job = parts.jobs.submit(*await to_thread.run_sync(prepare, limiter=parts.decoding))
     wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
     if wait_s:
@@ -268,7 +266,7 @@ async def job_render(
 
 
 def _rendered_jpeg(job: Job, camera: Camera) -> bytes:
-    return encode_jpeg(job.task.scene.rasterizer.render([camera])[0].rgb)
+    return encode_image(job.task.scene.rasterizer.render([camera])[0].rgb)
 
 
 @router.get("/scenes", tags=["scenes"], responses=errors())
@@ -323,9 +321,7 @@ async def live() -> Liveness:
     return Liveness()
 
 
-@router.get(
-    "/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors()
-)
+@router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
 async def ready(parts: PartsOf, response: Response) -> Readiness:
     """Say whether photos can be localized at full speed: scenes loaded, kernels compiled, indexes made."""
     readiness = parts.scenes.readiness()

@@ -13,7 +13,7 @@ import numpy as np
 from service.api.schemas import Readiness, SceneState
 from service.errors import BadInput, SceneNotFound, SceneNotReady, SplatfixError
 from service.geometry import look_at
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
+from service.localize import LoadedScene, Request, localize
 from service.scene_formats.discovery import find_scenes
 from service.types import Camera, Intrinsics, Query
 
@@ -36,9 +36,12 @@ class Entry:
 class Scenes:
     """All scenes of the service. Changed by the loading thread, read by any."""
 
-    def __init__(self, paths: Iterable[Path], cache_dir: Path | None) -> None:
-        """Find the scenes, without reading them. Raises SceneNotFound, InvalidRequest."""
-        self._cache_dir = cache_dir
+    def __init__(self, paths: Iterable[Path], estimator: str, cache_dir: Path | None) -> None:
+        """Find the scenes, without reading them. Raises SceneNotFound, BadInput.
+
+        `estimator` is the one that they are made ready for.
+        """
+        self._estimator, self._cache_dir = estimator, cache_dir
         self._entries: dict[str, Entry] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._load_all, name="scenes", daemon=True)
@@ -49,9 +52,9 @@ class Scenes:
             self._entries[scene_id] = Entry(scene_id, path)
 
     @classmethod
-    def of(cls, loaded: Mapping[str, LoadedScene]) -> Scenes:
+    def of(cls, loaded: Mapping[str, LoadedScene], estimator: str) -> Scenes:
         """Take scenes that are in memory already."""
-        scenes = cls((), None)
+        scenes = cls((), estimator, None)
         scenes._entries = {k: Entry(k, None, "preparing", v) for k, v in loaded.items()}
         return scenes
 
@@ -83,9 +86,7 @@ class Scenes:
         if entry.error:
             raise entry.error
         if entry.loaded is None:
-            raise SceneNotReady(
-                f"scene '{entry.id}' is still loading.", where="scene", hint="Try again later."
-            )
+            raise SceneNotReady(f"scene '{entry.id}' is still loading.", where="scene", hint="Try again later.")
         return entry.loaded
 
     def readiness(self) -> Readiness:
@@ -115,19 +116,19 @@ class Scenes:
             entry.loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir)
         entry.state = "preparing"
         if entry.loaded is not None and not self._stop.is_set():
-            entry.loaded.prepare(DEFAULT_ESTIMATOR)
-            warm_up(entry.loaded)
+            entry.loaded.prepare(self._estimator)
+            warm_up(entry.loaded, self._estimator)
         entry.state = "ready"
 
 
-def warm_up(loaded: LoadedScene) -> None:
+def warm_up(loaded: LoadedScene, estimator: str) -> None:
     """Localize a render of the scene, so that the first photo meets compiled code and loaded networks."""
     cameras = loaded.scene.cameras
     camera = cameras[len(cameras) // 2].camera if cameras else _outside(loaded)
     camera = Camera(camera.intrinsics.with_long_side(512), camera.pose)
     frame = loaded.rasterizer.render([camera])[0]
     rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
-    estimate = localize(Query(rgb, camera.intrinsics, "given", camera.intrinsics), loaded)
+    estimate = localize(Query(rgb, camera.intrinsics, "given", camera.intrinsics), loaded, Request(estimator))
     _log.info("scene %s: warmed up, %s", loaded.scene.info.id, estimate.verdict.status)
 
 

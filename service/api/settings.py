@@ -8,6 +8,8 @@ from pathlib import Path
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from service.localize import DEFAULT_ESTIMATOR
+
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -23,6 +25,8 @@ class Settings(BaseSettings):
     """0: any free one."""
     root_path: str = ""
     """The sub-path under which a proxy shows the service, e.g. /fix; `X-Forwarded-Prefix` wins."""
+    estimator: str = DEFAULT_ESTIMATOR
+    """Of jobs that name none; what it prepares for a scene is made at start."""
     workers: int = Field(default_factory=_cores, ge=1)
     """Jobs that run at once; each has one thread."""
     queue_size: int = Field(default=32, ge=1)

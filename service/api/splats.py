@@ -32,9 +32,7 @@ def packed_splats(scene: GaussianScene, limit: int) -> bytes:
     """Return the `limit` most important Gaussians in the layout above; deterministic."""
     chosen = np.argsort(-importance(scene), kind="stable")[:limit]
     info = scene.info
-    header = json.dumps(
-        {"scene": info.id, "sha256": info.sha256, "count": len(chosen), "total": scene.count}
-    ).encode()
+    header = json.dumps({"scene": info.id, "sha256": info.sha256, "count": len(chosen), "total": scene.count}).encode()
     header += b" " * (-len(header) % 4)
     rotation = rotation_from_quat(scene.quats[chosen])
     axes = rotation * scene.scales[chosen][:, None, :]

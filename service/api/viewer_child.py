@@ -37,7 +37,9 @@ class ViewerChild:
             await asyncio.sleep(pause)
 
     async def _run_once(self) -> None:
-        child = await asyncio.create_subprocess_exec(*self._command, stdin=asyncio.subprocess.DEVNULL)
+        # Its log goes to stderr; on stdout is viser's banner with an address that is not for people.
+        nothing = asyncio.subprocess.DEVNULL
+        child = await asyncio.create_subprocess_exec(*self._command, stdin=nothing, stdout=nothing)
         try:
             code = await child.wait()
             _log.warning("the viewer ended with code %s; it is started again", code)

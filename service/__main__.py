@@ -1,0 +1,393 @@
+"""The command line: `splatfix serve | localize | render | bench | scenes | doctor`."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import logging
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
+from rich.table import Table
+
+from service import __version__
+from service.errors import InvalidRequest, SplatfixError
+
+if TYPE_CHECKING:
+    import uvicorn
+    from fastapi import FastAPI
+
+    from service.api.schemas import Result
+    from service.api.settings import Settings
+    from service.localize import LoadedScene
+
+# Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
+
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="Photo in, pose out.")
+bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
+scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes.")
+app.add_typer(bench_app, name="bench")
+app.add_typer(scenes_app, name="scenes")
+out, err = Console(), Console(stderr=True)
+
+SceneOption = Annotated[Path, typer.Option("--scene", help="Scene folder or scene file.")]
+IntrinsicsOption = Annotated[
+    str,
+    typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
+]
+
+
+def main() -> None:
+    """Run the command line; an error that a user can mend is one line and exit code 2."""
+    # Before numpy and torch are imported: a job runs on one thread, and several jobs at once.
+    for library in ("OMP", "MKL", "OPENBLAS", "VECLIB_MAXIMUM"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
+    handler = RichHandler(console=err, show_path=False) if err.is_terminal else logging.StreamHandler()
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", handlers=[handler])
+    try:
+        app()
+    except SplatfixError as error:
+        err.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        raise SystemExit(2) from None
+
+
+@app.command()
+def serve(
+    scenes: Annotated[
+        list[Path] | None, typer.Argument(help="Scene folders, scene files, or folders of scene folders.")
+    ] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="0: any free one.", min=0, max=65535)] = None,
+    viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
+) -> None:
+    """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment."""
+    import uvicorn
+
+    from service.api.app import create_app
+
+    given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer}
+    settings = _settings({name: value for name, value in given.items() if value is not None})
+    listener = _listener(settings.host, settings.port)
+    settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+    application = create_app(settings)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            application,
+            log_level="warning",
+            access_log=False,
+            ws="websockets-sansio",
+            ws_max_size=2**26,
+            ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
+            timeout_graceful_shutdown=3,
+        )
+    )
+    logging.getLogger("service").setLevel(logging.INFO)
+    announce = threading.Thread(target=_announce, args=(server, application, settings), daemon=True)
+    announce.start()
+    server.run(sockets=[listener])
+
+
+def _settings(given: dict[str, Any]) -> Settings:
+    from pydantic import ValidationError
+
+    from service.api.problems import described
+    from service.api.settings import Settings
+
+    try:
+        return Settings(**given)
+    except ValidationError as error:
+        where, message = described(error.errors())
+        raise InvalidRequest(message, where=where) from error
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
+
+
+def _announce(server: uvicorn.Server, application: FastAPI, settings: Settings) -> None:
+    """Wait until the service is ready, then say where it is and what to type."""
+    from service.example import curl_line
+
+    with err.status("starting") as status:
+        while not server.started:
+            time.sleep(0.05)
+        scenes = application.state.parts.scenes
+        while awaited := scenes.readiness().awaited:
+            status.update(", ".join(awaited))
+            time.sleep(0.1)
+    readiness, url = scenes.readiness(), settings.loopback_url
+    for reason in readiness.failed:
+        err.print(f"not usable: {reason}", style="red", markup=False, highlight=False)
+    lines = [
+        f"splatfix {__version__} {'is ready' if readiness.ready else 'runs, but has no usable scene'}:",
+        f"  start page  {url}/",
+        *([f"  viewer      {url}/viewer/"] if settings.viewer else []),
+        f"  API         {url}/docs",
+    ]
+    ready = [entry for entry in scenes.entries() if entry.state == "ready"]
+    if ready:
+        scene, folder = ready[0].loaded.scene, ready[0].path
+        several = len(scenes.entries()) > 1
+        lines += ["Try it:", f"  {curl_line(url, scene, folder, name_scene=several)}"]
+    out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def localize(
+    photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC.")],
+    scene: SceneOption,
+    intrinsics: IntrinsicsOption = "",
+    prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
+    estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
+    seed: int = 0,
+    budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
+    csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
+) -> None:
+    """Find where photos were taken in a scene."""
+    from service.api.convert import result_out, timing_out
+    from service.api.documents import versions
+    from service.api.intake import Body, make_task, read_fields
+    from service.localize import DEFAULT_ESTIMATOR
+    from service.localize import localize as run
+
+    given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s}
+    given |= {"intrinsics": _json(intrinsics, "intrinsics"), "prior": _json(prior, "prior")}
+    fields = read_fields({name: value for name, value in given.items() if value is not None})
+    bodies = [Body(_bytes(photo), str(photo), {}) for photo in photos]
+    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR)
+    results: list[tuple[str, Result]] = []
+    for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
+        task, query = make_task(body, fields, loaded)
+        estimate = run(query, loaded, task.request)
+        results.append((body.name, result_out(estimate, timing_out(task.decode), versions())))
+        if not as_json:
+            out.print(_line(*results[-1]), markup=False, highlight=False, soft_wrap=True)
+    if as_json:
+        _print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
+    if csv_file:
+        _write_csv(csv_file, results)
+
+
+def _line(name: str, result: Result) -> str:
+    place = " ".join(f"{value:.4f}" for value in result.pose.position)
+    turn = " ".join(f"{value:.4f}" for value in result.pose.world_from_camera.quaternion_wxyz)
+    told = f"{name}: {result.status}, score {result.score:.2f}, position {place}, quaternion_wxyz {turn}"
+    return f"{told}. {result.hint}" if result.hint else told
+
+
+_POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+
+def _write_csv(path: Path, results: list[tuple[str, Result]]) -> None:
+    """One row a photo; the pose is world_from_camera in OpenCV axes."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(["photo", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"])
+        for name, result in results:
+            spent = sum(timing.wall_s for timing in result.timings)
+            turn = result.pose.world_from_camera.quaternion_wxyz
+            row = [name, result.status, result.reason, result.score, *result.pose.position, *turn]
+            table.writerow([*row, result.inliers, round(1000 * spent, 1)])
+
+
+@app.command()
+def render(
+    scene: SceneOption,
+    pose: Annotated[str, typer.Option(help="As the API takes a prior: JSON or a file.")],
+    out_file: Annotated[Path, typer.Option("--out", help="A .png or .jpg to write.")],
+    intrinsics: IntrinsicsOption = "",
+) -> None:
+    """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
+    from service.api.intake import prior_from, read_fields
+    from service.images import encode_image, intrinsics_from
+    from service.types import Camera, Intrinsics
+
+    fields = read_fields({"prior": _json(pose, "prior")})
+    if fields.prior is None:
+        raise InvalidRequest("a pose is required.", where="--pose")
+    kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
+    if kind not in ("png", "jpg"):
+        raise InvalidRequest("must end with .png or .jpg.", where="--out")
+    given = _json(intrinsics, "intrinsics")
+    loaded = _loaded(scene)
+    cameras = [named.camera.intrinsics for named in loaded.scene.cameras]
+    default = cameras[0] if cameras else Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+    camera = Camera(intrinsics_from(given) if given else default, prior_from(fields.prior))
+    out_file.write_bytes(encode_image(loaded.rasterizer.render([camera])[0].rgb, kind))
+
+
+@bench_app.command("localize")
+def bench_localize(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    estimator: str = "view_index",
+    start: Annotated[Literal["none", "easy", "hard", "inplace", "random"], typer.Option()] = "none",
+    trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
+    seed: int = 0,
+    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
+    modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Localize a scene's test photos and compare with the truth."""
+    from service.bench.localize import run
+
+    _tell_machine()
+    with _progress() as progress:
+        outcome = run(
+            folder,
+            estimator=estimator,
+            start=start,
+            trials=trials,
+            seed=seed,
+            intrinsics=intrinsics,
+            cameras=cameras,
+            modify=tuple(modify or ()),
+            progress=_counter(progress, "photos"),
+            cache_dir=_settings({}).cache_dir,
+        )
+    _write_json(json_file, outcome)
+    for name, value in outcome.items():
+        if name != "per_query":
+            out.print(f"{name:28} {value}", markup=False, highlight=False)
+
+
+@bench_app.command("render")
+def bench_render(
+    repeats: Annotated[int, typer.Option(min=1, help="Of each picture; the least time counts.")] = 30,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Time the renderer on the synthetic room."""
+    from service.bench.render import run
+
+    _tell_machine()
+    with _progress() as progress:
+        outcome = run(repeats=repeats, progress=_counter(progress, "cases"))
+    _write_json(json_file, outcome)
+    table = Table(*outcome[0].keys())
+    for row in outcome:
+        table.add_row(*(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()))
+    out.print(table)
+
+
+@scenes_app.command("list")
+def list_scenes(
+    folder: Annotated[Path, typer.Argument(help="A scene, or a folder of scenes.")] = Path(),
+) -> None:
+    """List the scenes at a path, without reading them."""
+    from service.scene_formats.discovery import find_scenes
+
+    for scene in find_scenes(folder):
+        out.print(str(scene), markup=False, highlight=False, soft_wrap=True)
+
+
+@scenes_app.command("inspect")
+def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")]) -> None:
+    """Read a scene and say what is in it."""
+    from service.scene_formats import load_scene
+
+    with err.status(f"reading {scene}"):
+        found = load_scene(scene)
+    lower, upper = found.means.min(0), found.means.max(0)
+    facts = {"gaussians": found.count, "sh_degree": found.sh_degree, "training cameras": len(found.cameras)}
+    facts |= {"memory": f"{found.nbytes / 1e6:.1f} MB", "extent": f"{lower.tolist()} to {upper.tolist()}"}
+    for name, value in (facts | dataclasses.asdict(found.info)).items():
+        out.print(f"{name:22} {value}", markup=False, highlight=False, soft_wrap=True)
+
+
+@app.command()
+def doctor() -> None:
+    """Say what runs on this machine, and why the rest doesn't."""
+    from service.doctor import findings
+
+    healthy = True
+    with err.status("examining"):
+        for finding in findings():
+            mark = "ok  " if finding.ok else "FAIL" if finding.needed else "no  "
+            out.print(f"{mark} {finding.subject:24} {finding.detail}", markup=False, highlight=False, soft_wrap=True)
+            healthy &= finding.ok or not finding.needed
+    for name, value in _settings({}).model_dump().items():
+        out.print(f"     SPLATFIX_{name.upper():22} {value}", markup=False, highlight=False, soft_wrap=True)
+    if not healthy:
+        raise typer.Exit(1)
+
+
+@app.command(hidden=True)
+def openapi() -> None:
+    """Print the API's description, as openapi.yaml has it."""
+    from service.api.app import openapi_yaml
+
+    print(openapi_yaml(), end="")
+
+
+def _json(text: str, where: str) -> Any:
+    """Parse an option that is JSON, or names a file of it; None if it is empty."""
+    from service.api.intake import parsed_json
+
+    if not text:
+        return None
+    return parsed_json(text if text.lstrip().startswith("{") else _bytes(Path(text)), where)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InvalidRequest(f"{error.strerror}.", where=str(path)) from error
+
+
+def _loaded(scene: Path, estimator: str | None = None) -> LoadedScene:
+    """Load a scene and, if an estimator is to use it, make what that prepares for it."""
+    from service.localize import LoadedScene
+
+    with err.status(f"reading {scene}") as status:
+        loaded = LoadedScene.load(scene, cache_dir=_settings({}).cache_dir)
+        if estimator:
+            status.update("preparing")
+            loaded.prepare(estimator)
+    return loaded
+
+
+def _tell_machine() -> None:
+    from service.doctor import processor
+
+    err.print(processor(), markup=False, highlight=False)
+
+
+def _progress() -> Progress:
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    return Progress(*columns, console=err, transient=True)
+
+
+def _counter(progress: Progress, unit: str) -> Callable[[int, int], None]:
+    """Return a function that shows (done, of how many) as a bar."""
+    task = progress.add_task(unit, total=None)
+    return lambda done, total: progress.update(task, completed=done, total=total)
+
+
+def _write_json(path: Path | None, value: Any) -> None:
+    if path:
+        path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=1))
+
+
+if __name__ == "__main__":
+    main()
