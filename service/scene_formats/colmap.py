@@ -63,9 +63,7 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
         name, count = _MODELS[model]
-        result[number] = _intrinsics(
-            name, width, height, list(struct.unpack_from(f"<{count}d", data, at + 24))
-        )
+        result[number] = _intrinsics(name, width, height, list(struct.unpack_from(f"<{count}d", data, at + 24)))
         at += 24 + 8 * count
     return result
 

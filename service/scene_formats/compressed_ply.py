@@ -51,9 +51,7 @@ def read(path: Path) -> RawGaussians:
             means=_between(_unpacked(packed[0], (11, 10, 11)), chunks, of_vertex, ("x", "y", "z")),
             quats=_quaternions(packed[1]),
             scales=np.exp(
-                _between(
-                    _unpacked(packed[2], (11, 10, 11)), chunks, of_vertex, ("scale_x", "scale_y", "scale_z")
-                )
+                _between(_unpacked(packed[2], (11, 10, 11)), chunks, of_vertex, ("scale_x", "scale_y", "scale_z"))
             ),
             opacities=rgba[:, 3],
             sh=sh,
@@ -73,15 +71,9 @@ def _check_layout(header: PlyHeader, path: Path) -> None:
     if any(vertex.dtype[name].kind != "u" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
         raise CorruptScene("the packed properties must be uint.", where=path.name)
     if chunk.count != -(-vertex.count // CHUNK):
-        raise CorruptScene(
-            f"{chunk.count} chunks for {vertex.count} Gaussians; a chunk has {CHUNK}.", where=path.name
-        )
-    if sh is not None and (
-        sh.count != vertex.count or len((sh.dtype and sh.dtype.names) or ()) not in (9, 24, 45)
-    ):
-        raise CorruptScene(
-            f"element 'sh' must have {vertex.count} records of 9, 24 or 45 bytes.", where=path.name
-        )
+        raise CorruptScene(f"{chunk.count} chunks for {vertex.count} Gaussians; a chunk has {CHUNK}.", where=path.name)
+    if sh is not None and (sh.count != vertex.count or len((sh.dtype and sh.dtype.names) or ()) not in (9, 24, 45)):
+        raise CorruptScene(f"element 'sh' must have {vertex.count} records of 9, 24 or 45 bytes.", where=path.name)
 
 
 def _unpacked(packed: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float32[np.ndarray, "n c"]:
@@ -116,9 +108,7 @@ def _rest(path: Path, header: PlyHeader) -> Float32[np.ndarray, "n k 3"]:
     records = element_records(path, header, "sh")
     names = [f"f_rest_{i}" for i in range(len(records.dtype.names or ()))]
     if set(names) != set(records.dtype.names or ()):
-        raise CorruptScene(
-            f"the properties of element 'sh' must be f_rest_0 to {names[-1]}.", where=path.name
-        )
+        raise CorruptScene(f"the properties of element 'sh' must be f_rest_0 to {names[-1]}.", where=path.name)
     byte = np.stack([records[name] for name in names], 1).astype(np.float32)
     share = np.where(byte == 0, 0, np.where(byte == 255, 1, (byte + np.float32(0.5)) / 256))
     return sh_from_channel_major(((share - np.float32(0.5)) * 8).astype(np.float32))

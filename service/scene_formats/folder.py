@@ -119,6 +119,8 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
         )
     with candidates[0].open("rb") as file:
         head = file.read(_HEAD_BYTES)
+    if not head:
+        raise CorruptScene("the file is empty (0 bytes).", where=candidates[0].name)
     for name in SCENE_FORMATS.names():
         reader = SCENE_FORMATS.load(name)
         if reader.accepts(head, candidates[0].suffix.lower()):
@@ -145,9 +147,7 @@ def _training_focal_px(cameras: tuple[NamedCamera, ...], size: tuple[int, int] |
 
 
 def _moved(camera: NamedCamera, world_from_scene: np.ndarray) -> NamedCamera:
-    return replace(
-        camera, camera=replace(camera.camera, pose=moved_pose(camera.camera.pose, world_from_scene))
-    )
+    return replace(camera, camera=replace(camera.camera, pose=moved_pose(camera.camera.pose, world_from_scene)))
 
 
 def _digest(file: Path, path: Path, cameras: tuple[NamedCamera, ...], *facts: object) -> str:

@@ -49,9 +49,7 @@ def checked(raw: RawGaussians, where: str) -> RawGaussians:
     for name in ("means", "scales", "opacities", "sh", "quats"):
         values = getattr(raw, name)
         _require_none(~np.isfinite(values.reshape(len(values), -1)).all(1), f"non-finite {name}", where)
-    _require_none(
-        (np.abs(raw.means) > MAX_COORDINATE).any(1), f"means beyond {MAX_COORDINATE:g} units", where
-    )
+    _require_none((np.abs(raw.means) > MAX_COORDINATE).any(1), f"means beyond {MAX_COORDINATE:g} units", where)
     _require_none((raw.scales > MAX_COORDINATE).any(1), f"scales beyond {MAX_COORDINATE:g} units", where)
     _require_none((raw.scales < 0).any(1), "negative scales", where)
     lengths = np.linalg.norm(raw.quats.astype(np.float64), axis=1)

@@ -93,9 +93,7 @@ class TransformsFile:
             fx = number("fl_x")
         else:
             fx = float(width / 2 / np.tan(number("camera_angle_x") / 2))
-        return Intrinsics(
-            width, height, fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2)
-        )
+        return Intrinsics(width, height, fx, number("fl_y", fx), number("cx", width / 2), number("cy", height / 2))
 
     def _size(self, values: dict[str, Any], photo: str, manifest: Manifest, where: str) -> tuple[int, int]:
         if "w" in values and "h" in values:

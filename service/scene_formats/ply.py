@@ -47,22 +47,16 @@ def read(path: Path) -> RawGaussians:
 def _sh_degree(names: tuple[str, ...], path: Path) -> int:
     """Check the property names and return the degree that they amount to."""
     if "scale_0" in names and "scale_2" not in names:
-        raise UnsupportedFormat(
-            "a 2DGS scene (it has no scale_2); only 3DGS scenes can be rendered.", where=path.name
-        )
+        raise UnsupportedFormat("a 2DGS scene (it has no scale_2); only 3DGS scenes can be rendered.", where=path.name)
     rest = [name for name in names if name.startswith("f_rest_")]
     needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
     needed += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
     needed += [f"f_rest_{i}" for i in range(len(rest))]
     missing = [name for name in needed if name not in names]
     if missing:
-        raise UnsupportedFormat(
-            f"not a 3DGS scene: element 'vertex' has no {', '.join(missing[:5])}.", where=path.name
-        )
+        raise UnsupportedFormat(f"not a 3DGS scene: element 'vertex' has no {', '.join(missing[:5])}.", where=path.name)
     if len(rest) not in _REST_COUNTS:
-        raise CorruptScene(
-            f"{len(rest)} f_rest properties; 0, 9, 24 or 45 are SH degree 0 to 3.", where=path.name
-        )
+        raise CorruptScene(f"{len(rest)} f_rest properties; 0, 9, 24 or 45 are SH degree 0 to 3.", where=path.name)
     return _REST_COUNTS[len(rest)]
 
 

@@ -46,9 +46,7 @@ def read_header(path: Path) -> PlyHeader:
     end = head.find(b"\nend_header")
     newline = head.find(b"\n", end + 1)
     if not head.startswith(b"ply") or end < 0 or newline < 0:
-        raise CorruptScene(
-            f"no 'ply' ... 'end_header' within the first {MAX_HEADER_BYTES} bytes.", where=path.name
-        )
+        raise CorruptScene(f"no 'ply' ... 'end_header' within the first {MAX_HEADER_BYTES} bytes.", where=path.name)
     lines = head[:end].decode("ascii", "replace").splitlines()
     comments = tuple(line[8:].strip() for line in lines if line.startswith("comment "))
     order = _byte_order(lines, path)
