@@ -23,7 +23,7 @@ from fastapi.responses import FileResponse
 from pydantic.json_schema import models_json_schema
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import __version__
 from service.api.jobs import Jobs
@@ -34,6 +34,7 @@ from service.api.scenes import Scenes
 from service.api.schemas import LocalizeIn, Problem, Record
 from service.api.settings import Settings
 from service.api.viewer_child import ViewerChild
+from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
 
 _START_PAGE = Path(__file__).parent / "start.html"
@@ -44,9 +45,10 @@ _BODY_OVERHEAD = 1_000_000
 def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScene] | None = None) -> FastAPI:
     """Make the app. Scenes are found here and loaded after start-up; `scenes` are in memory already.
 
-    Raises SceneNotFound or BadInput if the settings name scenes that can't be.
+    Raises SceneNotFound, BadInput or BackendMissing if the settings name what is not there.
     """
     settings = settings or Settings()
+    ESTIMATORS.load(settings.estimator)  # an unknown name shall be told now, not in each job
     if scenes is None:
         known = Scenes(settings.scenes, settings.estimator, settings.cache_dir)
     else:
@@ -68,12 +70,10 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
             yield
 
-    limit = settings.max_upload_bytes + _BODY_OVERHEAD
     app = FastAPI(
         title="splatfix",
         version=__version__,
         lifespan=lifespan,
-        max_body_size=limit,
         generate_unique_id_function=lambda route: route.name,
     )
     install(app)
@@ -81,7 +81,7 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     app.add_api_route("/", _start_page, include_in_schema=False)
     if relay:
         app.include_router(relay.router)
-    app.add_middleware(SizeCheck, limit=limit)
+    app.add_middleware(SizeLimit, limit=settings.max_upload_bytes + _BODY_OVERHEAD)
     app.add_middleware(SubPath, default=settings.root_path)
     app.openapi = lambda: openapi(app)
     return app
@@ -154,16 +154,32 @@ class SubPath:
         await self._app(scope, receive, send)
 
 
-class SizeCheck:
-    """Refuses a body by its announced length, before a byte of it is read; FastAPI counts the unannounced."""
+class SizeLimit:
+    """Refuses a large body: by its announced length before a byte of it is read, else as soon as it is too long.
+
+    Starlette's own limit answers in plain text, whatever the app would say.
+    """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self._app, self._limit = app, limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        length = Headers(scope=scope).get("content-length", "") if scope["type"] == "http" else ""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        error = HTTPException(413, f"The body may have {self._limit} bytes.")
+        length = Headers(scope=scope).get("content-length", "")
         if length.isdecimal() and int(length) > self._limit:
-            error = HTTPException(413, f"The body may have {self._limit} bytes.")
             await problem_response(error, scope["path"])(scope, receive, send)
             return
-        await self._app(scope, receive, send)
+        received = 0
+
+        async def counted() -> Message:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            if received > self._limit:
+                raise error
+            return message
+
+        await self._app(scope, counted, send)

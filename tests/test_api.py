@@ -1,0 +1,619 @@
+"""The HTTP API over a real server and real sockets; only the engine's parts are small stand-ins."""
+
+from __future__ import annotations
+
+import base64
+import importlib
+import io
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+import yaml
+from fastapi import FastAPI
+from PIL import Image
+
+import service.estimators
+from service.api.app import create_app
+from service.api.settings import Settings
+from service.interfaces import Features, Frame
+from service.localize import LoadedScene
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
+
+ROOT = Path(__file__).parents[1]
+PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
+HALF = 0.5**0.5
+TURNED = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
+"""A camera at (1, 2, 3), turned by 90 degrees about z."""
+
+
+class FlatRasterizer:
+    """Every picture is mid-grey."""
+
+    name = "flat"
+
+    def render(self, cameras):
+        sizes = [(c.intrinsics.height, c.intrinsics.width) for c in cameras]
+        flat = [np.full(size, 0.5, np.float32) for size in sizes]
+        return [Frame(np.stack([f, f, f], 2), f, f, f) for f in flat]
+
+
+class BlindMatcher:
+    """Sees nothing."""
+
+    name = "blind"
+
+    def extract(self, rgb, limit):
+        return Features(*(np.zeros(s, np.float32) for s in ((0, 2), (0,), (0, 64))))
+
+    def match(self, a, b):
+        return np.zeros((0, 2), np.int32)
+
+
+def make_scene(name: str = "room", count: int = 5) -> LoadedScene:
+    rng = np.random.default_rng(0)
+    camera = Camera(PHOTO, Pose(TURNED))
+    scene = GaussianScene(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=np.tile(np.array([[HALF, 0, 0, HALF]], np.float32), (count, 1)),
+        scales=np.tile(np.array([[0.3, 0.2, 0.1]], np.float32), (count, 1)),
+        opacities=np.linspace(0.1, 1.0, count, dtype=np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        info=SceneInfo(name, name.title(), "ab" * 32, "ply"),
+        cameras=(NamedCamera("images/a.jpg", camera),),
+    )
+    return LoadedScene(scene, FlatRasterizer(), BlindMatcher())  # type: ignore[arg-type]
+
+
+@contextmanager
+def serving(app: FastAPI) -> Iterator[httpx.Client]:
+    listener = socket.create_server(("127.0.0.1", 0))
+    config = uvicorn.Config(app, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=1)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
+    try:
+        with httpx.Client(base_url=url, timeout=20, trust_env=False) as client:
+            until(lambda: server.started)
+            yield client
+    finally:
+        server.should_exit = True
+        thread.join()
+        listener.close()
+
+
+def until(condition) -> None:
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline, "waited for too long"
+        time.sleep(0.005)
+
+
+@pytest.fixture(scope="module")
+def plugins() -> Iterator[ModuleType]:
+    """The estimators of tests/fake_estimators, registered as any: by lying in the package's folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        paths = [*service.estimators.__path__, str(ROOT / "tests" / "fake_estimators")]
+        patch.setattr(service.estimators, "__path__", paths)
+        yield importlib.import_module("service.estimators.stepping")
+
+
+@pytest.fixture
+def stepping(plugins) -> ModuleType:
+    plugins.GO_ON.clear()
+    return plugins
+
+
+def settings(**changes) -> Settings:
+    return Settings(**{"viewer": False, "estimator": "stepping", "workers": 1, "queue_size": 2, **changes})
+
+
+@pytest.fixture(scope="module")
+def shared(plugins) -> Iterator[httpx.Client]:
+    """A server for tests that leave nothing behind."""
+    with serving(create_app(settings(), {"room": make_scene()})) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        yield client
+
+
+@pytest.fixture
+def client(stepping) -> Iterator[httpx.Client]:
+    with serving(create_app(settings(), {"room": make_scene()})) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        yield client
+        stepping.GO_ON.set()
+
+
+def photo(kind: str = "jpeg", size: tuple[int, int] = (96, 64), **save) -> bytes:
+    pixels = np.random.default_rng(1).integers(0, 256, (*size[::-1], 3), np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, kind, **save)
+    return file.getvalue()
+
+
+def post(client: httpx.Client, data: bytes | None = None, prefer: str = "wait=20", **fields) -> httpx.Response:
+    """Send a form; fields that aren't text go as JSON."""
+    texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in fields.items()}
+    files = {"photo": ("p.jpg", photo() if data is None else data, "image/jpeg")}
+    return client.post("/localize", files=files, data=texts, headers={"Prefer": prefer} if prefer else {})
+
+
+def finished(client: httpx.Client, path: str) -> dict:
+    until(lambda: client.get(path).json()["finished"])
+    return client.get(path).json()
+
+
+def events(text: str) -> list[tuple[str, str, dict]]:
+    """(event, id, data) of a server-sent event stream."""
+    found = []
+    for block in text.split("\n\n"):
+        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
+        if fields:
+            found.append((fields["event"], fields["id"], json.loads(fields["data"])))
+    return found
+
+
+# ------------------------------------------------------------------ the life of a job
+
+
+def test_a_photo_becomes_a_job_becomes_a_result(shared):
+    accepted = post(shared, prefer="", seed="7", options={"steps": 4})
+    assert accepted.status_code == 202
+    path = accepted.headers["location"]
+    assert path == f"/jobs/{accepted.json()['id']}" == accepted.json()["links"]["self"]
+    job = finished(shared, path)
+    assert job["state"] == "succeeded"
+    assert job["error"] is None
+    assert (job["records"], job["options"], job["seed"]) == (4, {"steps": 4}, 7)
+    result = job["result"]
+    # Nothing matches grey: the gate, which is the real one, must say so, and that is no error.
+    assert (result["status"], result["reason"]) == ("not_localized", "few_features")
+    assert result["hint"]
+    assert [t["stage"] for t in result["timings"]] == ["decode", "step", "verify"]
+    assert result["scene"] == {"id": "room", "sha256": "ab" * 32}
+    assert (result["estimator"], result["matcher"], result["rasterizer"]) == ("stepping", "blind", "flat")
+    assert result["intrinsics_source"] == "guessed"
+    assert result["warnings"]
+    assert {"splatfix", "numpy", "numba", "torch"} <= result["versions"].keys()
+
+
+def test_the_pose_is_right_in_every_spelling(shared):
+    pose = post(shared).json()["result"]["pose"]
+    assert pose["position"] == [1, 2, 3]
+    assert pose["world_from_camera"]["matrix"] == TURNED.tolist()
+    # By hand: a quarter turn about z; the inverse turns back; OpenGL's y and z axes point the other way.
+    assert np.allclose(pose["world_from_camera"]["quaternion_wxyz"], [HALF, 0, 0, HALF])
+    assert np.allclose(pose["camera_from_world"]["quaternion_wxyz"], [HALF, 0, 0, -HALF])
+    assert np.allclose(pose["camera_from_world"]["translation"], [-2, 1, -3])
+    opengl = np.array(pose["opengl"]["world_from_camera"]["matrix"])
+    assert np.allclose(opengl, TURNED * [1, -1, -1, 1])
+    assert np.allclose(pose["opengl"]["camera_from_world"]["matrix"], np.linalg.inv(opengl))
+
+
+def test_json_and_form_are_the_same_request(shared):
+    given = {"width": 96, "height": 64, "fx": 80, "fy": 80, "cx": 48, "cy": 32}
+    fields = {"scene": "room", "intrinsics": given, "seed": 3, "budget_s": 5, "options": {"steps": 2}}
+    body = {"photo": base64.b64encode(photo()).decode(), **fields}
+    by_json = shared.post("/localize", json=body, headers={"Prefer": "wait=20"}).json()
+    by_form = post(shared, **fields).json()
+    for job in (by_json, by_form):
+        for name in ("id", "created", "started", "finished", "links", "photo"):
+            job.pop(name)
+        job["result"].pop("timings")
+    assert by_json == by_form
+    assert by_form["result"]["intrinsics_source"] == "given"
+
+
+def test_prefer_wait_answers_at_once_or_accepts(client, stepping):
+    done = post(client, prefer="respond-async, wait=20")
+    assert (done.status_code, done.json()["state"]) == (200, "succeeded")
+    assert done.headers["preference-applied"] == "wait=20"
+    began = time.monotonic()
+    held = post(client, prefer="wait=1", options={"hold": True})
+    assert (held.status_code, held.json()["state"]) == (202, "running")
+    assert 0.9 < time.monotonic() - began < 5
+
+
+def test_the_prior_reaches_the_estimator_in_every_spelling(shared):
+    opengl = TURNED * [1, -1, -1, 1]
+    spellings = [
+        {"world_from_camera": TURNED.tolist()},
+        {"camera_from_world": np.linalg.inv(TURNED).tolist()},
+        {"position": [1, 2, 3], "quaternion_wxyz": [HALF, 0, 0, HALF]},
+        {"world_from_camera": opengl.tolist(), "convention": "opengl"},
+        {"camera_from_world": np.linalg.inv(opengl).tolist(), "convention": "opengl"},
+    ]
+    for prior in spellings:
+        job = post(shared, prior=prior).json()
+        # 1e-12: the same numbers by another way.
+        assert np.allclose(job["prior"]["world_from_camera"]["matrix"], TURNED, atol=1e-12)
+
+
+def test_events_come_live_from_the_first_and_end_with_the_result(client, stepping):
+    path = post(client, prefer="", options={"hold": True}).headers["location"]
+    with client.stream("GET", f"{path}/events") as stream:
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        chunks = stream.iter_text()
+        first = events(next(chunks))
+        assert [(name, number) for name, number, _ in first] == [("record", "0")]
+        assert client.get(path).json()["state"] == "running"
+        stepping.GO_ON.set()
+        seen = first + events("".join(chunks))
+    assert [(name, number) for name, number, _ in seen] == [
+        ("record", "0"), ("record", "1"), ("record", "2"), ("result", "end"),
+    ]  # fmt: skip
+    late = client.get(f"{path}/events")
+    assert events(late.text) == seen
+    resumed = client.get(f"{path}/events", headers={"Last-Event-ID": "1"})
+    assert events(resumed.text) == seen[2:]
+    trace = client.get(f"{path}/trace").json()
+    assert trace["records"] == [data for name, _, data in seen if name == "record"]
+    matches = trace["records"][0]["matches"]
+    assert (matches["photo_px"], matches["inlier"]) == ([[1.5, 2.5], [3.5, 4.5]], [True, False])
+
+
+def test_cancelling_a_running_job_takes_effect_at_its_next_record(client, stepping):
+    path = post(client, prefer="", options={"hold": True}).headers["location"]
+    until(lambda: client.get(path).json()["records"] == 1)
+    assert client.delete(path).json()["state"] == "running"
+    stepping.GO_ON.set()
+    job = finished(client, path)
+    assert (job["state"], job["records"], job["result"], job["error"]) == ("cancelled", 1, None, None)
+    assert [name for name, _, _ in events(client.get(f"{path}/events").text)] == ["record", "error"]
+    assert client.delete(path).json()["state"] == "cancelled"
+
+
+def test_a_full_queue_refuses_and_a_cancelled_job_makes_room(client, stepping):
+    running = post(client, prefer="", options={"hold": True}).headers["location"]
+    until(lambda: client.get(running).json()["state"] == "running")
+    waiting = [post(client, prefer="").headers["location"] for _ in range(2)]
+    refused = post(client, prefer="")
+    assert (refused.status_code, refused.json()["code"]) == (503, "queue_full")
+    assert int(refused.headers["retry-after"]) > 0
+    listed = client.get("/jobs").json()
+    assert (listed["queued"], listed["running"]) == (2, 1)
+    assert [job["links"]["self"] for job in listed["jobs"]] == [*waiting[::-1], running]
+    assert client.delete(waiting[0]).json()["state"] == "cancelled"
+    assert post(client, prefer="").status_code == 202
+    stepping.GO_ON.set()
+    assert finished(client, waiting[1])["state"] == "succeeded"
+
+
+@pytest.mark.parametrize(("fail", "code"), [("fault", "estimator_fault"), ("bug", "internal_error")])
+def test_a_failing_estimator_fails_its_job_only(shared, fail, code, caplog):
+    job = post(shared, options={"fail": fail}).json()
+    assert (job["state"], job["error"]["code"], job["records"]) == ("failed", code, 1)
+    assert "secret" not in json.dumps(job)
+    assert f"job {job['id']} failed" in caplog.text
+    assert post(shared).json()["state"] == "succeeded"
+
+
+def test_old_finished_jobs_are_forgotten(stepping):
+    with serving(create_app(settings(keep_jobs=2), {"room": make_scene()})) as client:
+        paths = [post(client).json()["links"]["self"] for _ in range(4)]
+        until(lambda: len(client.get("/jobs").json()["jobs"]) == 2)
+        assert [client.get(path).status_code for path in paths] == [404, 404, 200, 200]
+
+
+# ------------------------------------------------------------------ pictures and scenes
+
+
+def test_the_photo_is_upright_and_the_render_has_its_size(shared):
+    turned = Image.Exif()
+    turned[0x0112] = 6  # turn right by 90 degrees to see it upright
+    job = post(shared, photo(exif=turned)).json()
+    path = job["links"]["self"]
+    pictures = [f"{path}/photo", f"{path}/iterations/0/render.jpg", f"{path}/iterations/last/render.jpg"]
+    for picture in pictures:
+        answer = shared.get(picture)
+        assert answer.headers["content-type"] == "image/jpeg"
+        assert Image.open(io.BytesIO(answer.content)).size == (64, 96)
+    matched = shared.get(f"{path}/iterations/0/render.jpg", params={"camera": "matches"})
+    assert Image.open(io.BytesIO(matched.content)).size == (96, 64)
+    assert shared.get(f"{path}/iterations/3/render.jpg").json()["code"] == "record_not_found"
+    assert shared.get(f"{path}/iterations/-1/render.jpg").status_code == 400
+
+
+def test_a_render_that_may_still_come_is_not_ready(client, stepping):
+    path = post(client, prefer="", options={"hold": True}).headers["location"]
+    answer = client.get(f"{path}/iterations/2/render.jpg")
+    assert (answer.status_code, answer.json()["code"]) == (409, "job_not_ready")
+
+
+def test_splats_are_the_most_important_in_the_documented_layout(shared):
+    data = shared.get("/scenes/room/splats", params={"max": 2}).content
+    start = 4 + int.from_bytes(data[:4], "little")
+    header = json.loads(data[4:start])
+    assert header == {"scene": "room", "sha256": "ab" * 32, "count": 2, "total": 5}
+    assert len(data) == start + 40 * 2
+    floats = np.frombuffer(data, "<f4", 18, start)
+    rgba = np.frombuffer(data, np.uint8, 8, start + 72).reshape(2, 4)
+    # All have the same shape and colour: opacity over squared distance from the camera at (1, 2, 3) decides.
+    scene = make_scene().scene
+    distance = np.linalg.norm(scene.means - [1, 2, 3], axis=1)
+    best = np.argsort(-scene.opacities / distance**2)[:2]
+    assert np.array_equal(floats[:6].reshape(2, 3), scene.means[best])
+    assert np.array_equal(rgba[:, 3], np.rint(scene.opacities[best] * 255))
+    assert np.all(rgba[:, :3] == 128)  # SH of 0 is mid-grey
+    # By hand: a quarter turn about z swaps the axes of 0.3 and 0.2. 1e-6: float32.
+    assert np.allclose(floats[6:12], [0.04, 0, 0, 0.09, 0, 0.01], atol=1e-6)
+
+
+def test_scenes_are_described(shared):
+    (summary,) = shared.get("/scenes").json()["scenes"]
+    assert (summary["id"], summary["name"], summary["state"]) == ("room", "Room", "ready")
+    assert (summary["gaussians"], summary["sh_degree"], summary["cameras"]) == (5, 0, 1)
+    (camera,) = shared.get("/scenes/room").json()["training_cameras"]
+    assert (camera["name"], camera["world_from_camera"]) == ("images/a.jpg", TURNED.tolist())
+
+
+def test_the_only_scene_needs_no_name_but_one_of_two_does(stepping):
+    scenes = {name: make_scene(name) for name in ("attic", "cellar")}
+    with serving(create_app(settings(), scenes)) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        assert post(client, scene="cellar").json()["result"]["scene"]["id"] == "cellar"
+        unnamed = post(client)
+        assert (unnamed.status_code, unnamed.json()["code"]) == (404, "scene_not_found")
+        assert "attic, cellar" in unnamed.json()["detail"]
+
+
+def test_a_corrupt_scene_is_told_and_harms_no_other(stepping, tmp_path):
+    for name, text in (("torn", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"), ("odd", b"?")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.ply").write_bytes(text)
+    with serving(create_app(settings(scenes=[tmp_path], cache_dir=tmp_path))) as client:
+        until(lambda: not client.get("/readyz").json()["awaited"])
+        ready = client.get("/readyz")
+        assert (ready.status_code, len(ready.json()["failed"])) == (503, 2)
+        states = {s["id"]: (s["state"], s["error"]["code"]) for s in client.get("/scenes").json()["scenes"]}
+        assert states == {"torn": ("failed", "corrupt_scene"), "odd": ("failed", "unsupported_format")}
+        for name, code in (("torn", "corrupt_scene"), ("odd", "unsupported_format")):
+            refused = post(client, scene=name)
+            assert (refused.status_code, refused.json()["code"]) == (422, code)
+            assert client.get(f"/scenes/{name}/splats").status_code == 422
+        assert client.get("/livez").status_code == 200
+
+
+def test_a_scene_still_loading_is_not_ready(stepping):
+    scene = make_scene()
+    scene.matcher = HeldMatcher()
+    with serving(create_app(settings(), {"room": scene})) as client:
+        until(scene.matcher.asked.is_set)
+        ready = client.get("/readyz")
+        assert (ready.status_code, ready.json()["awaited"]) == (503, ["scene room: preparing"])
+        assert client.get("/livez").status_code == 200
+        scene.matcher.go_on.set()
+        until(lambda: client.get("/readyz").status_code == 200)
+
+
+class HeldMatcher(BlindMatcher):
+    def __init__(self):
+        self.asked, self.go_on = threading.Event(), threading.Event()
+
+    def extract(self, rgb, limit):
+        self.asked.set()
+        assert self.go_on.wait(20)
+        return super().extract(rgb, limit)
+
+
+# ------------------------------------------------------------------ errors
+
+PROBLEM = {"type", "title", "status", "detail", "instance", "code", "where", "hint"}
+
+
+def assert_problem(answer: httpx.Response, status: int, code: str, where: str | None = None) -> None:
+    assert answer.status_code == status, answer.text
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem.keys() == PROBLEM
+    assert (problem["status"], problem["code"]) == (status, code), problem
+    assert problem["instance"] == answer.request.url.path
+    assert problem["detail"]
+    if where is not None:
+        assert problem["where"] == where, problem
+
+
+def bomb() -> bytes:
+    """A PNG of 100 megapixels in a few kilobytes."""
+    file = io.BytesIO()
+    Image.new("1", (10_000, 10_000)).save(file, "png")
+    return file.getvalue()
+
+
+GOOD = {"width": 96, "height": 64, "fx": 80, "fy": 80, "cx": 48, "cy": 32}
+SHEARED = [[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+NAN = '{"width": 96, "height": 64, "fx": NaN, "fy": 80, "cx": 48, "cy": 32}'
+
+BAD_FIELDS = [
+    ({"scene": "attic"}, 404, "scene_not_found", "scene"),
+    ({"estimator": "magic"}, 422, "unknown_name", "estimators"),
+    ({"estimator": "../view_index"}, 422, "unknown_name", "estimators"),
+    ({"estimator": "absent"}, 501, "backend_missing", "estimators"),
+    ({"options": {"stpes": 3}}, 422, "invalid_options", "options.stpes"),
+    ({"options": {"steps": "many"}}, 422, "invalid_options", "options.steps"),
+    ({"options": "[]"}, 422, "invalid_options", "options"),
+    ({"options": "{"}, 422, "invalid_options", "options"),
+    ({"intrinsics": GOOD | {"fx": 0}}, 422, "invalid_intrinsics", "intrinsics.fx"),
+    ({"intrinsics": GOOD | {"fy": -80}}, 422, "invalid_intrinsics", "intrinsics.fy"),
+    ({"intrinsics": NAN}, 422, "invalid_intrinsics", "intrinsics.fx"),
+    ({"intrinsics": NAN.replace("96", "NaN")}, 422, "invalid_intrinsics", "intrinsics.width"),
+    ({"intrinsics": GOOD | {"fx": 10**400}}, 422, "invalid_intrinsics", "intrinsics.fx"),
+    ({"intrinsics": GOOD | {"width": 97}}, 422, "invalid_intrinsics", "intrinsics"),
+    ({"intrinsics": GOOD | {"width": 64, "height": 96}}, 422, "invalid_intrinsics", "intrinsics"),
+    ({"intrinsics": {"fx": 80}}, 422, "invalid_intrinsics", "intrinsics.width"),
+    ({"intrinsics": "[1, 2"}, 422, "invalid_intrinsics", "intrinsics"),
+    ({"intrinsics": "[" * 100_000}, 422, "invalid_intrinsics", "intrinsics"),
+    ({"prior": {"world_from_camera": SHEARED}}, 422, "invalid_prior", "prior.world_from_camera"),
+    ({"prior": {"camera_from_world": MIRRORED}}, 422, "invalid_prior", "prior.camera_from_world"),
+    ({"prior": {"world_from_camera": [[1]]}}, 422, "invalid_prior", None),
+    ({"prior": '{"position": [0, 0, NaN], "quaternion_wxyz": [1, 0, 0, 0]}'}, 422, "invalid_prior", "prior.position"),
+    ({"prior": {"position": [0, 0, 0], "quaternion_wxyz": [2, 0, 0, 0]}}, 422, "invalid_prior", "prior.position"),
+    ({"prior": {"position": [0, 0, 0]}}, 422, "invalid_prior", "prior"),
+    ({"prior": {}}, 422, "invalid_prior", "prior"),
+    ({"prior": {"convention": "blender"}}, 422, "invalid_prior", "prior.convention"),
+    ({"seed": "x"}, 400, "invalid_request", "seed"),
+    ({"seed": "-1"}, 400, "invalid_request", "seed"),
+    ({"seed": str(2**63)}, 400, "invalid_request", "seed"),
+    ({"budget_s": "0"}, 400, "invalid_request", "budget_s"),
+    ({"budget_s": "nan"}, 400, "invalid_request", "budget_s"),
+    ({"budget_s": "inf"}, 400, "invalid_request", "budget_s"),
+    ({"sced": "3"}, 400, "invalid_request", "sced"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("fields", "status", "code", "where"), BAD_FIELDS)
+def test_a_bad_field_is_refused_before_anything_is_queued(shared, fields, status, code, where):
+    before = shared.get("/jobs").json()
+    assert_problem(post(shared, **fields), status, code, where)
+    assert shared.get("/jobs").json() == before
+
+
+BAD_PHOTOS = {
+    "no image": b"hello",
+    "empty": b"",
+    "truncated JPEG": photo()[:600],
+    "truncated PNG": photo("png")[:600],
+    "JPEG header only": photo()[:3],
+    "bomb": bomb(),
+    "too small": photo(size=(8, 8)),
+}
+
+
+@pytest.mark.parametrize("name", BAD_PHOTOS)
+def test_a_bad_photo_is_refused_at_once(shared, name):
+    assert_problem(post(shared, BAD_PHOTOS[name]), 422, "invalid_image", "photo")
+    assert post(shared).json()["state"] == "succeeded"
+
+
+def test_a_request_that_cannot_be_read_is_refused(shared):
+    def send(content, kind="application/json"):
+        return shared.post("/localize", content=content, headers={"Content-Type": kind})
+
+    assert_problem(send("{"), 400, "invalid_request", "body")
+    assert_problem(send(b"\xff\xfe"), 400, "invalid_request", "body")
+    assert_problem(send("[]"), 400, "invalid_request", "body")
+    assert_problem(send("{}"), 400, "invalid_request", "photo")
+    assert_problem(send('{"photo": "%%%"}'), 400, "invalid_request", "photo")
+    assert_problem(send('{"photo": 3}'), 400, "invalid_request", "photo")
+    assert_problem(send(photo(), "image/jpeg"), 415, "unsupported_media_type")
+    assert_problem(send("x=1", "application/x-www-form-urlencoded"), 415, "unsupported_media_type")
+    assert_problem(send(photo(), "multipart/form-data"), 400, "bad_request")
+    assert_problem(send(photo(), "multipart/form-data; boundary=x"), 400, "bad_request")
+    assert_problem(shared.post("/localize", files={"scene": b"room"}), 400, "invalid_request", "photo")
+    twice = [("scene", (None, "room")), ("scene", (None, "room")), ("photo", ("p", photo()))]
+    assert_problem(shared.post("/localize", files=twice), 400, "invalid_request", "scene")
+
+
+def test_http_errors_are_problem_documents(shared):
+    assert_problem(shared.get("/nowhere"), 404, "not_found")
+    assert_problem(shared.get("/jobs/none"), 404, "job_not_found", "job")
+    assert_problem(shared.get("/jobs/none/events"), 404, "job_not_found", "job")
+    assert_problem(shared.delete("/jobs/none"), 404, "job_not_found", "job")
+    assert_problem(shared.get("/scenes/none"), 404, "scene_not_found", "scene")
+    assert_problem(shared.get("/scenes/room/splats?max=0"), 400, "invalid_request", "query.max")
+    refused = shared.put("/localize")
+    assert_problem(refused, 405, "method_not_allowed")
+    assert refused.headers["allow"] == "POST"
+
+
+def test_a_body_too_large_is_refused_announced_or_not(stepping):
+    with serving(create_app(settings(max_upload_bytes=1000), {"room": make_scene()})) as client:
+        kind = {"Content-Type": "application/json"}
+        large = b" " * 1_500_000
+        assert_problem(client.post("/localize", content=large, headers=kind), 413, "content_too_large")
+        assert_problem(client.put("/nowhere", content=large), 413, "content_too_large")
+        chunks = (large[:100_000] for _ in range(15))
+        assert_problem(client.post("/localize", content=chunks, headers=kind), 413, "content_too_large")
+        assert client.get("/livez").status_code == 200
+
+
+def test_a_bug_in_a_route_is_a_problem_document_without_details(stepping, caplog):
+    scene = make_scene()
+    with serving(create_app(settings(), {"room": scene})) as client:
+        job = post(client).json()
+        scene.rasterizer.render = None  # type: ignore[assignment]
+        answer = client.get(job["links"]["render"])
+        assert_problem(answer, 500, "internal_error")
+        assert "NoneType" not in answer.text
+
+
+def test_an_unknown_default_estimator_is_told_at_start():
+    with pytest.raises(service.errors.UnknownName, match="magic"):
+        create_app(settings(estimator="magic"))
+
+
+# ------------------------------------------------------------------ the surroundings
+
+
+@pytest.mark.parametrize("stripped", [True, False])
+def test_links_carry_the_sub_path_of_a_proxy(shared, stripped):
+    prefix = "/maps/fix"
+    path = "/localize" if stripped else f"{prefix}/localize"
+    headers = {"X-Forwarded-Prefix": prefix, "Prefer": "wait=20"}
+    answer = shared.post(path, files={"photo": photo()}, headers=headers)
+    job = answer.json()
+    assert answer.headers["location"] == f"{prefix}/jobs/{job['id']}"
+    assert all(link.startswith(f"{prefix}/") for link in job["links"].values())
+    assert shared.get(job["links"]["events"], headers=headers).status_code == 200
+    assert f"{prefix}/openapi.json" in shared.get(f"{prefix}/docs", headers=headers).text
+    missing = shared.get(f"{prefix}/jobs/x", headers=headers)
+    assert_problem(missing, 404, "job_not_found")
+
+
+def test_a_prefix_that_is_no_path_is_ignored(shared):
+    for prefix in ("//evil.example", "/a/../b", "/a b", "javascript:x", "/<script>"):
+        (scene,) = shared.get("/scenes", headers={"X-Forwarded-Prefix": prefix}).json()["scenes"]
+        assert scene["links"]["self"] == "/scenes/room"
+
+
+def test_the_sub_path_may_be_set(stepping):
+    with serving(create_app(settings(root_path="/fix"), {"room": make_scene()})) as client:
+        for path in ("/scenes", "/fix/scenes"):
+            assert client.get(path).json()["scenes"][0]["links"]["self"] == "/fix/scenes/room"
+
+
+def test_capabilities_tell_what_can_be_chosen(shared):
+    told = shared.get("/capabilities").json()
+    estimators = {e["name"]: e for e in told["estimators"]}
+    assert estimators["stepping"]["default"]
+    steps = estimators["stepping"]["options_schema"]["properties"]["steps"]
+    assert (steps["type"], steps["description"]) == ("integer", "Records to yield.")
+    assert {"cpu"} <= {r["name"] for r in told["rasterizers"]}
+    assert {"xfeat", "sift"} <= {m["name"] for m in told["matchers"]}
+    assert {"ply", "splat", "compressed_ply"} <= {f["name"] for f in told["scene_formats"]}
+    assert all(e["available"] == (e["reason"] is None) for e in told["estimators"])
+
+
+def test_the_start_page_and_the_docs_are_there(shared):
+    page = shared.get("/")
+    assert page.headers["content-type"].startswith("text/html")
+    assert 'href="viewer/"' in page.text  # relative: right under any sub-path
+    assert shared.get("/docs").status_code == 200
+    assert shared.get("/version").json()["splatfix"] == service.__version__
+
+
+def test_openapi_yaml_is_fresh():
+    """Write it anew with `splatfix openapi > openapi.yaml`."""
+    app = create_app(Settings(scenes=[], viewer=False))
+    assert yaml.safe_load((ROOT / "openapi.yaml").read_text("utf-8")) == app.openapi()
+
+
+def test_openapi_tells_of_every_error_as_problem():
+    for path, methods in create_app(Settings(scenes=[], viewer=False)).openapi()["paths"].items():
+        for method, operation in methods.items():
+            failures = {s: r for s, r in operation["responses"].items() if s[0] in "45d"}
+            assert "default" in failures, (method, path)
+            for status, response in failures.items():
+                kinds = {"application/json"} if (path, status) == ("/readyz", "503") else {"application/problem+json"}
+                assert response["content"].keys() == kinds, (method, path, status)
