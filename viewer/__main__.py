@@ -17,8 +17,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="viewer", description=__doc__)
     parser.add_argument("--service", required=True, help="base URL of the splatfix service")
     parser.add_argument("--port", type=int, required=True, help="port to serve browsers on")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve browsers on (default: %(default)s)")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to serve browsers on (default: %(default)s)"
+        "--parent", type=int, default=os.getppid(), help="process to end with (default: the one that started it)"
     )
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
@@ -26,10 +27,9 @@ def main() -> None:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    parent = os.getppid()
     service = Service(arguments.service)
     viewer = Viewer(service, arguments.host, arguments.port)
-    while not ended.wait(1.0) and os.getppid() == parent:
+    while not ended.wait(1.0) and os.getppid() == arguments.parent:
         pass
     viewer.stop()
     service.close()

@@ -86,11 +86,12 @@ async def _to_viewer(browser: WebSocket, viewer: ClientConnection) -> None:
 
 
 async def _to_browser(viewer: ClientConnection, browser: WebSocket) -> None:
-    async for message in viewer:
-        if isinstance(message, str):
-            await browser.send_text(message)
-        else:
-            await browser.send_bytes(message)
+    with suppress(ConnectionClosed):  # told by an exception unless it was closed with code 1000
+        async for message in viewer:
+            if isinstance(message, str):
+                await browser.send_text(message)
+            else:
+                await browser.send_bytes(message)
     await browser.close(viewer.close_code or 1000, viewer.close_reason or "")
 
 
@@ -103,5 +104,6 @@ async def _first_of(*directions: Coroutine[Any, Any, None]) -> None:
         for task in tasks:
             task.cancel()
         for task in tasks:
+            # RuntimeError is starlette's word for a socket that was closed meanwhile.
             with suppress(asyncio.CancelledError, ConnectionClosed, WebSocketDisconnect, RuntimeError):
                 await task

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import socket
 import sys
 import time
@@ -25,7 +26,8 @@ class ViewerChild:
 
     def __init__(self, service_url: str) -> None:
         self.port = _free_port()
-        self._command = [sys.executable, "-m", "viewer", "--service", service_url, "--port", str(self.port)]
+        self.command = [sys.executable, "-m", "viewer", "--service", service_url]
+        self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
 
     async def supervise(self) -> None:
         pause = _FIRST_PAUSE_S
@@ -39,7 +41,7 @@ class ViewerChild:
     async def _run_once(self) -> None:
         # Its log goes to stderr; on stdout is viser's banner with an address that is not for people.
         nothing = asyncio.subprocess.DEVNULL
-        child = await asyncio.create_subprocess_exec(*self._command, stdin=nothing, stdout=nothing)
+        child = await asyncio.create_subprocess_exec(*self.command, stdin=nothing, stdout=nothing)
         try:
             code = await child.wait()
             _log.warning("the viewer ended with code %s; it is started again", code)
