@@ -96,20 +96,22 @@ def read_query(
             )
         long_side = max(decoded.width, decoded.height)
         focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
-        intrinsics = Intrinsics(
-            decoded.width, decoded.height, focal, focal, decoded.width / 2, decoded.height / 2
-        )
+        intrinsics = Intrinsics(decoded.width, decoded.height, focal, focal, decoded.width / 2, decoded.height / 2)
     rgb, pinhole = undistorted(decoded.rgb, decoded.camera(intrinsics))
     return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
 
 
 def encode_image(
-    rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"], kind: Literal["jpg", "png"] = "jpg"
+    rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
+    kind: Literal["jpg", "png"] = "jpg",
+    *,
+    quality: int = 90,
 ) -> bytes:
-    """Return an image (uint8, or a render's float32 in 0..1) as a file for looking at."""
+    """Return an image (uint8, or a render's float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100."""
     if rgb.dtype != np.uint8:
         rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    encoded, data = cv2.imencode(f".{kind}", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpg" else []
+    encoded, data = cv2.imencode(f".{kind}", rgb[:, :, ::-1], options)
     if not encoded:
         raise ValueError(f"an image of shape {rgb.shape} can't be {kind}")
     return data.tobytes()
@@ -183,9 +185,7 @@ def undistorted(
     return straight, pinhole
 
 
-def _folded(
-    pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool
-) -> Bool[np.ndarray, "h w"]:
+def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:
     """Return the pixels beyond the radius at which the distortion's polynomial turns back.
 
     There it would show the inside of the image once more.
@@ -366,9 +366,7 @@ def _require_size(given: Intrinsics, width: int, height: int) -> None:
     raise InvalidIntrinsics(
         f"{expected}.",
         where="intrinsics",
-        hint="Scale all of them by the ratio of the widths."
-        if same_shape
-        else "The photo may have been cropped.",
+        hint="Scale all of them by the ratio of the widths." if same_shape else "The photo may have been cropped.",
     )
 
 

@@ -1,0 +1,180 @@
+"""`splatfix bench localize`: localize a scene's test photos and compare with the truth.
+
+The test photos' cameras are taken out before the scene is loaded, whatever layout it has, so that no index view
+and no unit rests on them. Latency is wall time from the photo's bytes to the result, decoding included, with the
+estimator's index ready and one localization done before; CPU time is the whole process's in the same span.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, summary, units_of
+from service.bench.queries import BenchPhoto, find_photos, photo_bytes
+from service.bench.starts import require_kind, start_pose
+from service.errors import UnknownName
+from service.images import read_query
+from service.interfaces import Rasterizer
+from service.localize import LoadedScene, Request, localize
+from service.scene_formats import load_scene
+from service.types import Camera, Pose, PoseEstimate, Query
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One thing to send, and its truth."""
+
+    photo: str
+    number: int
+    data: bytes
+    truth: Camera
+    start: Pose | None
+
+
+def run(
+    folder: Path,
+    *,
+    estimator: str = "view_index",
+    start: str = "none",
+    trials: int = 1,
+    seed: int = 0,
+    intrinsics: Literal["given", "withheld"] = "given",
+    cameras: Literal["given", "ignored"] = "given",
+    modify: Sequence[str] = (),
+    progress: Callable[[int, int], None] | None = None,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
+
+    With `cameras="ignored"` the scene is used without its training cameras; they still define the units.
+    """
+    require_kind(start)
+    for name, value, words in (("intrinsics", intrinsics, ("given", "withheld")), ("cameras", cameras, _CAMERAS)):
+        if value not in words:
+            raise UnknownName(f"there is no '{value}'; known: {', '.join(words)}.", where=name)
+    folder = Path(folder)
+    photos = find_photos(folder)
+    loaded, training = _loaded(folder, photos, cameras, cache_dir)
+    began = time.perf_counter()
+    loaded.prepare(estimator)
+    prepare_s = time.perf_counter() - began
+    units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
+    background = loaded.scene.info.background_rgb
+    todo = list(_trials(photos, start, trials, seed, tuple(modify), background, units, training))
+
+    def answer(trial: Trial) -> PoseEstimate:
+        given = trial.truth.intrinsics if intrinsics == "given" else None
+        query: Query = read_query(trial.data, intrinsics=given, prior=trial.start, background_rgb=background)
+        return localize(query, loaded, Request(estimator=estimator, seed=seed))
+
+    outcomes, per_query = measure(todo, answer, units, progress)
+    return {
+        "scene": loaded.scene.info.name,
+        "estimator": estimator,
+        "start": start,
+        **summary(outcomes),
+        "photos": len(photos),
+        "trials": trials,
+        "seed": seed,
+        "intrinsics": intrinsics,
+        "cameras": cameras,
+        "modify": list(modify),
+        "training_cameras": len(training),
+        "gaussians": loaded.scene.count,
+        "forward_facing": units.forward_facing,
+        "units_per_scene_unit": units.units_per_scene_unit,
+        "prepare_s": prepare_s,
+        "per_query": per_query,
+    }
+
+
+_CAMERAS = ("given", "ignored")
+
+
+def measure(
+    todo: Sequence[Trial],
+    answer: Callable[[Trial], PoseEstimate],
+    units: Units,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[Outcome], list[dict[str, Any]]]:
+    """Answer every trial and compare; the first one is answered twice, and only the second time counts."""
+    outcomes, lines = [], []
+    answer(todo[0])
+    for done, trial in enumerate(todo, 1):
+        wall, cpu = time.perf_counter(), time.process_time()
+        estimate = answer(trial)
+        latency_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
+        outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, units), latency_ms, cpu_ms)
+        outcomes.append(outcome)
+        lines.append(_line(trial, estimate, outcome, units))
+        if progress:
+            progress(done, len(todo))
+    return outcomes, lines
+
+
+def centre_depth(rasterizer: Rasterizer, camera: Camera) -> float:
+    """Return the median depth rendered in the middle of the image, in scene units; 0 if nothing is there."""
+    small = Camera(camera.intrinsics.with_long_side(256), camera.pose)
+    (frame,) = rasterizer.render([small])
+    height, width = frame.median_depth.shape
+    middle = frame.median_depth[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4]
+    return float(np.median(middle[middle > 0])) if np.any(middle > 0) else 0.0
+
+
+def _loaded(
+    folder: Path, photos: Sequence[BenchPhoto], cameras: str, cache_dir: Path | None
+) -> tuple[LoadedScene, list[Camera]]:
+    """Return the scene without the test photos, and its training cameras; the truth's if there are none."""
+    held_back = [name for photo in photos for name in photo.names]
+    scene = load_scene(folder, without_photos=held_back)
+    training = [named.camera for named in scene.cameras] or [photo.camera for photo in photos]
+    if cameras == "ignored":
+        scene = load_scene(folder, without_photos=held_back, cameras=False)
+    return LoadedScene.of(scene, cache_dir=cache_dir), training
+
+
+def _trials(
+    photos: Sequence[BenchPhoto],
+    start: str,
+    trials: int,
+    seed: int,
+    modify: tuple[str, ...],
+    background_rgb: tuple[float, float, float],
+    units: Units,
+    training: Sequence[Camera],
+) -> Iterator[Trial]:
+    """Each trial of a photo has its own start, the same in every run with this seed."""
+    for index, photo in enumerate(photos):
+        data, truth = photo_bytes(photo, modify, background_rgb, seed)
+        for number in range(trials):
+            rng = np.random.default_rng([seed, index, number])
+            yield Trial(photo.name, number, data, truth, start_pose(start, truth.pose, units, training, rng))
+
+
+def _line(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) -> dict[str, Any]:
+    verdict = estimate.verdict
+    begun = errors(trial.start, trial.truth.pose, units) if trial.start else (None, None)
+    return {
+        "photo": trial.photo,
+        "trial": trial.number,
+        "status": str(verdict.status),
+        "reason": str(verdict.reason),
+        "score": verdict.score,
+        "inliers": verdict.inliers,
+        "success_5deg_0p05": outcome.success(COARSE),
+        "success_1deg_0p01": outcome.success(FINE),
+        "rotation_deg": outcome.rotation_deg,
+        "translation_units": outcome.translation_units,
+        "start_rotation_deg": begun[0],
+        "start_translation_units": begun[1],
+        "intrinsics_source": estimate.intrinsics_source,
+        "latency_ms": outcome.latency_ms,
+        "cpu_ms": outcome.cpu_ms,
+        "stages_ms": {timing.stage: 1e3 * timing.wall_s for timing in estimate.timings},
+    }

@@ -1,0 +1,116 @@
+"""The photos of a scene folder that a bench localizes, with their truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.bench.modifications import Shot, modified
+from service.errors import CorruptScene, SceneNotFound, SplatfixError
+from service.images import encode_image, intrinsics_from, read_query
+from service.scene_formats.colmap import read_cameras
+from service.scene_formats.folder import COLMAP_FOLDER
+from service.scene_formats.manifest import read_manifest
+from service.scene_formats.nerfstudio import TransformsFile, transforms_path
+from service.scene_formats.similarity import moved_pose
+from service.types import Camera, NamedCamera, Pose
+
+HOLD_OUT_EVERY = 8
+"""Where nothing says which photos are for testing: every eighth by name, LLFF's custom. The scene was then trained
+on them, too; only their cameras are held back."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchPhoto:
+    name: str
+    """As in the truth file."""
+    path: Path
+    camera: Camera
+    """The truth, in the world frame."""
+    aliases: tuple[str, ...] = ()
+    """Other names under which the same view may stand among the scene's cameras."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (self.name, *self.aliases)
+
+
+def find_photos(folder: Path) -> list[BenchPhoto]:
+    """Return the test photos of a scene folder. Raises SceneError.
+
+    The first of these that is there: truth.json (scenes/studio); transforms_test.json (Blender); the
+    `test_filenames` of transforms.json (nerfstudio); every eighth photo of transforms.json or sparse/0.
+    """
+    if not folder.is_dir():
+        raise SceneNotFound("there is no such folder.", where=str(folder))
+    if (folder / "truth.json").is_file():
+        photos = _from_truth(folder)
+    elif (folder / "transforms_test.json").is_file():
+        photos = _from_transforms(folder / "transforms_test.json", folder)
+    elif (transforms := transforms_path(folder)) is not None:
+        photos = _from_transforms(transforms, folder)
+    elif (folder / COLMAP_FOLDER).is_dir():
+        cameras = read_cameras(folder / COLMAP_FOLDER, lambda name: True)[::HOLD_OUT_EVERY]
+        photos = [_photo(folder, "images/" + c.name, c, (c.name,)) for c in cameras]
+    else:
+        photos = []
+    if not photos:
+        raise SceneNotFound("there are no test photos with poses.", where=str(folder))
+    return photos
+
+
+def photo_bytes(
+    photo: BenchPhoto, modify: tuple[str, ...], background_rgb: tuple[float, float, float], seed: int
+) -> tuple[bytes, Camera]:
+    """Return the file to send and its camera: as it is, or spoilt and stored without loss and without EXIF."""
+    data = photo.path.read_bytes()
+    if not modify:
+        return data, photo.camera
+    query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background_rgb)
+    shot = Shot(query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose)
+    shot = modified(shot, modify, np.random.default_rng(seed))
+    return encode_image(shot.rgb, "png"), Camera(shot.intrinsics, shot.pose)
+
+
+def _from_truth(folder: Path) -> list[BenchPhoto]:
+    """A list of {photo, original, intrinsics, world_from_camera}; OpenCV axes, world frame."""
+    path = folder / "truth.json"
+    try:
+        entries = json.loads(path.read_text("utf-8"))
+        return [_from_entry(folder, entry) for entry in entries]
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise CorruptScene(f"not a list of photos with their truth: {error!r}.", where=path.name) from None
+
+
+def _from_entry(folder: Path, entry: dict[str, Any]) -> BenchPhoto:
+    name, original = entry["photo"], entry.get("original")
+    files = [folder / name, folder / "photos" / name]
+    file = next((f for f in files if f.is_file()), files[0])
+    try:
+        pose = Pose(np.array(entry["world_from_camera"], np.float64))
+        camera = Camera(intrinsics_from(entry["intrinsics"]), pose)
+    except SplatfixError as error:
+        raise CorruptScene(str(error), where=f"truth.json, '{name}'") from None
+    return BenchPhoto(name, file, camera, (original,) if original else ())
+
+
+def _from_transforms(path: Path, folder: Path) -> list[BenchPhoto]:
+    file, manifest = TransformsFile.open(path), read_manifest(folder)
+    names = file.split("test")
+    if names is None:
+        step = 1 if path.stem.endswith("_test") else HOLD_OUT_EVERY
+        names = sorted(file.frames)[::step]
+    return [_photo(folder, str(file.photo_file(name) or name), file.camera(name, manifest)) for name in names]
+
+
+def _photo(folder: Path, file: str, named: NamedCamera, aliases: tuple[str, ...] = ()) -> BenchPhoto:
+    """The camera of a file in the scene's frame, moved into the world as the scene is."""
+    world_from_scene = read_manifest(folder).world_from_scene
+    camera = named.camera
+    if world_from_scene is not None:
+        camera = Camera(camera.intrinsics, moved_pose(camera.pose, world_from_scene))
+    return BenchPhoto(named.name, folder / file, camera, aliases)

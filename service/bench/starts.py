@@ -1,0 +1,72 @@
+"""Start poses for estimators that need one, seeded; the paper's protocol and our own.
+
+easy, hard: the perturbation of iComMa and the paper, start = T Rz Ry Rx gt, acting in the normalized *world* frame
+(origin in the focus), so that its rotations carry the camera round the scene. Per axis |angle| is in 0..30 degrees
+and |t| in 0..0.5 units (easy), 30..60 and 0.5..1.0 (hard), signs at random.
+inplace: 15 to 40 degrees about a random axis through the camera, which stays where it is.
+random: a place within the box of the training cameras, any rotation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.bench.metrics import Units
+from service.errors import UnknownName
+from service.geometry import rotation_from_quat, so3_exp
+from service.types import Camera, Pose
+
+_WORLD = {"easy": ((0.0, 30.0), (0.0, 0.5)), "hard": ((30.0, 60.0), (0.5, 1.0))}
+"""Range of degrees and of normalized units, per axis."""
+KINDS = ("none", *_WORLD, "inplace", "random")
+
+
+def require_kind(kind: str) -> None:
+    """Raise UnknownName unless there is such a start."""
+    if kind not in KINDS:
+        raise UnknownName(f"there is no start '{kind}'; known: {', '.join(KINDS)}.", where="start")
+
+
+def start_pose(
+    kind: str, truth: Pose, units: Units, cameras: Sequence[Camera], rng: np.random.Generator
+) -> Pose | None:
+    """Return the pose to start from; None for kind 'none'. Raises UnknownName."""
+    require_kind(kind)
+    if kind == "none":
+        return None
+    if kind in _WORLD:
+        return _perturbed_in_world(truth, units, *_WORLD[kind], rng)
+    matrix = truth.world_from_camera.copy()
+    if kind == "inplace":
+        axis = rng.normal(size=3)
+        angle = np.radians(rng.uniform(15.0, 40.0))
+        matrix[:3, :3] = matrix[:3, :3] @ so3_exp(angle * axis / np.linalg.norm(axis))
+    else:
+        positions = np.stack([camera.pose.position_in_world for camera in cameras])
+        matrix[:3, :3] = rotation_from_quat(rng.normal(size=4))
+        matrix[:3, 3] = rng.uniform(positions.min(0), positions.max(0))
+    return Pose(matrix)
+
+
+def _perturbed_in_world(
+    truth: Pose,
+    units: Units,
+    degrees: tuple[float, float],
+    lengths: tuple[float, float],
+    rng: np.random.Generator,
+) -> Pose:
+    signs = rng.choice([-1.0, 1.0], 6)
+    angles = np.radians(rng.uniform(*degrees, 3)) * signs[:3]
+    rotation = np.eye(3)
+    for axis in range(3):  # Rx first, Rz last
+        rotation = so3_exp(angles[axis] * np.eye(3)[axis]) @ rotation
+    shift: Float64[np.ndarray, "3"] = rng.uniform(*lengths, 3) * signs[3:]
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation @ truth.world_from_camera[:3, :3]
+    offset = (truth.position_in_world - units.focus_in_world) * units.units_per_scene_unit
+    moved = rotation @ offset + shift
+    matrix[:3, 3] = moved / units.units_per_scene_unit + units.focus_in_world
+    return Pose(matrix)
