@@ -78,24 +78,24 @@ def serve(
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer}
     settings = _settings({name: value for name, value in given.items() if value is not None})
-    listener = _listener(settings.host, settings.port)
-    settings = settings.model_copy(update={"port": listener.getsockname()[1]})
-    application = create_app(settings)
-    server = uvicorn.Server(
-        uvicorn.Config(
-            application,
-            log_level="warning",
-            access_log=False,
-            ws="websockets-sansio",
-            ws_max_size=2**26,
-            ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
-            timeout_graceful_shutdown=3,
+    with _listener(settings.host, settings.port) as listener:
+        settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+        application = create_app(settings)
+        server = uvicorn.Server(
+            uvicorn.Config(
+                application,
+                log_level="warning",
+                access_log=False,
+                ws="websockets-sansio",
+                ws_max_size=2**26,
+                ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
+                timeout_graceful_shutdown=3,
+            )
         )
-    )
-    logging.getLogger("service").setLevel(logging.INFO)
-    announce = threading.Thread(target=_announce, args=(server, application, settings), daemon=True)
-    announce.start()
-    server.run(sockets=[listener])
+        logging.getLogger("service").setLevel(logging.INFO)
+        announce = threading.Thread(target=_announce, args=(server, application, settings), daemon=True)
+        announce.start()
+        server.run(sockets=[listener])
 
 
 def _settings(given: dict[str, Any]) -> Settings:

@@ -1,0 +1,77 @@
+"""A scene folder that can be localized in: a box whose walls are patchworks of random colours, seen from inside."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from service.geometry import look_at, quat_from_rotation
+from service.types import Pose
+
+SIZE = np.array([4.0, 3.0, 2.5])
+SPACING = 0.06
+WIDTH, HEIGHT, FOCAL = 320, 240, 240.0
+INTRINSICS = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+
+
+def write_room(folder: Path, cameras: int = 24) -> Path:
+    """Write `scene.ply` (Inria's layout, degree 0) and `transforms.json`; return the folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(3)
+    walls = [_wall(axis, side, rng) for axis in range(3) for side in (-1, 1)]
+    means, quats, colours = (np.concatenate(parts) for parts in zip(*walls, strict=True))
+    scales = np.tile(np.log([0.5 * SPACING, 0.5 * SPACING, 0.003]), (len(means), 1))
+    columns = {
+        **dict(zip("xyz", means.T, strict=True)),
+        **{f"f_dc_{i}": (colours[:, i] - 0.5) / 0.28209479177387814 for i in range(3)},
+        "opacity": np.full(len(means), 6.0),
+        **{f"scale_{i}": scales[:, i] for i in range(3)},
+        **{f"rot_{i}": quats[:, i] for i in range(4)},
+    }
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(means)}"]
+    header += [*(f"property float {name}" for name in columns), "end_header\n"]
+    table = np.stack(list(columns.values()), 1).astype("<f4")
+    (folder / "scene.ply").write_bytes("\n".join(header).encode() + table.tobytes())
+    frames = [
+        {
+            "file_path": f"images/{i}.png",
+            "transform_matrix": (pose.world_from_camera @ np.diag([1.0, -1, -1, 1])).tolist(),
+        }
+        for i, pose in enumerate(training_poses(cameras))
+    ]
+    camera = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))
+    return folder
+
+
+def training_poses(count: int) -> list[Pose]:
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return [pose_at(angle, 0.2 * np.sin(3 * angle)) for angle in angles]
+
+
+def pose_at(angle: float, height: float) -> Pose:
+    """A camera near the middle that looks out, level with `height`."""
+    outwards = np.array([np.cos(angle), np.sin(angle), 0.0])
+    position = -0.6 * outwards + [0.0, 0.0, height]
+    return look_at(position, position + outwards, np.array([0.0, 0.0, 1.0]))
+
+
+def _wall(axis: int, side: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gaussians on one wall; colours are constant over patches of 2 to 5 of them."""
+    u, v = (a for a in range(3) if a != axis)
+    across = [np.arange(-SIZE[a] / 2, SIZE[a] / 2, SPACING) for a in (u, v)]
+    grid = np.stack(np.meshgrid(*across, indexing="ij"), -1)
+    means = np.zeros((*grid.shape[:2], 3))
+    means[..., u], means[..., v], means[..., axis] = grid[..., 0], grid[..., 1], side * SIZE[axis] / 2
+    colours = np.zeros_like(means)
+    for _ in range(400):
+        row, column = rng.integers(0, grid.shape[0]), rng.integers(0, grid.shape[1])
+        height, width = rng.integers(2, 6, 2)
+        colours[row : row + height, column : column + width] = rng.uniform(0, 1, 3)
+    rotation = np.zeros((3, 3))
+    rotation[u, 0] = rotation[v, 1] = 1.0
+    rotation[:, 2] = np.cross(rotation[:, 0], rotation[:, 1])
+    count = means.shape[0] * means.shape[1]
+    return means.reshape(-1, 3), np.tile(quat_from_rotation(rotation), (count, 1)), colours.reshape(-1, 3)

@@ -1,0 +1,197 @@
+"""The command line, in process; and `splatfix serve` as a process of its own, with the line that it prints."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import service
+import service.__main__
+from service import jit
+from service.geometry import pose_distance
+from service.types import Pose
+from tests.small_room import INTRINSICS, pose_at, write_room
+
+ROOT = Path(__file__).parents[1]
+TRUTH = pose_at(1.0, 0.1)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    return write_room(tmp_path_factory.mktemp("scenes") / "room")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SPLATFIX_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+@pytest.fixture
+def splatfix(monkeypatch, capsys):
+    """Run a command line; return exit code, standard output, standard error."""
+
+    def run(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["splatfix", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            service.__main__.main()
+        told = capsys.readouterr()
+        return int(left.value.code or 0), told.out, told.err
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def photo(room) -> Path:
+    """A render of the room from TRUTH, made by the command line itself."""
+    path = room / "photos" / "query.png"
+    path.parent.mkdir()
+    pose = json.dumps({"world_from_camera": TRUTH.world_from_camera.tolist()})
+    service.__main__.render(room, pose, path)
+    return path
+
+
+def environment() -> dict[str, str]:
+    """Of a process that shall find the kernels compiled."""
+    return {**os.environ, "NUMBA_CACHE_DIR": str(jit.numba.config.CACHE_DIR)}  # type: ignore[attr-defined]
+
+
+def test_render_draws_the_scene_as_a_training_camera_sees_it(photo):
+    image = Image.open(photo)
+    assert image.size == (INTRINSICS["width"], INTRINSICS["height"])
+    assert np.asarray(image).std() > 30  # coloured patches, not one grey
+
+
+def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo, tmp_path):
+    table = tmp_path / "poses.csv"
+    given = ("--scene", room, "--intrinsics", json.dumps(INTRINSICS), "--seed", 5)
+    code, told, _ = splatfix("localize", photo, *given, "--json", "--csv", table)
+    assert code == 0
+    (result,) = json.loads(told)
+    assert (result["photo"], result["status"], result["seed"]) == (str(photo), "localized", 5)
+    found = Pose(np.array(result["pose"]["world_from_camera"]["matrix"]))
+    degrees, units = pose_distance(found, TRUTH)
+    # Seen: 0.02 degrees, 0.0002 units.
+    assert degrees < 0.2
+    assert units < 0.005
+    (row,) = csv.DictReader(table.read_text().splitlines())
+    assert [float(row[c]) for c in "xyz"] == pytest.approx(found.position_in_world.tolist())
+    assert row["status"] == "localized"
+    code, told, _ = splatfix("localize", photo, *given)
+    assert told.startswith(f"{photo}: localized, score ")
+
+
+def test_scenes_are_listed_and_inspected(splatfix, room):
+    assert splatfix("scenes", "list", room.parent)[:2] == (0, f"{room}\n")
+    code, told, _ = splatfix("scenes", "inspect", room)
+    facts = dict(line.split(maxsplit=1) for line in told.replace("training cameras", "cameras").splitlines())
+    assert (code, facts["cameras"], facts["format"], facts["name"]) == (0, "24", "ply", "room")
+
+
+def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo, tmp_path):
+    torn = tmp_path / "torn.ply"
+    torn.write_bytes(b"ply\n")
+    text = tmp_path / "photo.jpg"
+    text.write_text("no photo")
+    pose = '{"world_from_camera": [[2,0,0,0],[0,2,0,0],[0,0,2,0],[0,0,0,1]]}'
+    bad = [
+        (("localize", photo, "--scene", tmp_path / "none"), "none"),
+        (("localize", photo, "--scene", torn), "torn.ply"),
+        (("localize", tmp_path / "none.jpg", "--scene", room), "none.jpg"),
+        (("localize", text, "--scene", room), "not a JPEG"),
+        (("localize", photo, "--scene", room, "--estimator", "magic"), "magic"),
+        (("localize", photo, "--scene", room, "--intrinsics", '{"fx": 0}'), "intrinsics"),
+        (("localize", photo, "--scene", room, "--intrinsics", "none.json"), "none.json"),
+        (("localize", photo, "--scene", room, "--prior", "{"), "prior"),
+        (("localize", photo, "--scene", room, "--budget-s", "-1"), "budget_s"),
+        (("render", "--scene", room, "--pose", pose, "--out", tmp_path / "a.png"), "not a rotation"),
+        (("render", "--scene", room, "--pose", "{}", "--out", tmp_path / "a.gif"), ".png"),
+        (("scenes", "list", tmp_path / "none"), "none"),
+        (("serve", tmp_path / "none"), "none"),
+    ]
+    for arguments, expected in bad:
+        code, told, complaint = splatfix(*arguments)
+        assert (code, told) == (2, ""), arguments
+        assert complaint.startswith("error: "), complaint
+        assert expected in complaint
+        assert complaint.count("\n") == 1
+
+
+def test_a_port_in_use_and_a_bad_setting_are_told(splatfix, monkeypatch):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        code, _, complaint = splatfix("serve", "--port", taken.getsockname()[1])
+    assert (code, "in use" in complaint) == (2, True)
+    monkeypatch.setenv("SPLATFIX_WORKERS", "0")
+    code, _, complaint = splatfix("serve")
+    assert (code, complaint.startswith("error: workers: ")) == (2, True)
+
+
+def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_path):
+    import service.bench.localize
+
+    asked = {}
+
+    def run(folder, **options):
+        options["progress"](1, 2)
+        asked.update(options, folder=folder)
+        return {"scene": "x", "success_5deg_0p05": 0.5, "per_query": [{"photo": "a"}]}
+
+    monkeypatch.setattr(service.bench.localize, "run", run)
+    flags = "--estimator e --start hard --trials 3 --seed 4 --intrinsics withheld --cameras ignored"
+    written = tmp_path / "out.json"
+    code, told, complaint = splatfix(
+        "bench", "localize", tmp_path, *flags.split(), "--modify", "blur=2", "--json", written
+    )
+    assert code == 0, complaint
+    assert asked.pop("progress")
+    assert asked.pop("cache_dir") == Path(os.environ["SPLATFIX_CACHE_DIR"])
+    assert asked == {
+        "folder": tmp_path, "estimator": "e", "start": "hard", "trials": 3, "seed": 4,
+        "intrinsics": "withheld", "cameras": "ignored", "modify": ("blur=2",),
+    }  # fmt: skip
+    assert json.loads(written.read_text())["per_query"] == [{"photo": "a"}]
+    assert "success_5deg_0p05" in told
+    assert "cores" in complaint  # the machine and its load
+
+
+def test_doctor_finds_the_parts_at_work(splatfix):
+    code, told, _ = splatfix("doctor")
+    lines = {line[5:29].strip(): line[:4].strip() for line in told.splitlines()}
+    assert code == 0, told
+    assert (lines["renderer"], lines["matcher"], lines["estimator view_index"]) == ("ok", "ok", "ok")
+    assert "SPLATFIX_WORKERS" in told
+
+
+def test_serve_prints_a_line_that_works_and_ends_when_told(room, photo):
+    curl = shutil.which("curl")
+    if not curl:
+        pytest.skip("no curl here")
+    command = [sys.executable, "-m", "service", "serve", str(room), "--port", "0", "--no-viewer"]
+    with subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True) as server:
+        try:
+            line = next(line for line in server.stdout or () if line.startswith("  curl "))
+            done = subprocess.run([*shlex.split(line), "-s"], capture_output=True, text=True, check=True)
+            job = json.loads(done.stdout)
+            assert job["result"]["status"] == "localized"
+            found = Pose(np.array(job["result"]["pose"]["world_from_camera"]["matrix"]))
+            assert pose_distance(found, TRUTH)[0] < 0.2
+        finally:
+            began = time.monotonic()
+            server.send_signal(signal.SIGTERM)
+            server.wait(20)
+    assert time.monotonic() - began < 10
+    assert server.returncode in (0, -signal.SIGTERM)
