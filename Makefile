@@ -36,7 +36,8 @@ studio: setup
 	$(PYTHON) -m venv scenes/studio/.venv
 	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
 	cd scenes/studio && .venv/bin/python build.py --out build
-	$(BIN)/python scenes/studio/train_studio.py
+	$(BIN)/python scenes/train.py scenes/studio/build --out scenes/studio/scene.compressed.ply
+	$(BIN)/python scenes/studio/assemble.py scenes/studio/build
 
 clean:
 	rm -rf .venv scenes/studio/.venv
