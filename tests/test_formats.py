@@ -289,7 +289,7 @@ class TestDamage:
         with pytest.raises(error, match=says):
             load_scene(written(tmp_path, data))
 
-    @settings(max_examples=200, deadline=None)
+    @settings(max_examples=200)
     @given(st.data())
     def test_no_damage_raises_anything_else(self, tmp_path_factory, data):
         kind = data.draw(st.sampled_from(["scene.ply", "scene.compressed.ply", "scene.splat"]))

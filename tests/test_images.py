@@ -46,9 +46,7 @@ def png(width: int, height: int, *chunks: tuple[bytes, bytes], data: bytes = b""
     """A PNG by hand: the header may promise anything."""
     parts = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)), *chunks]
     parts += [(b"IDAT", zlib.compress(data)), (b"IEND", b"")]
-    body = b"".join(
-        struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts
-    )
+    body = b"".join(struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in parts)
     return b"\x89PNG\r\n\x1a\n" + body
 
 
@@ -156,42 +154,42 @@ RAYS = np.array([[-0.42, -0.25], [0.4, -0.28], [0.05, 0.02], [-0.35, 0.27], [0.4
 
 
 class TestGeometry:
-    """A spot on a ray must appear where `Query.intrinsics` project that ray, whatever happened to pixels."""
+    """A spot on a ray must appear where `Query.intrinsics` project that ray, whatever happened to the pixels."""
+
+    @pytest.fixture(autouse=True)
+    def small(self, monkeypatch):
+        monkeypatch.setattr(images, "LONG_SIDE", 200)  # JPEG's reduced decode starts at 400
 
     @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
-    @pytest.mark.parametrize("size", [(640, 480), (1999, 1501), (3303, 2205), (6607, 4411)])
+    @pytest.mark.parametrize("size", [(160, 120), (249, 187), (413, 275), (827, 551), (1655, 1103)])
     def test_reduction_keeps_rays(self, kind, size):
-        if kind == "PNG" and size[0] > 4000:
-            pytest.skip("slow, and nothing new: only JPEG has a reduced decode")
         width, height = size
         camera = Intrinsics(width, height, 1.0 * width, 0.98 * width, 0.51 * width, 0.49 * height)
         photo = Image.fromarray(spots(camera, RAYS, pinhole, size))
-        query = read_query(
-            encoded(photo, kind, **({"quality": 95} if kind == "JPEG" else {"compress_level": 1})),
-            intrinsics=camera,
-        )
-        assert max(query.rgb.shape) == min(1600, width)
+        options = {"quality": 95} if kind == "JPEG" else {"compress_level": 1}
+        query = read_query(encoded(photo, kind, **options), intrinsics=camera)
+        assert max(query.rgb.shape) == min(200, width)
         for ray, expected in zip(RAYS, pinhole(RAYS, query.intrinsics), strict=True):
-            found = centroid(query.rgb, expected, int(0.03 * query.rgb.shape[1]))
-            # Seen: 0.024. Taking the reduced width for the exact half of an odd one would give 0.25.
+            found = centroid(query.rgb, expected, int(0.04 * query.rgb.shape[1]))
+            # Seen: 0.027; 0.46 if the reduced width were taken for the exact half of an odd one.
             assert np.abs(found - expected).max() < 0.05, ray
 
     @pytest.mark.parametrize("orientation", range(1, 9))
     def test_orientation_keeps_rays_through_a_reduced_decode(self, orientation):
-        upright_size = (2205, 3303) if orientation > 4 else (3303, 2205)
+        upright_size = (551, 827) if orientation > 4 else (827, 551)
         width, height = upright_size
-        camera = Intrinsics(width, height, 3000.0, 3000.0, width / 2 + 9, height / 2 - 7)
+        camera = Intrinsics(width, height, 750.0, 750.0, width / 2 + 9, height / 2 - 7)
         rays = RAYS * [0.7, 0.9] if width > height else RAYS[:, ::-1] * [0.9, 0.7]
         upright = Image.fromarray(spots(camera, rays, pinhole, upright_size))
         back = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's transpositions that undo the orientation
         stored = upright.transpose(Image.Transpose(back[orientation])) if orientation > 1 else upright
-        query = read_query(
-            encoded(stored, "JPEG", quality=95, exif=exif_with(orientation)), intrinsics=camera
-        )
+        query = read_query(encoded(stored, "JPEG", quality=95, exif=exif_with(orientation)), intrinsics=camera)
         for expected in pinhole(rays, query.intrinsics):
-            found = centroid(query.rgb, expected, 48)
-            assert np.abs(found - expected).max() < 0.05  # seen: 0.02
+            found = centroid(query.rgb, expected, 8)
+            assert np.abs(found - expected).max() < 0.05  # seen: 0.019
 
+
+class TestDistortion:
     @pytest.mark.parametrize(
         ("model", "distortion"),
         [
@@ -206,9 +204,7 @@ class TestGeometry:
     )
     def test_undistortion_puts_spots_on_their_rays(self, model, distortion):
         size = (800, 600)
-        camera = Intrinsics(
-            *size, 700.0, 690.0 if "OPENCV" in model else 700.0, 407.0, 293.0, model, distortion
-        )
+        camera = Intrinsics(*size, 700.0, 690.0 if "OPENCV" in model else 700.0, 407.0, 293.0, model, distortion)
         photo = spots(camera, RAYS, colmap_pixels, size)
         query = read_query(encoded(Image.fromarray(photo)), intrinsics=camera)
         assert query.intrinsics.model == "PINHOLE"
@@ -289,9 +285,7 @@ class TestFocalLength:
 
     def test_given_wins(self):
         camera = Intrinsics(80, 60, 100.0, 101.0, 39.0, 31.0)
-        query = read_query(
-            encoded(Image.fromarray(gradient()), exif=exif_with(focal_35mm=27)), intrinsics=camera
-        )
+        query = read_query(encoded(Image.fromarray(gradient()), exif=exif_with(focal_35mm=27)), intrinsics=camera)
         assert query.intrinsics_source == "given"
         assert query.intrinsics == query.photo_intrinsics == camera
 
@@ -305,9 +299,7 @@ class TestFocalLength:
     )
     def test_other_size_than_the_photo(self, size, says):
         with pytest.raises(InvalidIntrinsics, match=says):
-            read_query(
-                encoded(Image.fromarray(gradient())), intrinsics=Intrinsics(*size, 70.0, 70.0, 30.0, 30.0)
-            )
+            read_query(encoded(Image.fromarray(gradient())), intrinsics=Intrinsics(*size, 70.0, 70.0, 30.0, 30.0))
 
 
 GOOD = {"width": 640, "height": 480, "fx": 500.0, "fy": 501, "cx": 320, "cy": 240.5}
@@ -400,7 +392,7 @@ class TestBrokenPhotos:
         with pytest.raises(InvalidImage):
             read_query(bytes(data))
 
-    @pytest.mark.parametrize("size", [(31, 400), (1, 1), (60_000, 1000)])
+    @pytest.mark.parametrize("size", [(31, 400), (1, 1), (6000, 100)])
     def test_too_small_or_narrow(self, size):
         with pytest.raises(InvalidImage, match="narrow"):
             read_query(encoded(Image.new("RGB", size), compress_level=1))
@@ -412,7 +404,7 @@ class TestBrokenPhotos:
         with pytest.raises(InvalidImage, match=r"truncated|broken"):
             read_query(data[: len(data) // 2])
 
-    @settings(max_examples=150, deadline=None)
+    @settings(max_examples=150)
     @given(st.data())
     def test_no_damage_raises_anything_else(self, data):
         """Bytes changed and cut at random: a query or InvalidImage, nothing else."""
@@ -426,8 +418,7 @@ class TestBrokenPhotos:
 
 
 _WHOLE = {
-    kind: encoded(Image.fromarray(gradient()), kind, exif=exif_with(6, 27))
-    for kind in ("JPEG", "PNG", "WEBP")
+    kind: encoded(Image.fromarray(gradient()), kind, exif=exif_with(6, 27)) for kind in ("JPEG", "PNG", "WEBP")
 } | {"HEIC": (DATA / "rotated.heic").read_bytes()}
 
 
