@@ -40,6 +40,8 @@ class SceneView:
     id: str
     name: str
     gaussians: int
+    background_rgb: tuple[float, float, float]
+    """Seen where there is no Gaussian; 0..1."""
     up_in_world: tuple[float, float, float] | None
     cameras: tuple[NamedCamera, ...]
 
@@ -116,6 +118,7 @@ class Service:
             raw["id"],
             raw["name"],
             raw["gaussians"] or 0,
+            cast("tuple[float, float, float]", tuple(raw["background_rgb"] or (0, 0, 0))),
             cast("tuple[float, float, float] | None", raw["up_in_world"] and tuple(raw["up_in_world"])),
             tuple(NamedCamera(c["name"], _camera(c)) for c in raw["training_cameras"]),
         )
@@ -126,8 +129,7 @@ class Service:
     def jobs(self) -> list[JobSummary]:
         """Return the jobs, newest first."""
         return [
-            JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"])
-            for j in self._json("/jobs")["jobs"]
+            JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in self._json("/jobs")["jobs"]
         ]
 
     def job(self, job_id: str) -> JobView:
@@ -198,9 +200,7 @@ def parsed_splats(data: bytes) -> Splats:
         raise ValueError(f"{len(data)} bytes for {n} splats")
     floats = np.frombuffer(data, "<f4", 9 * n, start)
     rgba = np.frombuffer(data, np.uint8, 4 * n, start + 36 * n)
-    return Splats(
-        floats[: 3 * n].reshape(n, 3), floats[3 * n :].reshape(n, 6), rgba.reshape(n, 4), header["total"]
-    )
+    return Splats(floats[: 3 * n].reshape(n, 3), floats[3 * n :].reshape(n, 6), rgba.reshape(n, 4), header["total"])
 
 
 def parsed_record(raw: dict[str, Any]) -> IterationRecord:

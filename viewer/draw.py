@@ -5,7 +5,6 @@ Images are uint8 RGB. Pixel coordinates have the centre of the top-left pixel at
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal, get_args
 
 import cv2
@@ -20,9 +19,11 @@ MODES: tuple[Mode, ...] = get_args(Mode)
 INLIER, OUTLIER = (70, 225, 120), (240, 70, 70)
 # Dull blue to bright yellow, lightness rising all the way: readable on a dark ground and without hue.
 _RAMP = np.array([(72, 84, 150), (44, 130, 165), (60, 175, 150), (150, 205, 90), (255, 225, 60)], np.float64)
-_GAP_PX = 4
-_BOX_PX = (480, 560)
-"""Width and height that one image of a pair may fill."""
+_GAP_PX = 8
+_WIDTH_PX, _HEIGHT_PX = 800, 1160
+"""Of every picture, at most: twice what the docked window shows, for fine displays and for enlarging."""
+_GROUND = (36, 36, 36)
+"""viser's dark panels."""
 
 cv2.setNumThreads(1)
 
@@ -48,34 +49,44 @@ def overlaid(
     weight: float = 0.5,
 ) -> UInt8[np.ndarray, "c d 3"]:
     """Return photo and render on top of one another; in a blend `weight` is the render's share, 0..1."""
-    height = _common_height([photo], (2 * _BOX_PX[0], _BOX_PX[1]))
-    photo = _with_height(photo, height)
+    photo = _fitted(photo, _WIDTH_PX, _HEIGHT_PX)
     render = _resized(render, photo.shape[1], photo.shape[0])
     if mode == "blend":
-        return cv2.addWeighted(photo, 1 - weight, render, weight, 0)
-    # Doubled: at the answer most differences are below a tenth of the range and would look black.
-    return np.minimum(cv2.absdiff(photo, render).astype(np.uint16) * 2, 255).astype(np.uint8)
+        both = cv2.addWeighted(photo, 1 - weight, render, weight, 0)
+    else:
+        # Doubled: at the answer most differences are below a tenth of the range and would look black.
+        both = np.minimum(cv2.absdiff(photo, render).astype(np.uint16) * 2, 255).astype(np.uint8)
+    return _pasted((both, ((_WIDTH_PX - both.shape[1]) // 2, 0)))
 
 
 def side_by_side(
     photo: UInt8[np.ndarray, "h w 3"], render: UInt8[np.ndarray, "a b 3"], matches: MatchVectors | None = None
 ) -> UInt8[np.ndarray, "c d 3"]:
-    """Return photo and render, equally high, with a line per match: outliers below, inliers above."""
-    height = _common_height([photo, render], _BOX_PX)
-    left, right = _with_height(photo, height), _with_height(render, height)
-    pair = np.concatenate([left, np.zeros((height, _GAP_PX, 3), np.uint8), right], 1)
+    """Return photo and render with a line per match: outliers below, inliers above.
+
+    The render is right of an upright photo, and under a wide one: so both are as large as the window allows.
+    """
+    if photo.shape[1] < 0.9 * photo.shape[0]:
+        box = (_WIDTH_PX - _GAP_PX) // 2, _HEIGHT_PX
+        a, b = _fitted(photo, *box), _fitted(render, *box)
+        left = (_WIDTH_PX - a.shape[1] - _GAP_PX - b.shape[1]) // 2
+        corners = (left, 0), (left + a.shape[1] + _GAP_PX, 0)
+    else:
+        box = _WIDTH_PX, (_HEIGHT_PX - _GAP_PX) // 2
+        a, b = _fitted(photo, *box), _fitted(render, *box)
+        corners = ((_WIDTH_PX - a.shape[1]) // 2, 0), ((_WIDTH_PX - b.shape[1]) // 2, a.shape[0] + _GAP_PX)
+    pair = _pasted((a, corners[0]), (b, corners[1]))
     if matches is None:
         return pair
     k = matches.render_camera.intrinsics
-    starts = matches.photo_px * [left.shape[1] / photo.shape[1], height / photo.shape[0]]
-    ends = matches.render_px * [right.shape[1] / k.width, height / k.height] + [left.shape[1] + _GAP_PX, 0]
+    starts = matches.photo_px * [a.shape[1] / photo.shape[1], a.shape[0] / photo.shape[0]] + corners[0]
+    ends = matches.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
     lines = pair.copy()
     for i in np.argsort(matches.inlier, kind="stable"):
         colour = INLIER if matches.inlier[i] else OUTLIER
-        a, b = _fixed(starts[i]), _fixed(ends[i])
-        cv2.line(lines, a, b, colour, 1, cv2.LINE_AA, _SHIFT)
-        for end in (a, b):
-            cv2.circle(lines, end, 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), colour, 2, cv2.LINE_AA, _SHIFT)
+        for end in (starts[i], ends[i]):
+            cv2.circle(lines, _fixed(end), 4 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
     # Translucent, so that three hundred lines don't hide what they connect.
     return cv2.addWeighted(pair, 0.35, lines, 0.65, 0)
 
@@ -97,20 +108,24 @@ _SHIFT = 4
 """Fractional bits of OpenCV's drawing coordinates."""
 
 
-def _fixed(point: Sequence[float] | np.ndarray) -> tuple[int, int]:
+def _fixed(point: Float[np.ndarray, "2"]) -> tuple[int, int]:
     """To OpenCV's fixed point, whose top-left pixel centre is (0, 0)."""
     x, y = (np.asarray(point) - 0.5) * (1 << _SHIFT)
     return round(float(x)), round(float(y))
 
 
-def _common_height(images: Sequence[np.ndarray], box: tuple[int, int]) -> int:
-    """Return the greatest height at which each image fits the box, enlarged at most twofold."""
-    heights = [min(box[0] * im.shape[0] / im.shape[1], box[1], 2 * im.shape[0]) for im in images]
-    return max(1, int(min(heights)))
+def _pasted(*parts: tuple[np.ndarray, tuple[int, int]]) -> UInt8[np.ndarray, "c d 3"]:
+    """Put images at their (left, top) corners on a ground of the full width."""
+    height = max(top + image.shape[0] for image, (_, top) in parts)
+    ground = np.full((height, _WIDTH_PX, 3), _GROUND, np.uint8)
+    for image, (left, top) in parts:
+        ground[top : top + image.shape[0], left : left + image.shape[1]] = image
+    return ground
 
 
-def _with_height(image: UInt8[np.ndarray, "h w 3"], height: int) -> UInt8[np.ndarray, "a b 3"]:
-    return _resized(image, round(image.shape[1] * height / image.shape[0]), height)
+def _fitted(image: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> UInt8[np.ndarray, "a b 3"]:
+    factor = min(width / image.shape[1], height / image.shape[0])
+    return _resized(image, min(width, round(image.shape[1] * factor)), round(image.shape[0] * factor))
 
 
 def _resized(image: UInt8[np.ndarray, "h w 3"], width: int, height: int) -> UInt8[np.ndarray, "a b 3"]:

@@ -11,7 +11,8 @@ from viewer.draw import MODES
 from viewer.stage import Layer
 
 NO_JOB: str = "no job yet"
-_PICTURE_WIDTH_PX = 620
+_PANEL_WIDTH_PX = 340
+_WINDOW_WIDTH_PX = 420
 
 
 class Panel:
@@ -19,11 +20,10 @@ class Panel:
 
     def __init__(self, client: viser.ClientHandle) -> None:
         gui = client.gui
-        gui.main_panel.float(x=-12, y=12, width=350)
+        gui.main_panel.dock_right()
+        gui.main_panel.set_width(_PANEL_WIDTH_PX)
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
-        self.newest = gui.add_checkbox(
-            "follow newest", True, hint="Change to every new job as soon as it appears."
-        )
+        self.newest = gui.add_checkbox("follow newest", True, hint="Change to every new job as soon as it appears.")
         self.headline = gui.add_html("")
         self.step = gui.add_slider("step", 0, 0, 1, 0, disabled=True)
         self.play = gui.add_button_group("", ("◀ previous", "play / pause", "next ▶"))
@@ -43,6 +43,7 @@ class Panel:
             self.caption = gui.add_html("")
             self.matches = gui.add_checkbox("match vectors", True)
             self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
-        self.window.float(x=12, y=-12, width=_PICTURE_WIDTH_PX)
+        self.window.dock_left()
+        self.window.set_width(_WINDOW_WIDTH_PX)
         # The page is viser's file, with its title; this is the one way to another title from here.
         gui.add_html("<img src='data:,' style='display:none' onerror=\"document.title='splatfix'\">")

@@ -73,7 +73,7 @@ def headline_html(job: JobView | None, records: int, trouble: str) -> str:
         return _block(_badge("no connection", (215, 65, 65)), trouble)
     if job is None:
         return _block(_badge("waiting", PENDING_COLOUR), "for a first job: POST a photo to /localize.")
-    title = f"{job.photo_name} in {job.scene}, by {job.estimator}"
+    title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
     if job.answer is None:
         word = "queued" if not records else "running"
         return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title)
@@ -99,13 +99,10 @@ def record_html(record: IterationRecord) -> str:
         ("moved", _or_dash(record.step_units, ".3g", " units")),
     ]
     cells = "".join(
-        f"<div><div style='opacity:.6;font-size:.8em'>{name}</div>"
-        f"<div style='white-space:nowrap'>{value}</div></div>"
+        f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
     )
-    return _padded(
-        f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>"
-    )
+    return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>")
 
 
 def caption_html(mode: Mode, matches: MatchVectors | None) -> str:
@@ -115,10 +112,10 @@ def caption_html(mode: Mode, matches: MatchVectors | None) -> str:
     if mode == "difference":
         return _small("difference of photo and render at this step's pose, doubled")
     if matches is None:
-        return _small("left: photo · right: render at this step's pose")
+        return _small("photo, and render at this step's pose")
     inliers = int(matches.inlier.sum())
     return _small(
-        f"left: photo · right: render that was matched · lines: {_coloured(f'{inliers} agree', INLIER)}, "
+        f"photo, and the render that was matched; lines: {_coloured(f'{inliers} agree', INLIER)}, "
         f"{_coloured(f'{len(matches.inlier) - inliers} do not', OUTLIER)}"
     )
 

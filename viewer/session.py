@@ -121,15 +121,10 @@ class Session:
         panel.mode.on_click(lambda event: self.post(lambda mode=event.target.value: self._set_mode(mode)))
         panel.look_through.on_click(lambda _: self.post(self._look_through))
         panel.fly.on_click(lambda _: self.post(self._fly))
-        self._client.camera.on_update(lambda _: self.post(self.stage.hide_near))
         command = self._client.gui.add_command
         command("Next step", hotkey="N").on_trigger(lambda _: self.post(lambda: self._press("next ▶")))
-        command("Previous step", hotkey="P").on_trigger(
-            lambda _: self.post(lambda: self._press("◀ previous"))
-        )
-        command("Play or pause", hotkey="space").on_trigger(
-            lambda _: self.post(lambda: self._press("play / pause"))
-        )
+        command("Previous step", hotkey="P").on_trigger(lambda _: self.post(lambda: self._press("◀ previous")))
+        command("Play or pause", hotkey="space").on_trigger(lambda _: self.post(lambda: self._press("play / pause")))
 
     def _on_user(self, widget: Any, action: Action) -> None:
         """Post the action when the user, not this program, has changed the widget."""
@@ -207,7 +202,6 @@ class Session:
         self.stage.show_current(record.pose, feed.job.photo, texture)
         weighed = (r.candidates for r in reversed(feed.records[: record.index + 1]) if r.candidates)
         self.stage.show_candidates(next(weighed, None), feed.job.photo)
-        self.stage.hide_near()
         self._shown = feed.id, record.index
         self._picture_due = True
 

@@ -56,9 +56,7 @@ def extent(
     return Extent(centre, radius, _up(cameras, up_in_world), frustum=0.08 * radius)
 
 
-def _up(
-    cameras: Sequence[Camera], up_in_world: tuple[float, float, float] | None
-) -> Float64[np.ndarray, "3"]:
+def _up(cameras: Sequence[Camera], up_in_world: tuple[float, float, float] | None) -> Float64[np.ndarray, "3"]:
     """Up as the scene says, else as most photographers held their camera, else z."""
     up = np.zeros(3)
     if up_in_world is not None:
@@ -72,7 +70,7 @@ def _up(
 def first_view(scene: Extent, cameras: Sequence[Camera]) -> Viewpoint:
     """Where a visitor starts: at the first training camera (inside an interior), else outside, above."""
     if cameras:
-        return through(cameras[0], scene, aspect=1.6)
+        return through(cameras[0], scene, aspect=1.0)
     across = np.eye(3)[np.argmin(np.abs(scene.up))]
     away = across - scene.up * (across @ scene.up) + 0.5 * scene.up
     position = scene.centre + 2.5 * scene.radius * away / np.linalg.norm(away)

@@ -30,7 +30,7 @@ _FLIGHT_S, _FRAME_S = 0.8, 1 / 30
 
 
 class Stage:
-    """What one browser sees. All methods but `hide_near` are called from one thread."""
+    """What one browser sees. All methods are called from one thread."""
 
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
@@ -47,9 +47,12 @@ class Stage:
         cameras = [named.camera for named in content.view.cameras]
         with client.atomic():
             client.scene.set_up_direction(scene.up)
-            client.camera.near, client.camera.far = 0.005 * scene.radius, 500 * scene.radius
+            # Nearer than this nothing is drawn: the frusta that one stands in would cover what one looks at.
+            client.camera.near, client.camera.far = 1.15 * scene.frustum, 500 * scene.radius
             self.look(shapes.first_view(scene, cameras))
         client.flush()
+        background = np.array([[content.view.background_rgb]])
+        client.scene.set_background_image((255 * background).astype(np.uint8), format="png")
         poses = shapes.stacked([c.pose for c in cameras])
         segments = shapes.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
         self._lines("training cameras", "cameras", segments, _TRAINING, 1.0)
@@ -102,19 +105,6 @@ class Stage:
         for node in self._nodes[layer].values():
             node.visible = visible
 
-    def hide_near(self) -> None:
-        """Hide the frusta that the browser's camera stands in: they would cover what it looks at."""
-        if self._scene is None:
-            return
-        eye = self._client.camera.position
-        for name in ("initial", "current", "final"):
-            node = self._nodes["trajectory"].get(name)
-            if node is not None:
-                near = float(np.linalg.norm(node.position - eye)) < 0.5 * self._scene.extent.frustum
-                visible = self._visible["trajectory"] and not near
-                if node.visible != visible:
-                    node.visible = visible
-
     def look(self, view: shapes.Viewpoint) -> None:
         camera = self._client.camera
         with self._client.atomic():
@@ -132,9 +122,7 @@ class Stage:
         if self._scene is None:
             return
         camera = self._client.camera
-        start = shapes.Viewpoint(
-            camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov
-        )
+        start = shapes.Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov)
         goal = shapes.behind(pose, self._scene.extent)
         began = time.monotonic()
         share = 0.0
