@@ -132,7 +132,7 @@ def _announce(server: uvicorn.Server, application: FastAPI, settings: Settings) 
             time.sleep(0.1)
     readiness, url = scenes.readiness(), settings.loopback_url
     for reason in readiness.failed:
-        err.print(f"not usable: {reason}", style="red", markup=False, highlight=False)
+        err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
     lines = [
         f"splatfix {__version__} {'is ready' if readiness.ready else 'runs, but has no usable scene'}:",
         f"  start page  {url}/",

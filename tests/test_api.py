@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -289,6 +290,19 @@ def test_a_full_queue_refuses_and_a_cancelled_job_makes_room(client, stepping):
     assert finished(client, waiting[1])["state"] == "succeeded"
 
 
+def test_many_at_once_are_served_or_refused_and_nothing_else(stepping):
+    with serving(create_app(settings(workers=2, queue_size=8), {"room": make_scene()})) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        with ThreadPoolExecutor(16) as senders:
+            answers = list(senders.map(lambda seed: post(client, prefer="", seed=str(seed)), range(100)))
+        assert {a.status_code for a in answers} <= {202, 503}
+        accepted = {a.json()["id"]: a.json()["seed"] for a in answers if a.status_code == 202}
+        assert len(accepted) >= 10
+        until(lambda: all(job["finished"] for job in client.get("/jobs").json()["jobs"]))
+        ended = {job_id: client.get(f"/jobs/{job_id}").json() for job_id in accepted}
+        assert {k: job["result"]["seed"] for k, job in ended.items()} == accepted
+
+
 @pytest.mark.parametrize(("fail", "code"), [("fault", "estimator_fault"), ("bug", "internal_error")])
 def test_a_failing_estimator_fails_its_job_only(shared, fail, code, caplog):
     job = post(shared, options={"fail": fail}).json()
@@ -513,6 +527,16 @@ def test_a_request_that_cannot_be_read_is_refused(shared):
     assert_problem(shared.post("/localize", files={"scene": b"room"}), 400, "invalid_request", "photo")
     twice = [("scene", (None, "room")), ("scene", (None, "room")), ("photo", ("p", photo()))]
     assert_problem(shared.post("/localize", files=twice), 400, "invalid_request", "scene")
+
+
+def test_a_client_that_leaves_in_the_middle_is_no_failure(shared, caplog):
+    head = b"POST /localize HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 999\r\n\r\n{"
+    with socket.create_connection((shared.base_url.host, shared.base_url.port)) as connection:
+        connection.sendall(head)
+    before = time.monotonic()
+    while time.monotonic() - before < 0.3:
+        assert shared.get("/livez").status_code == 200
+    assert "Exception" not in caplog.text
 
 
 def test_http_errors_are_problem_documents(shared):

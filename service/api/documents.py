@@ -7,9 +7,9 @@ from functools import cache
 from importlib import metadata
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from service.api.convert import intrinsics_out, named_camera_out, pose_out, record_out, result_out, timing_out
+from service.api.intake import options_adapter
 from service.api.jobs import Job
 from service.api.problems import problem_of
 from service.api.scenes import Entry
@@ -157,7 +157,7 @@ def capabilities(settings: Settings) -> Capabilities:
                 **plugin.model_dump(),
                 options_schema=None
                 if plugin.reason
-                else TypeAdapter(ESTIMATORS.load(plugin.name).Options).json_schema(),
+                else options_adapter(ESTIMATORS.load(plugin.name).Options).json_schema(),
             )
             for plugin in plugins(ESTIMATORS, settings.estimator)
         ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import threading
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -144,10 +145,26 @@ def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
             where=f"options.{unknown[0]}",
         )
     try:
-        return TypeAdapter(kind).validate_python(dict(values))
+        return options_adapter(kind).validate_python(dict(values))
     except ValidationError as error:
         where, message = described(error.errors())
         raise InvalidOptions(message, where=f"options.{where}") from error
+
+
+_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
+_ADAPTERS_LOCK = threading.Lock()
+
+
+def options_adapter(kind: type) -> TypeAdapter[Any]:
+    """Return what checks and describes an estimator's `Options`, made once.
+
+    Behind a lock: for the fields' docstrings pydantic parses source code, which Python 3.11 doesn't do safely in
+    two threads at once ("AST constructor recursion depth mismatch").
+    """
+    with _ADAPTERS_LOCK:
+        if kind not in _ADAPTERS:
+            _ADAPTERS[kind] = TypeAdapter(kind)
+        return _ADAPTERS[kind]
 
 
 def _intrinsics_from(values: Mapping[str, Any]) -> Intrinsics:

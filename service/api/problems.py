@@ -10,6 +10,7 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from service.api.schemas import Problem
 from service.errors import (
@@ -62,6 +63,8 @@ def problem_of(error: Exception, instance: str) -> Problem:
     if isinstance(error, SplatfixError):
         status = next(status for kind, status in _STATUS if isinstance(error, kind))
         return _problem(status, error.code, error.message, instance, error.where, error.hint)
+    if isinstance(error, ClientDisconnect):
+        return _problem(400, "bad_request", "The client left before it had sent everything.", instance)
     if isinstance(error, HTTPException):
         code = _HTTP_CODES.get(error.status_code, "http_error")
         return _problem(error.status_code, code, str(error.detail), instance)
@@ -102,6 +105,7 @@ def install(app: FastAPI) -> None:
 
     app.add_exception_handler(SplatfixError, answer)
     app.add_exception_handler(HTTPException, answer)
+    app.add_exception_handler(ClientDisconnect, answer)  # nobody hears it, but it is no failure of ours
     app.add_exception_handler(RequestValidationError, answer_validation)
     app.add_exception_handler(Exception, answer)
 
