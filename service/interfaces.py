@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
@@ -39,6 +39,7 @@ class SceneGradients:
     sh: Float32[np.ndarray, "v k 3"]
 
 
+@runtime_checkable
 class Rasterizer(Protocol):
     """Renders ONE scene: upload and packing have a home. Safe to call from several threads."""
 
@@ -85,6 +86,7 @@ class Features:
     """Unit length: the dot product is the similarity."""
 
 
+@runtime_checkable
 class Matcher(Protocol):
     """Finds local features and pairs them. Safe to call from several threads."""
 
@@ -115,6 +117,7 @@ class Tools:
     of this job alone; it never changes a result's meaning."""
 
 
+@runtime_checkable
 class Estimator(Protocol):
     """A plain generator function satisfies it. The last record's pose is the answer.
 

@@ -314,7 +314,8 @@ class Verdict:
     inliers: int
     """Matches between the photo and the render at the pose that agree with it."""
     agreement: float
-    """Zero-normalized cross-correlation of the gradients of photo and render, -1..1."""
+    """Normalized cross-correlation of the gradients of photo and render, -1..1, where they agree best: a quarter
+    of the photo may be hidden."""
     coverage: float
     """Share of the photo in which the scene is rendered opaque."""
     covariance: Float64[np.ndarray, "6 6"] | None

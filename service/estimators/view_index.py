@@ -10,7 +10,7 @@ the photo turned by quarters. A prior pose is one more candidate view.
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,10 +39,12 @@ MATCH_ERROR_PX = 4.0
 REMATCH_ERROR_PX = 3.0
 GOOD_MATCH = 60
 """Inliers with one view that make further views needless."""
-HOPELESS = 12
-"""Fewer inliers than this are chance: photos of other scenes end at 9 to 27."""
+CHANCE = 15
+"""Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
 STRONG = 150
 """Inliers with which alignment needs no further match."""
+SETTLED_PX = 0.3
+"""Where alignment moved what is seen by less, another render would be the same."""
 SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 
@@ -53,8 +55,8 @@ class Options:
     """Index views that the photo is matched with in one search."""
     rematches: int = 3
     """Rounds of rendering at the pose and matching again, at most, where few matches agree."""
-    alignments: int = 2
-    """Rounds of rendering at the pose and aligning photometrically; 0 leaves the pose as matched."""
+    alignments: int = 4
+    """Rounds of rendering at the pose and aligning photometrically, at most; 0 leaves the pose as matched."""
     escalate: bool = True
     """Search on (vote of features, quarter turns) while the verification gate doesn't accept the answer."""
 
@@ -67,12 +69,13 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    """Search until the gate accepts an answer; see the module's picture."""
     best_pose, best_score = None, -1.0
     for search in _searches(query, tools, options):
         last = None
         for last in search:
             yield last if best_pose is None else replace(last, pose=best_pose)
-        if last is None or (best_pose and (last.num_inliers or 0) < HOPELESS):
+        if last is None or last.stage != "align" and best_pose is not None:
             continue
         verdict = verify(query, last.pose, tools)
         if verdict.score > best_score:
@@ -86,17 +89,17 @@ def _searches(query: Query, tools: Tools, options: Options) -> Iterator[Iterator
     """The ways to look for the photo in the index, cheapest first."""
     index: ViewIndex = tools.prepared
     photo = photo_features(query, tools)
-    yield _search(
-        "retrieve", photo, index.vectors @ vlad(photo.descriptors, index.words), query, tools, options
-    )
+    upright = index.vectors @ vlad(photo.descriptors, index.words)
+    yield _search("retrieve", photo, upright, query, tools, options)
     if not options.escalate:
         return
+    turned = [photo_features(query, tools, quarter_turns) for quarter_turns in (1, 2, 3)]
+    scores = [index.vectors @ vlad(features.descriptors, index.words) for features in turned]
+    likeliest = int(np.argmax([s.max() for s in scores]))  # right for 26 of 26 photos that were turned
+    if scores[likeliest].max() > upright.max():
+        yield _search("turn", turned[likeliest], scores[likeliest], query, tools, options)
     votes = vote(photo.descriptors, [view.features.descriptors for view in index.views])
     yield _search("vote", photo, votes, query, tools, options)
-    for quarter_turns in (1, 3, 2):
-        turned = photo_features(query, tools, quarter_turns)
-        scores = index.vectors @ vlad(turned.descriptors, index.words)
-        yield _search(f"turn_{90 * quarter_turns}", turned, scores, query, tools, options)
 
 
 def _search(
@@ -113,11 +116,9 @@ def _search(
     if query.prior is not None and stage == "retrieve":
         views.insert(0, rendered_view(query.prior, query, tools)[0])
     found = yield from _matched(photo, views, query, tools)
-    if found is None:
-        return
-    if found.num_inliers < STRONG:
+    if found and found.num_inliers < STRONG:
         found = yield from _rematched(found, query, tools, options.rematches)
-    if found.num_inliers >= HOPELESS:
+    if found:
         yield from _aligned(found, query, tools, options.alignments)
 
 
@@ -129,57 +130,53 @@ def _matched(
     seen: list[Correspondences] = []
     for view in views:
         seen.append(correspondences(photo, view, tools.matcher))
-        found = _resected(seen[-1], query, MATCH_ERROR_PX)
+        found = _resected(seen[-1], query, MATCH_ERROR_PX, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        pose = best.pose if best else views[0].camera.pose
-        yield _match_record("match", pose, seen[-1], found, view.camera)
+        yield _match_record("match", best.pose if best else views[0].camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
-    pooled = Correspondences(
-        *(np.concatenate([getattr(c, name) for c in seen]) for name in Correspondences.__slots__)
-    )
-    found = _resected(pooled, query, MATCH_ERROR_PX)
-    if found and (best is None or found.num_inliers > best.num_inliers):
-        best = found
-    if best:
-        yield IterationRecord(
-            "pool", best.pose, num_matches=len(pooled.photo_px), num_inliers=best.num_inliers
-        )
+    pooled = Correspondences(*(np.concatenate(part) for part in zip(*map(astuple, seen), strict=True)))
+    together = _resected(pooled, query, MATCH_ERROR_PX, 2000)
+    if together and (best is None or together.num_inliers > best.num_inliers):
+        best = together
+    if best is None:
+        return None
+    yield IterationRecord("pool", best.pose, num_matches=len(pooled.photo_px), num_inliers=best.num_inliers)
     return best
 
 
 def _rematched(
     found: Resection, query: Query, tools: Tools, rounds: int
-) -> Generator[IterationRecord, None, Resection]:
-    """Render at the pose and match with that, which looks more like the photo than any index view."""
+) -> Generator[IterationRecord, None, Resection | None]:
+    """Render at the pose and match with that: a right pose gains matches, a chance one has none there."""
     photo = photo_features(query, tools)
     for _ in range(rounds):
         view, _ = rendered_view(found.pose, query, tools)
         matches = correspondences(photo, view, tools.matcher)
-        again = _resected(matches, query, REMATCH_ERROR_PX)
-        if again is None or again.num_inliers < found.num_inliers // 2:
-            break
+        again = _resected(matches, query, REMATCH_ERROR_PX, 500)
+        if again is None or again.num_inliers < CHANCE:
+            return None
         step_deg, step_units = pose_distance(found.pose, again.pose)
         distance = np.median(np.linalg.norm(view.points_in_world - again.pose.position_in_world, axis=1))
         found = again
-        yield replace(
-            _match_record("rematch", found.pose, matches, found, view.camera),
-            step_deg=step_deg,
-            step_units=step_units,
-        )
+        record = _match_record("rematch", found.pose, matches, found, view.camera)
+        yield replace(record, step_deg=step_deg, step_units=step_units)
         if step_deg < SETTLED_DEG and step_units < SETTLED_SHARE * distance:
             break
     return found
 
 
 def _aligned(found: Resection, query: Query, tools: Tools, rounds: int) -> Iterator[IterationRecord]:
-    pose = found.pose
+    """Align on a render, render at the result, align again, until a new render would be the same."""
+    pose, camera = found.pose, None
     for round_number in range(rounds):
-        frame, camera = rendered_frame(pose, query, tools)
+        frame, new_camera = rendered_frame(pose, query, tools, SETTLED_PX if camera else 1.0)
+        if new_camera is camera:
+            return
+        camera = new_camera
         levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
-        photo = photo_at(query, camera.intrinsics.width, camera.intrinsics.height)
-        result = align(photo, frame, camera, pose, levels)
+        result = align(photo_at(query, tools, camera.intrinsics), frame, camera, pose, levels)
         if not np.isfinite(result.loss):
             return
         step_deg, step_units = pose_distance(pose, result.pose)
@@ -194,9 +191,11 @@ def _aligned(found: Resection, query: Query, tools: Tools, rounds: int) -> Itera
         )
 
 
-def _resected(matches: Correspondences, query: Query, max_error_px: float) -> Resection | None:
-    pixels = max_error_px * query.intrinsics.long_side / min(PHOTO_PX, query.intrinsics.long_side)
-    return resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels)
+def _resected(
+    matches: Correspondences, query: Query, max_error_px: float, max_trials: int
+) -> Resection | None:
+    pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
+    return resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, max_trials)
 
 
 def _match_record(

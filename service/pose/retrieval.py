@@ -59,7 +59,8 @@ def vote(
     Unlike VLAD's sum over the image it is not drowned by features of things that the scene doesn't have: each
     feature counts by how much a view's best answer to it exceeds the average view's.
     """
-    best = np.stack([(descriptors[:VOTERS] @ view.T).max(1, initial=0.0) for view in views], 1)
+    voters = descriptors[:VOTERS].T
+    best = np.stack([(view @ voters).max(0, initial=0.0) for view in views], 1)
     return np.maximum(best - best.mean(1, keepdims=True), 0.0).sum(0, dtype=np.float64)
 
 

@@ -50,21 +50,22 @@ class Correspondences:
 
 
 def sized(intrinsics: Intrinsics, long_side: int) -> Intrinsics:
-    """Return the camera at about this size, not enlarged, both sides multiples of 32."""
-    factor = min(1.0, long_side / intrinsics.long_side) / SIZE_MULTIPLE_PX
+    """Return the camera at about this size, both sides multiples of 32."""
+    factor = long_side / intrinsics.long_side / SIZE_MULTIPLE_PX
     width, height = (
         SIZE_MULTIPLE_PX * max(1, round(side * factor)) for side in (intrinsics.width, intrinsics.height)
     )
     return intrinsics.resized(width, height)
 
 
-def photo_at(query: Query, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+def photo_at(query: Query, tools: Tools, size: Intrinsics) -> UInt8[np.ndarray, "h w 3"]:
     """Return the photo resampled; area averages when it shrinks, so nothing aliases."""
-    if query.rgb.shape[:2] == (height, width):
-        return query.rgb
-    shrinks = width * height < query.rgb.shape[0] * query.rgb.shape[1]
-    mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(query.rgb, (width, height), interpolation=mode))
+    key = ("photo", size.width, size.height)
+    if key not in tools.memo:
+        shrinks = size.width * size.height < query.rgb.shape[0] * query.rgb.shape[1]
+        mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        tools.memo[key] = np.asarray(cv2.resize(query.rgb, (size.width, size.height), interpolation=mode))
+    return tools.memo[key]
 
 
 def photo_features(query: Query, tools: Tools, quarter_turns: int = 0) -> Features:
@@ -76,7 +77,7 @@ def photo_features(query: Query, tools: Tools, quarter_turns: int = 0) -> Featur
     key = ("photo_features", quarter_turns)
     if key not in tools.memo:
         size = sized(query.intrinsics, PHOTO_PX)
-        rgb = photo_at(query, size.width, size.height)
+        rgb = photo_at(query, tools, size)
         found = tools.matcher.extract(np.ascontiguousarray(np.rot90(rgb, quarter_turns)), PHOTO_FEATURES)
         points = _turned_back(found.points_px, quarter_turns, size.width, size.height)
         scale = np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height], np.float32)
@@ -110,11 +111,13 @@ def render_views(
     ]
 
 
-def rendered_frame(pose: Pose, query: Query, tools: Tools) -> tuple[Frame, Camera]:
-    """Return the render with the photo's intrinsics; the job's last one if it is from almost the same place."""
+def rendered_frame(
+    pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0
+) -> tuple[Frame, Camera]:
+    """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
     intrinsics = sized(query.intrinsics, RENDER_PX)
     last = tools.memo.get("last_frame")
-    if last is None or last[1].intrinsics != intrinsics or not _nearly_seen(*last, pose):
+    if last is None or last[1].intrinsics != intrinsics or not _nearly_seen(*last, pose, tolerance_px):
         camera = Camera(intrinsics, pose)
         last = tools.memo["last_frame"] = (tools.rasterizer.render([camera])[0], camera)
     return last
@@ -130,8 +133,8 @@ def rendered_view(pose: Pose, query: Query, tools: Tools) -> tuple[View, Frame]:
     return last, frame
 
 
-def _nearly_seen(frame: Frame, camera: Camera, pose: Pose) -> bool:
-    """Would what the frame shows be seen from the pose at most a pixel from where it is?"""
+def _nearly_seen(frame: Frame, camera: Camera, pose: Pose, tolerance_px: float) -> bool:
+    """Would what the frame shows be seen from the pose within the tolerance of where it is?"""
     if pose is camera.pose:
         return True
     height, width = frame.alpha.shape
@@ -141,7 +144,8 @@ def _nearly_seen(frame: Frame, camera: Camera, pose: Pose) -> bool:
     if len(px) == 0:
         return False
     points = transformed(camera.pose.world_from_camera, unproject(px, depth[depth > 0], camera.intrinsics))
-    return bool(np.quantile(reprojection_error_px(px, points, camera.intrinsics, pose), 0.9) < 1.0)
+    error = reprojection_error_px(px, points, camera.intrinsics, pose)
+    return bool((error < tolerance_px).mean() > 0.9)
 
 
 def lifted(features: Features, frame: Frame, camera: Camera) -> View:
