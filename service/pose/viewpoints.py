@@ -27,8 +27,8 @@ SPREAD = 0.35
 """A wide scene gets more views, until each training camera has one within this distance (see `spread`)."""
 SEARCH_PX = 96
 SEARCH_FOV_DEG = 60.0
-SHELLS = (0.8, 1.3, 2.3)
-"""Radii, in units of the radius that holds 90 % of the opaque Gaussians: that fills, at 2.3, most of the image."""
+SHELLS = (1.2, 2.0, 3.4)
+"""Radii, in units of the radius that holds half of the opaque Gaussians."""
 SHELL_CANDIDATES = 100
 VOLUME_CANDIDATES = 200
 BEST, OFFSPRING = 60, 5
@@ -76,13 +76,13 @@ def found_cameras(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.G
     opaque = scene.means[scene.opacities > MIN_OPACITY].astype(np.float64)
     opaque = opaque if len(opaque) else scene.means.astype(np.float64)
     middle = np.median(opaque, axis=0)
-    radius, typical = np.quantile(np.linalg.norm(opaque - middle, axis=1), [0.9, 0.5])
+    radius = float(np.median(np.linalg.norm(opaque - middle, axis=1)))
     up = np.array(scene.info.up_in_world or (0.0, 0.0, 1.0))
     search = _intrinsics(SEARCH_PX)
 
     def judged(poses: list[Pose]) -> Float64[np.ndarray, "n"]:
         frames = rasterizer.render([Camera(search, pose) for pose in poses])
-        return np.array([solidity(frame, 0.1 * typical) for frame in frames])
+        return np.array([solidity(frame, 0.1 * radius) for frame in frames])
 
     poses = _shell_poses(middle, radius, up) + _volume_poses(opaque, up, rng)
     scores = judged(poses)
