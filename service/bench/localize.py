@@ -18,7 +18,6 @@ import numpy as np
 from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, summary, units_of
 from service.bench.queries import BenchPhoto, find_photos, photo_bytes
 from service.bench.starts import require_kind, start_pose
-from service.errors import UnknownName
 from service.images import read_query
 from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request, localize
@@ -55,9 +54,6 @@ def run(
     With `cameras="ignored"` the scene is used without its training cameras; they still define the units.
     """
     require_kind(start)
-    for name, value, words in (("intrinsics", intrinsics, ("given", "withheld")), ("cameras", cameras, _CAMERAS)):
-        if value not in words:
-            raise UnknownName(f"there is no '{value}'; known: {', '.join(words)}.", where=name)
     folder = Path(folder)
     photos = find_photos(folder)
     loaded, training = _loaded(folder, photos, cameras, cache_dir)
@@ -92,9 +88,6 @@ def run(
         "prepare_s": prepare_s,
         "per_query": per_query,
     }
-
-
-_CAMERAS = ("given", "ignored")
 
 
 def measure(

@@ -112,7 +112,7 @@ def _roll(shot: Shot, degrees: float, rng: np.random.Generator) -> Shot:
     corners = np.array([[0, 0], [old.width, 0], [0, old.height], [old.width, old.height]], float)
     rays = np.concatenate([(corners - [old.cx, old.cy]) / [old.fx, old.fy], np.ones((4, 1))], 1)
     extent = focal * (rays @ camera_from_rolled)[:, :2]
-    low = np.floor(extent.min(0) + 1e-6)
+    low = extent.min(0)  # not rounded: quarter turns then take pixel centres to pixel centres
     width, height = (int(v) for v in np.ceil(extent.max(0) - low - 1e-6))
     camera = Intrinsics(width, height, focal, focal, float(-low[0]), float(-low[1]))
     rows, columns = np.mgrid[:height, :width]

@@ -1,0 +1,476 @@
+"""The benches: which photos, what is held back, starts, modifications, and what is counted."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from service.bench import localize as bench
+from service.bench import render as render_bench
+from service.bench.metrics import Units, units_of
+from service.bench.modifications import MODIFICATIONS, Shot, modified
+from service.bench.queries import find_photos, photo_bytes
+from service.bench.starts import KINDS, start_pose
+from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
+from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
+from service.images import encode_image, read_query
+from service.interfaces import Frame
+from service.localize import LoadedScene
+from service.types import Camera, Intrinsics, Pose, PoseEstimate, Reason, Status, Verdict
+
+UP = np.array([0.0, 0.0, 1.0])
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+LENS = Intrinsics(64, 48, 60.0, 61.0, 33.0, 23.0)
+
+
+def poses(count=8) -> list[Pose]:
+    angles = np.linspace(0, 5, count)
+    return [look_at(np.array([3 * np.cos(a), 3 * np.sin(a), 1.0]), np.zeros(3), UP) for a in angles]
+
+
+def scene_ply(path: Path) -> None:
+    """Ten Gaussians, through the fewest properties that make a scene."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
+    header = "ply\nformat binary_little_endian 1.0\nelement vertex 10\n"
+    header += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    values = np.random.default_rng(0).normal(size=(10, len(names))).astype("<f4")
+    path.write_bytes(header.encode() + values.tobytes())
+
+
+def frames(names: list[str], found: list[Pose]) -> list[dict]:
+    keys = {"w": 64, "h": 48, "fl_x": 60.0, "fl_y": 61.0, "cx": 33.0, "cy": 23.0}
+    return [
+        {"file_path": n, "transform_matrix": (p.world_from_camera @ OPENGL).tolist(), **keys}
+        for n, p in zip(names, found, strict=True)
+    ]
+
+
+def photo(path: Path, seed: int = 0) -> None:
+    path.parent.mkdir(exist_ok=True)
+    pixels = np.random.default_rng(seed).integers(0, 255, (48, 64, 3), np.uint8)
+    Image.fromarray(pixels).save(path)
+
+
+def folder_of(path: Path, layout: str, wrong: Pose | None = None) -> Path:
+    """A scene of 8 photos in one of the layouts; `wrong` replaces the query frames' poses among the cameras."""
+    path.mkdir()
+    scene_ply(path / "scene.ply")
+    names = [f"images/{i}.png" for i in range(8)]
+    for i, name in enumerate(names):
+        photo(path / name, i)
+    held = (0, 5) if layout != "unsplit" else (0,)
+    stored = [wrong if wrong and i in held else pose for i, pose in enumerate(poses())]
+    data = {"frames": frames(names, stored)}
+    if layout == "nerfstudio":
+        data["test_filenames"] = [names[i] for i in held]
+        data["train_filenames"] = [n for i, n in enumerate(names) if i not in held]
+    elif layout == "blender":
+        (path / "transforms_test.json").write_text(json.dumps({"frames": [data["frames"][i] for i in held]}))
+    elif layout == "studio":  # truth in a file of its own, the same views among the cameras under other names
+        entries = []
+        for i in held:
+            photo(path / "photos" / f"query{i}.jpg", i)
+            entry = {"photo": f"query{i}.jpg", "original": f"{i}.png", "modification": "none"}
+            entry["intrinsics"] = {"width": 64, "height": 48, "fx": 60.0, "fy": 61.0, "cx": 33.0, "cy": 23.0}
+            entries.append(entry | {"world_from_camera": poses()[i].world_from_camera.tolist()})
+        (path / "truth.json").write_text(json.dumps(entries))
+    (path / "transforms.json").write_text(json.dumps(data))
+    return path
+
+
+LAYOUTS = ["nerfstudio", "blender", "studio", "unsplit"]
+
+
+class TestPhotos:
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    def test_found_with_their_truth(self, tmp_path, layout):
+        found = find_photos(folder_of(tmp_path / "s", layout))
+        held = [0] if layout == "unsplit" else [0, 5]
+        assert len(found) == len(held)
+        for index, one in zip(held, found, strict=True):
+            assert one.path.is_file()
+            assert one.camera.intrinsics == LENS
+            assert np.allclose(one.camera.pose.world_from_camera, poses()[index].world_from_camera, atol=1e-12)
+
+    def test_truth_moves_with_the_scene(self, tmp_path):
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+        (folder / "scene.json").write_text(json.dumps({"world_from_scene": np.diag([2.0, 2.0, 2.0, 1.0]).tolist()}))
+        (first, _) = find_photos(folder)
+        assert np.allclose(first.camera.pose.position_in_world, 2 * poses()[0].position_in_world)
+
+    def test_nothing_to_ask(self, tmp_path):
+        scene_ply(tmp_path / "scene.ply")
+        with pytest.raises(SceneNotFound, match="no test photos"):
+            find_photos(tmp_path)
+        with pytest.raises(SceneNotFound, match="no such folder"):
+            find_photos(tmp_path / "none")
+
+    @pytest.mark.parametrize("text", ["{", "7", "[{}]", '[{"photo": "a", "intrinsics": {}, "world_from_camera": []}]'])
+    def test_broken_truth(self, tmp_path, text):
+        (tmp_path / "truth.json").write_text(text)
+        with pytest.raises(CorruptScene, match="truth"):
+            find_photos(tmp_path)
+
+
+def estimate(pose: Pose, status=Status.LOCALIZED) -> PoseEstimate:
+    verdict = Verdict(status, Reason.AGREES, 0.9, 100, 0.8, 1.0, None)
+    return PoseEstimate(pose, verdict, LENS, "given", "s", "0", "fake", "fake", "fake", 0, False, (), (), ())
+
+
+class FakeRasterizer:
+    name = "fake"
+
+    def render(self, cameras):
+        flat = [np.full((c.intrinsics.height, c.intrinsics.width), 2.0, np.float32) for c in cameras]
+        return [Frame(np.repeat(f[:, :, None], 3, 2), f, f, f) for f in flat]
+
+    def pose_gradient(self, camera, d_rgb, d_depth=None, d_alpha=None):
+        raise NotImplementedError
+
+    scene_gradients = pose_gradient
+
+
+class FakeMatcher:
+    name = "fake"
+
+
+class FakeLoaded(LoadedScene):
+    """With nothing to prepare."""
+
+    def prepare(self, estimator):
+        return None
+
+
+@pytest.fixture
+def runs(monkeypatch):
+    """`run` with a fake scene and an estimator that answers what `answer` says; returns what it was given."""
+    seen = {"scenes": [], "queries": [], "answer": lambda query, index: poses()[0]}
+
+    def loaded(scene, **_):
+        seen["scenes"].append(scene)
+        return FakeLoaded(scene, FakeRasterizer(), FakeMatcher())
+
+    def fake_localize(query, loaded, request):
+        seen["queries"].append((query, request))
+        return estimate(seen["answer"](query, len(seen["queries"])))
+
+    monkeypatch.setattr(bench.LoadedScene, "of", loaded)
+    monkeypatch.setattr(bench, "localize", fake_localize)
+    return seen
+
+
+class TestRun:
+    @pytest.mark.parametrize("layout", LAYOUTS)
+    @pytest.mark.parametrize("cameras", ["given", "ignored"])
+    def test_query_frames_are_out_before_the_scene_is_loaded(self, tmp_path, runs, layout, cameras):
+        """Wrong poses of the query frames change nothing in the scene that is localized in, nor in the units."""
+        wrong = moved(poses()[3], np.array([0.3, -1.0, 0.5, 7.0, -8.0, 9.0]))
+        outcomes = [
+            bench.run(folder_of(tmp_path / name, layout, pose), cameras=cameras)
+            for name, pose in (("right", None), ("wrong", wrong))
+        ]
+        right, spoilt = runs["scenes"]
+        assert right.info.sha256 == spoilt.info.sha256
+        held = {"0"} if layout == "unsplit" else {"0", "5"}
+        expected = set() if cameras == "ignored" else set("01234567") - held
+        assert {Path(c.name).stem for c in right.cameras} == expected
+        assert outcomes[0]["units_per_scene_unit"] == outcomes[1]["units_per_scene_unit"]
+        assert outcomes[0]["training_cameras"] == 8 - len(held)
+
+    def test_output(self, tmp_path, runs):
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+        near = moved(poses()[5], np.array([np.radians(2), 0, 0, 0, 0, 0]))
+        runs["answer"] = lambda query, index: [poses()[0], poses()[0], near][index - 1]  # the first warms up
+        steps = []
+        outcome = bench.run(folder, progress=lambda done, total: steps.append((done, total)))
+        demanded = {
+            "scene", "estimator", "start", "queries", "success_5deg_0p05", "success_1deg_0p01",
+            "median_rotation_deg", "median_translation_units", "localized", "false_localized",
+            "latency_ms_p50", "latency_ms_p95", "cpu_ms_p50", "per_query",
+        }  # fmt: skip
+        assert demanded <= outcome.keys()
+        assert json.loads(json.dumps(outcome)) == outcome
+        assert (outcome["queries"], outcome["localized"], outcome["false_localized"]) == (2, 2, 0)
+        assert (outcome["success_5deg_0p05"], outcome["success_1deg_0p01"]) == (1.0, 0.5)
+        assert outcome["median_rotation_deg"] == pytest.approx(1)
+        assert [line["photo"] for line in outcome["per_query"]] == ["images/0.png", "images/5.png"]
+        assert steps == [(1, 2), (2, 2)]
+        assert all(query.prior is None for query, _ in runs["queries"])
+
+    def test_trials_have_starts_of_their_own_the_same_every_time(self, tmp_path, runs):
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+        outcome = bench.run(folder, start="easy", trials=3, seed=4)
+        again = bench.run(folder, start="easy", trials=3, seed=4)
+        other = bench.run(folder, start="easy", trials=3, seed=5)
+        starts = [[line["start_rotation_deg"] for line in o["per_query"]] for o in (outcome, again, other)]
+        assert outcome["queries"] == 6
+        assert len(set(starts[0])) == 6
+        assert starts[0] == starts[1] != starts[2]
+        priors = [query.prior for query, _ in runs["queries"]]
+        assert all(prior is not None for prior in priors)
+        assert pose_distance(priors[1], poses()[0])[0] == pytest.approx(starts[0][0])
+
+    def test_intrinsics_withheld(self, tmp_path, runs):
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+        bench.run(folder, intrinsics="withheld")
+        assert runs["queries"][0][0].intrinsics_source == "guessed"
+        bench.run(folder)
+        assert runs["queries"][-1][0].intrinsics == LENS
+
+    def test_modified_geometry_is_sent_and_compared_with_its_own_truth(self, tmp_path, runs):
+        folder = folder_of(tmp_path / "s", "unsplit")
+        turned = moved(poses()[0], np.array([0, 0, np.radians(90), 0, 0, 0]))
+        runs["answer"] = lambda query, index: turned
+        outcome = bench.run(folder, modify=("roll=90", "gain=0.5"))
+        query = runs["queries"][0][0]
+        assert query.rgb.shape == (65, 48, 3)  # 64 columns of 1/60, now as rows of 1/60.5 focal lengths
+        assert (query.intrinsics.width, query.intrinsics_source) == (48, "given")
+        assert outcome["success_1deg_0p01"] == 1
+        assert outcome["modify"] == ["roll=90", "gain=0.5"]
+
+    @pytest.mark.parametrize(
+        ("arguments", "error"),
+        [
+            ({"start": "hrad"}, UnknownName),
+            ({"modify": ("sharpen=3",)}, UnknownName),
+            ({"modify": ("blur=x",)}, InvalidOptions),
+            ({"modify": ("blur",)}, InvalidOptions),
+            ({"modify": ("occlude=2",)}, InvalidOptions),
+        ],
+    )
+    def test_wrong_words(self, tmp_path, runs, arguments, error):
+        with pytest.raises(error):
+            bench.run(folder_of(tmp_path / "s", "nerfstudio"), **arguments)
+
+    def test_depth_of_the_middle(self):
+        assert bench.centre_depth(FakeRasterizer(), Camera(LENS, poses()[0])) == 2
+
+
+class TestStarts:
+    UNITS = Units(np.array([1.0, -2.0, 0.5]), 0.5, False)
+    CAMERAS = tuple(Camera(LENS, pose) for pose in poses())
+
+    @pytest.mark.parametrize(
+        ("kind", "degrees", "lengths"), [("easy", (0, 30), (0, 0.5)), ("hard", (30, 60), (0.5, 1))]
+    )
+    @given(seed=st.integers(0, 1000))
+    def test_world_frame(self, kind, degrees, lengths, seed):
+        """Undone by hand in the normalized frame: start = T Rz Ry Rx gt."""
+        truth = poses()[1]
+        start = start_pose(kind, truth, self.UNITS, self.CAMERAS, np.random.default_rng(seed))
+        assert start is not None
+        normalized = self.UNITS.normalized_from_world()
+        both = []
+        for pose in (start, truth):
+            matrix = np.eye(4)
+            matrix[:3, :3] = pose.world_from_camera[:3, :3]
+            matrix[:3, 3] = (normalized @ [*pose.position_in_world, 1])[:3]
+            both.append(matrix)
+        change = both[0] @ np.linalg.inv(both[1])
+        assert np.all(np.abs(change[:3, 3]) >= lengths[0] - 1e-9)
+        assert np.all(np.abs(change[:3, 3]) <= lengths[1] + 1e-9)
+        r = change[:3, :3]  # Rz Ry Rx, taken apart
+        angles = np.degrees([np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])])
+        assert np.all(np.abs(angles) >= degrees[0] - 1e-6)
+        assert np.all(np.abs(angles) <= degrees[1] + 1e-6)
+
+    def test_as_far_as_the_protocol_says(self):
+        """Three turns of up to 30 degrees are some 30 together; 4 units from the focus that is over a unit off."""
+        units = units_of(self.CAMERAS, lambda camera: 0.0)
+        rng = np.random.default_rng(0)
+        found = []
+        for _ in range(100):
+            start = start_pose("easy", poses()[2], units, self.CAMERAS, rng)
+            assert start is not None
+            angle, distance = pose_distance(start, poses()[2])
+            found.append((angle, distance * units.units_per_scene_unit))
+        angle, distance = np.median(found, axis=0)
+        assert 25 < angle < 35  # seen: 29.9
+        assert 1.2 < distance < 2.0  # seen: 1.59
+
+    @given(seed=st.integers(0, 1000))
+    def test_inplace(self, seed):
+        start = start_pose("inplace", poses()[1], self.UNITS, self.CAMERAS, np.random.default_rng(seed))
+        assert start is not None
+        angle, distance = pose_distance(start, poses()[1])
+        assert 15 <= angle <= 40
+        assert distance == 0
+
+    def test_random_is_within_the_cameras(self):
+        positions = np.stack([pose.position_in_world for pose in poses()])
+        rng = np.random.default_rng(0)
+        turns = []
+        for _ in range(200):
+            start = start_pose("random", poses()[1], self.UNITS, self.CAMERAS, rng)
+            assert start is not None
+            assert np.all(start.position_in_world >= positions.min(0))
+            assert np.all(start.position_in_world <= positions.max(0))
+            turns.append(np.linalg.norm(so3_log(start.world_from_camera[:3, :3])))
+        assert 110 < np.degrees(np.mean(turns)) < 140  # the mean of uniform rotations is 126.5
+
+    def test_none_and_unknown(self):
+        rng = np.random.default_rng(0)
+        assert start_pose("none", poses()[0], self.UNITS, self.CAMERAS, rng) is None
+        with pytest.raises(UnknownName, match="inplace"):
+            start_pose("near", poses()[0], self.UNITS, self.CAMERAS, rng)
+        assert KINDS == ("none", "easy", "hard", "inplace", "random")
+
+
+def dotted_shot() -> tuple[Shot, np.ndarray]:
+    """A dark photo with a bright dot where each of some points is seen."""
+    camera = Intrinsics(160, 120, 130.0, 140.0, 85.0, 57.0)
+    pose = poses()[2]
+    points_in_camera = np.array([[-0.2, -0.15, 1.0], [0.25, -0.1, 1.2], [0.05, 0.2, 0.9], [-0.15, 0.2, 1.1]])
+    rows, columns = np.mgrid[:120, :160]
+    rgb = np.zeros((120, 160, 3), np.float32)
+    for x, y in project(points_in_camera, camera):
+        rgb += np.exp(-((columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2) / 8)[..., None].astype(np.float32)
+    return Shot(rgb, camera, pose), transformed(pose.world_from_camera, points_in_camera)
+
+
+class TestModifications:
+    @pytest.mark.parametrize(
+        "specs",
+        [["roll=90"], ["roll=-90"], ["roll=180"], ["roll=23"], ["crop=0.8"], ["roll=45", "crop=0.9"], ["jpeg=90"]],
+    )
+    def test_truth_goes_with_the_pixels(self, specs):
+        """The dots must lie where the new camera projects the points from the new pose."""
+        shot, points_in_world = dotted_shot()
+        shot = modified(shot, specs, np.random.default_rng(0))
+        assert shot.rgb.shape == (shot.intrinsics.height, shot.intrinsics.width, 3)
+        expected = project(transformed(shot.pose.camera_from_world, points_in_world), shot.intrinsics)
+        for x, y in expected:
+            left, top = int(x) - 6, int(y) - 6
+            window = shot.rgb[top : top + 13, left : left + 13, 1].astype(float)
+            window = np.where(window > 0.1, window, 0)
+            rows, columns = np.mgrid[top : top + 13, left : left + 13]
+            found = [(window * (c + 0.5)).sum() / window.sum() for c in (columns, rows)]
+            assert np.abs(np.array(found) - [x, y]).max() < 0.1  # seen: 0.06; half a pixel would be 0.5
+
+    def test_quarter_turns_lose_nothing(self):
+        rgb = np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32)
+        shot = Shot(rgb, Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), poses()[0])
+        for spec, turned in (
+            ("roll=90", np.rot90(rgb, 1)),
+            ("roll=-90", np.rot90(rgb, -1)),
+            ("roll=180", rgb[::-1, ::-1]),
+        ):
+            found = modified(shot, [spec], np.random.default_rng(0)).rgb
+            assert np.allclose(found, turned, atol=1e-5), spec
+
+    def test_values(self):
+        rgb = np.full((40, 60, 3), 0.4, np.float32)
+        shot = Shot(rgb, Intrinsics(60, 40, 50.0, 50.0, 30.0, 20.0), poses()[0])
+        rng = np.random.default_rng(0)
+        assert np.allclose(modified(shot, ["gain=1.5"], rng).rgb, 0.6)
+        assert np.allclose(modified(shot, ["gain=4"], rng).rgb, 1.0)
+        assert np.allclose(modified(shot, ["gamma=2"], rng).rgb, 0.16)
+        assert np.allclose(modified(shot, ["blur=3"], rng).rgb, 0.4, atol=1e-6)
+        assert modified(shot, ["noise=0.1"], rng).rgb.std() == pytest.approx(0.1, rel=0.05)
+        covered = np.any(modified(shot, ["occlude=0.3"], rng).rgb != np.float32(0.4), axis=2).mean()
+        assert 0.28 < covered < 0.4  # squares of up to 10 x 10 of 2400 pixels overshoot a little
+        assert np.allclose(modified(shot, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
+
+    def test_blur_has_its_width(self):
+        """A bright point becomes a Gaussian of the given sigma, in pixels of a photo 800 wide."""
+        rgb = np.zeros((81, 401, 3), np.float32)
+        rgb[40, 200] = 1
+        shot = Shot(rgb, Intrinsics(401, 81, 300.0, 300.0, 200.5, 40.5), poses()[0])
+        row = modified(shot, ["blur=4"], np.random.default_rng(0)).rgb[:, :, 0].sum(0)
+        columns = np.arange(401) - 200
+        assert row.sum() == pytest.approx(1, abs=1e-5)
+        assert np.sqrt((row * columns**2).sum()) == pytest.approx(4 * 401 / 800, rel=0.03)
+
+    @pytest.mark.parametrize("name", MODIFICATIONS)
+    def test_all_take_both_ends_of_their_range(self, name):
+        shot, _ = dotted_shot()
+        for value in MODIFICATIONS[name][:2]:
+            found = modified(shot, [f"{name}={value}"], np.random.default_rng(0))
+            assert found.rgb.dtype == np.float32
+            assert np.isfinite(found.rgb).all()
+            assert found.rgb.shape[:2] == (found.intrinsics.height, found.intrinsics.width)
+
+    def test_the_file_is_without_loss(self, tmp_path):
+        (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
+        data, camera = photo_bytes(one, ("crop=1",), (0.0, 0.0, 0.0), 0)
+        assert camera.intrinsics == one.camera.intrinsics
+        assert np.array_equal(read_query(data).rgb, read_query(one.path.read_bytes()).rgb)
+        same, _ = photo_bytes(one, (), (0.0, 0.0, 0.0), 0)
+        assert same == one.path.read_bytes()
+
+
+class TestRoom:
+    def test_same_every_time(self):
+        a, b = render_bench.synthetic_room(500), render_bench.synthetic_room(500)
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert np.array_equal(getattr(a, name), getattr(b, name))
+        assert (a.count, a.sh_degree) == (500, 3)
+        assert np.allclose(np.linalg.norm(a.quats, axis=1), 1, atol=1e-6)
+
+    def test_cameras_are_inside_and_see_7_to_10_percent(self):
+        room = render_bench.synthetic_room(20_000)
+        shares = []
+        for camera in render_bench.room_cameras(400):
+            assert camera.intrinsics.width * 3 == camera.intrinsics.height * 4
+            assert np.all(np.abs(camera.pose.position_in_world) < render_bench.ROOM / 2)
+            points = transformed(camera.pose.camera_from_world, room.means)
+            px = project(points, camera.intrinsics)
+            reach = 3 * room.scales.max(1) / np.maximum(points[:, 2], 0.01) * camera.intrinsics.fx
+            seen = np.all((px > -reach[:, None]) & (px < [400, 300] + reach[:, None]), axis=1) & (points[:, 2] > 0.01)
+            shares.append(seen.mean())
+        assert min(shares) > 0.07
+        assert max(shares) < 0.12
+
+    def test_flat_gaussians_lie_in_their_walls(self):
+        room = render_bench.synthetic_room(2000)
+        on_ceiling = np.isclose(room.means[:, 2], 1.5)
+        thin = rotation_from_quat(room.quats[on_ceiling])[:, :, 2]
+        assert on_ceiling.sum() > 100
+        assert np.allclose(np.abs(thin[:, 2]), 1, atol=1e-5)
+
+    def test_run(self, monkeypatch):
+        class Backend:
+            """The gradients are of the camera that was rendered last."""
+
+            name = "fake"
+
+            def __init__(self, scene):
+                assert scene.info.training_focal_px == render_bench.room_cameras(16)[0].intrinsics.fx
+
+            def render(self, cameras):
+                self.camera = cameras[-1]
+
+            def pose_gradient(self, camera, d_rgb, d_depth=None, d_alpha=None):
+                assert camera is self.camera
+                assert d_rgb.shape == (12, 16, 3)
+
+            scene_gradients = pose_gradient
+
+        module = type("module", (), {"create": Backend})
+        monkeypatch.setattr(render_bench.RASTERIZERS, "load", lambda name: module)
+        monkeypatch.setattr(render_bench.os, "cpu_count", lambda: 2)
+        clock = iter(np.arange(0, 1e4, 0.5))  # every call takes half a second
+        monkeypatch.setattr(render_bench.time, "perf_counter", lambda: next(clock))
+        rows = render_bench.run(repeats=2, cases=((50, 16),))
+        assert [(r["stage"], r["threads"]) for r in rows] == [
+            ("forward", 1),
+            ("pose_gradient", 1),
+            ("all_gradients", 1),
+            ("forward", 2),
+        ]
+        assert [r["ms_min"] for r in rows] == [r["ms_median"] for r in rows] == [500, 500, 500, pytest.approx(500 / 6)]
+        assert {k: rows[0][k] for k in ("gaussians", "sh_degree", "width", "height")} == {
+            "gaussians": 50, "sh_degree": 3, "width": 16, "height": 12,
+        }  # fmt: skip
+
+
+def test_encode_image():
+    rgb = np.random.default_rng(0).integers(0, 255, (40, 50, 3), np.uint8)
+    assert np.array_equal(read_query(encode_image(rgb, "png")).rgb, rgb)
+    assert np.array_equal(read_query(encode_image(rgb.astype(np.float32) / 255, "png")).rgb, rgb)
+    assert len(encode_image(rgb, quality=20)) < len(encode_image(rgb, quality=90))
