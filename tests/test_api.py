@@ -26,7 +26,7 @@ from PIL import Image
 import service.estimators
 from service.api.app import create_app
 from service.api.settings import Settings
-from service.interfaces import Features, Frame
+from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
@@ -37,7 +37,7 @@ TURNED = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 
 """A camera at (1, 2, 3), turned by 90 degrees about z."""
 
 
-class FlatRasterizer:
+class FlatRasterizer(Rasterizer):
     """Every picture is mid-grey."""
 
     name = "flat"
@@ -48,7 +48,7 @@ class FlatRasterizer:
         return [Frame(np.stack([f, f, f], 2), f, f, f) for f in flat]
 
 
-class BlindMatcher:
+class BlindMatcher(Matcher):
     """Sees nothing."""
 
     name = "blind"
@@ -72,7 +72,7 @@ def make_scene(name: str = "room", count: int = 5) -> LoadedScene:
         info=SceneInfo(name, name.title(), "ab" * 32, "ply"),
         cameras=(NamedCamera("images/a.jpg", camera),),
     )
-    return LoadedScene(scene, FlatRasterizer(), BlindMatcher())  # type: ignore[arg-type]
+    return LoadedScene(scene, FlatRasterizer(), BlindMatcher())
 
 
 @contextmanager

@@ -151,11 +151,11 @@ def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
         raise InvalidOptions(message, where=f"options.{where}") from error
 
 
-_ADAPTERS: dict[type, TypeAdapter[Any]] = {}
+_ADAPTERS: dict[type, TypeAdapter] = {}
 _ADAPTERS_LOCK = threading.Lock()
 
 
-def options_adapter(kind: type) -> TypeAdapter[Any]:
+def options_adapter(kind: type) -> TypeAdapter:
     """Return what checks and describes an estimator's `Options`, made once.
 
     Behind a lock: for the fields' docstrings pydantic parses source code, which Python 3.11 doesn't do safely in

@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from service.api.schemas import JobState
 from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound
@@ -157,6 +157,7 @@ class Job:
                 wake()
 
 
+@runtime_checkable
 class Executor(Protocol):
     """Where jobs run: here threads; machines, if one is not enough, fit behind the same four calls."""
 

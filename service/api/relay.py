@@ -11,7 +11,7 @@ import asyncio
 import logging
 from collections.abc import Coroutine
 from contextlib import suppress
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import httpx
 from fastapi import APIRouter, Request, Response, WebSocket
@@ -27,6 +27,7 @@ _CONTENT_HEADERS = ("content-type", "content-encoding", "cache-control", "etag")
 _TRY_AGAIN_LATER = 1013
 
 
+@runtime_checkable
 class Upstream(Protocol):
     port: int
     """On loopback; whether anybody listens there is found out by trying."""
