@@ -522,6 +522,9 @@ class TestWithoutPhotos:
         assert same_photo("r_0.png", "train/r_0")
         assert not same_photo("test/r_0.png", "train/r_0.png")
         assert not same_photo("10.png", "0.png")
+        assert same_photo("../images/1.jpg", "images\\1.png")
+        for odd in ("", ".", "/", ".."):
+            assert not same_photo(odd, "1.png")
 
 
 def colmap_folder(folder: Path, kind: str, scale: float = 1.0) -> Path:

@@ -22,7 +22,7 @@ from service.images import read_query
 from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request, localize
 from service.scene_formats import load_scene
-from service.types import Camera, Pose, PoseEstimate, Query
+from service.types import Camera, Pose, PoseEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,28 +66,16 @@ def run(
 
     def answer(trial: Trial) -> PoseEstimate:
         given = trial.truth.intrinsics if intrinsics == "given" else None
-        query: Query = read_query(trial.data, intrinsics=given, prior=trial.start, background_rgb=background)
+        query = read_query(trial.data, intrinsics=given, prior=trial.start, background_rgb=background)
         return localize(query, loaded, Request(estimator=estimator, seed=seed))
 
     outcomes, per_query = measure(todo, answer, units, progress)
-    return {
-        "scene": loaded.scene.info.name,
-        "estimator": estimator,
-        "start": start,
-        **summary(outcomes),
-        "photos": len(photos),
-        "trials": trials,
-        "seed": seed,
-        "intrinsics": intrinsics,
-        "cameras": cameras,
-        "modify": list(modify),
-        "training_cameras": len(training),
-        "gaussians": loaded.scene.count,
-        "forward_facing": units.forward_facing,
-        "units_per_scene_unit": units.units_per_scene_unit,
-        "prepare_s": prepare_s,
-        "per_query": per_query,
-    }
+    asked = {"estimator": estimator, "start": start, "trials": trials, "seed": seed}
+    asked |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
+    facts = {"photos": len(photos), "training_cameras": len(training), "gaussians": loaded.scene.count}
+    facts |= {"forward_facing": units.forward_facing, "units_per_scene_unit": units.units_per_scene_unit}
+    facts |= {"prepare_s": prepare_s}
+    return {"scene": loaded.scene.info.name, **asked, **facts, **summary(outcomes), "per_query": per_query}
 
 
 def measure(

@@ -31,9 +31,8 @@ log = logging.getLogger(__name__)
 def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: bool = True) -> GaussianScene:
     """Read a scene folder, or a bare scene file. Raises SceneError.
 
-    `without_photos` are names of photos whose cameras are not even read (a bench's queries); see
-    `same_photo`. With `cameras=False` nothing is taken from the training cameras but the size of their
-    photos.
+    `without_photos` are names of photos whose cameras are not even read (a bench's queries); see `same_photo`.
+    With `cameras=False` nothing is taken from the training cameras but the size of their photos.
     """
     path = Path(path)
     if not path.exists():
@@ -74,9 +73,14 @@ def same_photo(a: str, b: str) -> bool:
 
     "0001.png", "images/0001" and "./data/images/0001.jpg" are the same; "train/r_0" and "test/r_0" are not.
     """
-    parts = [PurePosixPath(name.replace("\\", "/")).with_suffix("").parts for name in (a, b)]
+    parts = [_parts(name) for name in (a, b)]
     shared = min(len(p) for p in parts)
-    return parts[0][-shared:] == parts[1][-shared:]
+    return shared > 0 and parts[0][-shared:] == parts[1][-shared:]
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    path = PurePosixPath(name.replace("\\", "/"))
+    return (*path.parts[:-1], path.stem) if path.name else path.parts
 
 
 @dataclass(frozen=True, slots=True)
