@@ -28,15 +28,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import bpy
-import numpy as np
-from mathutils import Matrix
-
 import cameras
 import furniture
+import numpy as np
 import outputs
 import room
 import shapes
 from cameras import View
+from mathutils import Matrix
 
 SEED = 7
 TRAINING = 120
@@ -132,8 +131,7 @@ def take_all(jobs: list[tuple[View, Path]], camera: bpy.types.Object) -> None:
         now = time.monotonic()
         left = (now - start) / k * (len(missing) - k)
         print(
-            f"{path.parent.name}/{path.name} {now - before:.1f} s, "
-            f"{k}/{len(missing)}, {left / 60:.1f} min left",
+            f"{path.parent.name}/{path.name} {now - before:.1f} s, {k}/{len(missing)}, {left / 60:.1f} min left",
             flush=True,
         )
 
@@ -149,9 +147,7 @@ def lens_of(modification: str) -> tuple[int, int, float]:
 def main() -> None:
     """Command line entry."""
     parser = argparse.ArgumentParser(description="Make the photos of the studio scene.")
-    parser.add_argument(
-        "--out", type=Path, default=Path(__file__).parent / "build", help="work folder"
-    )
+    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "build", help="work folder")
     parser.add_argument("--only", choices=("all", "train", "heldout"), default="all")
     options = parser.parse_args()
     out: Path = options.out

@@ -11,10 +11,9 @@ from math import cos, sin
 
 import bpy
 import numpy as np
+import room
 from mathutils import Vector
 from mathutils.bvhtree import BVHTree
-
-import room
 
 Array = np.ndarray
 Rng = np.random.Generator
@@ -202,7 +201,4 @@ def heldout_views(space: Room, rng: Rng, training: list[View], lenses: list[tupl
     while len(picks) < len(lenses):
         gaps = np.linalg.norm(keys[:, None] - keys[picks][None], axis=2).min(axis=1)
         picks.append(int(np.argmax(gaps)))
-    return [
-        View(f"photo_{k:02d}", *lens, pool[pick])
-        for k, (lens, pick) in enumerate(zip(lenses, picks, strict=True))
-    ]
+    return [View(f"photo_{k:02d}", *lens, pool[pick]) for k, (lens, pick) in enumerate(zip(lenses, picks, strict=True))]

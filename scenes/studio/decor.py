@@ -5,9 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 
 import bpy
-import numpy as np
-
 import materials
+import numpy as np
 import objects
 import prints
 import shapes

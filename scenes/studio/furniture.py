@@ -6,15 +6,14 @@ from dataclasses import dataclass
 from math import cos, pi, sin
 
 import bpy
-import numpy as np
-from mathutils import Matrix, Vector
-
 import decor
 import materials
+import numpy as np
 import objects
 import prints
 import shapes
 import textures
+from mathutils import Matrix, Vector
 
 Rng = np.random.Generator
 Material = bpy.types.Material
@@ -277,9 +276,7 @@ def plinth_and_pouf(stock: Stock) -> None:
     """Plaster ring standing on a plinth in the south-west corner, and a pouf before it."""
     rng = stock.rng
     stone = textures.plaster(400, 500, (0.72, 0.66, 0.60), rng)
-    shapes.box(
-        "plinth", (0.36, 0.36, 0.80), (0.55, 0.50, 0.40), materials.picture("plinth", stone, 0.8)
-    )
+    shapes.box("plinth", (0.36, 0.36, 0.80), (0.55, 0.50, 0.40), materials.picture("plinth", stone, 0.8))
     ring = shapes.torus("plaster_ring", 0.15, 0.055, (0, 0, 0), stock.gypsum)
     upright = Matrix.Rotation(0.7, 4, "Z") @ Matrix.Rotation(pi / 2, 4, "X")
     ring.matrix_world = Matrix.Translation((0.55, 0.50, 1.003)) @ upright

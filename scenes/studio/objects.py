@@ -5,13 +5,12 @@ from __future__ import annotations
 from math import cos, pi, sin
 
 import bpy
-import numpy as np
-from mathutils import Matrix, Vector
-
 import materials
+import numpy as np
 import prints
 import shapes
 import textures
+from mathutils import Matrix, Vector
 
 Rng = np.random.Generator
 Material = bpy.types.Material
@@ -55,9 +54,7 @@ def books(
     row_of_books.data.polygons.foreach_set("material_index", kinds)
 
 
-def pile(
-    name: str, place: Place, turn: float, printed: list[Material], paper: Material, rng: Rng
-) -> None:
+def pile(name: str, place: Place, turn: float, printed: list[Material], paper: Material, rng: Rng) -> None:
     """Lying books, one for each of the printed covers, the first at the bottom."""
     z = place[2]
     for k, cover in enumerate(printed):
@@ -226,9 +223,7 @@ def cups(top: float, rng: Rng) -> None:
         shapes.lathe(f"cup{k}", [*profile, (0, 0.012)], (x, y, top), skin)
 
 
-def frame(
-    name: str, origin: Place, right: Place, size: tuple, image: np.ndarray, wood: Material
-) -> None:
+def frame(name: str, origin: Place, right: Place, size: tuple, image: np.ndarray, wood: Material) -> None:
     """Framed picture on a wall: lower left corner, unit vector along the lower edge, (w, h)."""
     r, o = Vector(right), Vector(origin)
     out = r.cross(Vector((0, 0, 1)))

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
-
 import cameras
+import numpy as np
 import photos
 from cameras import Room, View
 
@@ -107,9 +106,7 @@ def check_poses(out: Path, space: Room, views: list[View], points: Array) -> Non
         photo = photos.read(out / "train" / f"{view.name}.png")
         u, v, depth = cameras.project(view, points[:, :3].astype(float))
         inside = (depth > 0.3) & (u > 3) & (u < view.width - 3) & (v > 3) & (v < view.height - 3)
-        near = [
-            k for k in np.flatnonzero(inside)[::3] if space.sees(view.pose[:3, 3], points[k, :3])
-        ]
+        near = [k for k in np.flatnonzero(inside)[::3] if space.sees(view.pose[:3, 3], points[k, :3])]
         for name, (du, dv) in shifts.items():
             seen = bilinear(photo, u[near] + du, v[near] + dv)
             differences[name].append(np.abs(seen - points[near, 3:]).mean(axis=1))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageDraw, ImageFilter
-
 from cameras import View
+from PIL import ExifTags, Image, ImageDraw, ImageFilter
 
 Array = np.ndarray
 
@@ -34,9 +33,7 @@ def expose(photo: Array, which: int) -> Array:
 def noise(height: int, width: int, cell: int, rng: np.random.Generator) -> Array:
     """Smooth coloured noise, 0..1."""
     small = rng.integers(0, 255, (height // cell + 2, width // cell + 2, 3), dtype=np.uint8)
-    return (
-        np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC)) / 255
-    )
+    return np.asarray(Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC)) / 255
 
 
 def person(draw: ImageDraw.ImageDraw, w: int, h: int, size: float) -> None:
@@ -64,9 +61,7 @@ def parcels(draw: ImageDraw.ImageDraw, w: int, h: int, size: float) -> None:
     """Two boxes held into the picture, with a pattern that the scene does not have."""
     a, b = w * 0.42 * size, h * 0.62 * size
     x, y = w * 0.60, h * 0.72
-    draw.polygon(
-        [(x, y - b / 2), (x + a, y - b / 3), (x + a * 0.9, y + b), (x - a * 0.1, y + b)], 255
-    )
+    draw.polygon([(x, y - b / 2), (x + a, y - b / 3), (x + a * 0.9, y + b), (x - a * 0.1, y + b)], 255)
     draw.rectangle((0, 0, a * 0.55, b * 0.5), fill=255)
 
 

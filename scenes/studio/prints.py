@@ -6,7 +6,6 @@ Arrays are (height, width, 3), sRGB values in 0..1, row 0 at the top of the pict
 from __future__ import annotations
 
 import numpy as np
-
 from textures import CREAM, INK, PALETTE, Array, Rng, blend, cells, fbm, grid, ramp, step
 
 
@@ -17,9 +16,7 @@ def globe(rng: Rng) -> Array:
     y, x = grid(h, w)
     # Fade the seam towards sea so that both ends of the map meet.
     land = land * np.clip(np.minimum(x, w - x) / 40, 0, 1)
-    high = ramp(
-        fbm((h, w), (40, 40), rng), [(0.42, 0.52, 0.25), (0.80, 0.68, 0.40), (0.62, 0.42, 0.27)]
-    )
+    high = ramp(fbm((h, w), (40, 40), rng), [(0.42, 0.52, 0.25), (0.80, 0.68, 0.40), (0.62, 0.42, 0.27)])
     image = ramp(fbm((h, w), (60, 60), rng), [(0.15, 0.36, 0.50), (0.33, 0.58, 0.66)])
     mask = step(land, 0.54, 0.02)
     image = blend(image, high, mask)
@@ -62,9 +59,7 @@ def poster_mountains(h: int, w: int, rng: Rng) -> Array:
     sun = np.hypot(x - w * 0.62, y - h * 0.34)
     image = blend(image, (0.98, 0.93, 0.76), 1 - step(sun, w * 0.17, 2))
     for k in range(6):
-        ridge = h * (0.42 + 0.1 * k) - h * 0.22 * (
-            fbm((1, w), (1, w * (0.6 - 0.07 * k)), rng, 6) - 0.4
-        )
+        ridge = h * (0.42 + 0.1 * k) - h * 0.22 * (fbm((1, w), (1, w * (0.6 - 0.07 * k)), rng, 6) - 0.4)
         tone = ramp(np.array(k / 5), [(0.74, 0.50, 0.45), (0.45, 0.32, 0.42), (0.11, 0.16, 0.24)])
         grain = 0.85 + 0.3 * fbm((h, w), (20, 50), rng, 3)
         image = blend(image, tone * grain[..., None], step(y - ridge, 0, 2))

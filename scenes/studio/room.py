@@ -5,13 +5,12 @@ from __future__ import annotations
 from math import pi
 
 import bpy
-import numpy as np
-from mathutils import Vector
-
 import materials
+import numpy as np
 import prints
 import shapes
 import textures
+from mathutils import Vector
 
 SIZE = (5.0, 4.0, 2.7)  # metres; x runs east, y north, z up
 PER_METRE = 330  # texture pixels a metre on walls and floor
@@ -35,9 +34,7 @@ def floor_and_ceiling(rng: np.random.Generator) -> None:
     lx, ly, lz = SIZE
     w, h = int(lx * PER_METRE), int(ly * PER_METRE)
     oak = [(0.66, 0.47, 0.30), (0.58, 0.40, 0.25), (0.71, 0.53, 0.35), (0.50, 0.34, 0.22)]
-    floor = materials.picture(
-        "floor", textures.planks(h, w, 30, oak, rng), roughness=0.42, bump=0.8
-    )
+    floor = materials.picture("floor", textures.planks(h, w, 30, oak, rng), roughness=0.42, bump=0.8)
     shapes.quad("floor", (0, 0, 0), (lx, 0, 0), (0, ly, 0), floor)
     white = [(0.86, 0.83, 0.76), (0.80, 0.77, 0.70), (0.89, 0.86, 0.80)]
     boards = materials.picture("ceiling", textures.planks(h, w, 22, white, rng, 700), roughness=0.8)
@@ -117,12 +114,8 @@ def door(rng: np.random.Generator) -> None:
     """Panelled door with frame and brass knob."""
     x0, x1, top = DOOR
     mid = (x0 + x1) / 2
-    paint = materials.picture(
-        "door", textures.painted(500, 700, (0.23, 0.38, 0.36), rng), 0.4, box_scale=0.8
-    )
-    frame = materials.picture(
-        "door_frame", textures.painted(400, 500, (0.84, 0.78, 0.66), rng), 0.5, box_scale=0.9
-    )
+    paint = materials.picture("door", textures.painted(500, 700, (0.23, 0.38, 0.36), rng), 0.4, box_scale=0.8)
+    frame = materials.picture("door_frame", textures.painted(400, 500, (0.84, 0.78, 0.66), rng), 0.5, box_scale=0.9)
     shapes.box("door", (x1 - x0, 0.05, top), (mid, 0.025, top / 2), paint)
     for z, tall in ((0.42, 0.52), (1.05, 0.44), (1.66, 0.56)):
         for side in (-0.19, 0.19):
@@ -138,18 +131,14 @@ def door(rng: np.random.Generator) -> None:
 def skirting(rng: np.random.Generator) -> None:
     """Skirting boards along the walls, leaving out the door."""
     lx, ly, _ = SIZE
-    paint = materials.picture(
-        "skirting", textures.painted(300, 900, (0.72, 0.66, 0.55), rng), 0.5, box_scale=0.7
-    )
+    paint = materials.picture("skirting", textures.painted(300, 900, (0.72, 0.66, 0.55), rng), 0.5, box_scale=0.7)
     shapes.box("skirt_n", (lx, 0.02, 0.11), (lx / 2, ly - 0.01, 0.055), paint)
     shapes.box("skirt_s", (DOOR[0] - 0.09, 0.02, 0.11), ((DOOR[0] - 0.09) / 2, 0.01, 0.055), paint)
     shapes.box("skirt_w", (0.02, ly, 0.11), (0.01, ly / 2, 0.055), paint)
     shapes.box("skirt_e", (0.02, ly, 0.11), (lx - 0.01, ly / 2, 0.055), paint)
 
 
-def area_light(
-    name: str, place: tuple, turn: tuple, size: tuple, watts: float, colour: tuple
-) -> None:
+def area_light(name: str, place: tuple, turn: tuple, size: tuple, watts: float, colour: tuple) -> None:
     """Rectangular light that cameras do not see."""
     data = bpy.data.lights.new(name, "AREA")
     data.shape = "RECTANGLE"

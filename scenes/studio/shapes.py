@@ -58,9 +58,7 @@ def box(
     return thing
 
 
-def quad(
-    name: str, origin: Point, right: Point, up: Point, material: bpy.types.Material
-) -> bpy.types.Object:
+def quad(name: str, origin: Point, right: Point, up: Point, material: bpy.types.Material) -> bpy.types.Object:
     """Picture plane: lower left corner, and the vectors along its lower and left edges."""
     o, r, u = Vector(origin), Vector(right), Vector(up)
     corners = [o, o + r, o + r + u, o + u]
@@ -74,12 +72,7 @@ def smooth_profile(profile: Sequence[Point], steps: int) -> list[tuple[float, fl
     for k in range(1, len(pts) - 2):
         a, b, c, d = pts[k - 1 : k + 3]
         for t in np.linspace(0, 1, steps, endpoint=False):
-            p = 0.5 * (
-                2 * b
-                + (c - a) * t
-                + (2 * a - 5 * b + 4 * c - d) * t**2
-                + (3 * b - a - 3 * c + d) * t**3
-            )
+            p = 0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
             out.append((max(float(p[0]), 0.0), float(p[1])))
     return [*out, (float(pts[-1][0]), float(pts[-1][1]))]
 
@@ -96,17 +89,13 @@ def lathe(
     curve = smooth_profile(profile, steps) if steps > 1 else list(profile)
     rows = len(curve)
     vertices = [
-        (r * cos(2 * pi * k / segments), r * sin(2 * pi * k / segments), z)
-        for r, z in curve
-        for k in range(segments)
+        (r * cos(2 * pi * k / segments), r * sin(2 * pi * k / segments), z) for r, z in curve for k in range(segments)
     ]
     faces, uvs = [], []
     for i in range(rows - 1):
         for k in range(segments):
             n = (k + 1) % segments
-            faces.append(
-                (i * segments + k, i * segments + n, (i + 1) * segments + n, (i + 1) * segments + k)
-            )
+            faces.append((i * segments + k, i * segments + n, (i + 1) * segments + n, (i + 1) * segments + k))
             u0, u1, v0, v1 = k / segments, (k + 1) / segments, i / (rows - 1), (i + 1) / (rows - 1)
             uvs += [(u0, v0), (u1, v0), (u1, v1), (u0, v1)]
     thing = add_mesh(name, vertices, faces, material, uvs, smooth=steps > 1)
@@ -178,16 +167,11 @@ def tube(
     return thing
 
 
-def torus(
-    name: str, major: float, minor: float, centre: Point, material: bpy.types.Material
-) -> bpy.types.Object:
+def torus(name: str, major: float, minor: float, centre: Point, material: bpy.types.Material) -> bpy.types.Object:
     """Ring lying flat."""
     n, m = 56, 24
     ring = [(2 * pi * i / n, 2 * pi * j / m) for i in range(n) for j in range(m)]
-    vertices = [
-        ((major + minor * cos(b)) * cos(a), (major + minor * cos(b)) * sin(a), minor * sin(b))
-        for a, b in ring
-    ]
+    vertices = [((major + minor * cos(b)) * cos(a), (major + minor * cos(b)) * sin(a), minor * sin(b)) for a, b in ring]
     faces = [
         (i * m + j, (i + 1) % n * m + j, (i + 1) % n * m + (j + 1) % m, i * m + (j + 1) % m)
         for i in range(n)
@@ -225,9 +209,7 @@ def leaves(
             out = reach * t * (1 - 0.25 * rise * t)
             up = reach * (rise * 1.5 * t - 0.95 * t * t)
             for side in (-1, 1):
-                vertices.append(
-                    Vector(centre) + around @ Vector((out, side * half, up + 0.25 * abs(half)))
-                )
+                vertices.append(Vector(centre) + around @ Vector((out, side * half, up + 0.25 * abs(half))))
         for i in range(rows - 1):
             a = base + 2 * i
             faces.append((a, a + 1, a + 3, a + 2))

@@ -104,9 +104,7 @@ def plaster(height: int, width: int, colour: tuple, rng: Rng, contrast: float = 
     return np.clip(blend(image, image * 0.78, contrast * 0.6 * specks), 0, 1)
 
 
-def planks(
-    height: int, width: int, rows: int, colours: list[tuple], rng: Rng, mean_length: float = 420
-) -> Array:
+def planks(height: int, width: int, rows: int, colours: list[tuple], rng: Rng, mean_length: float = 420) -> Array:
     """Boards running along x, each with its own tone and its own stretch of grain."""
     image = np.zeros((height, width, 3))
     edges = np.linspace(0, height, rows + 1).astype(int)
@@ -212,9 +210,7 @@ def rug(height: int, width: int, rng: Rng) -> Array:
     inset = np.minimum(np.minimum(y, height - y), np.minimum(x, width - x))
     along = np.where(np.minimum(y, height - y) < np.minimum(x, width - x), x, y)
     picks = rng.integers(0, len(PALETTE), 400)
-    blocks = PALETTE[
-        picks[(along / 23).astype(int) + 80 * (y > height / 2) + 160 * (x > width / 2)]
-    ]
+    blocks = PALETTE[picks[(along / 23).astype(int) + 80 * (y > height / 2) + 160 * (x > width / 2)]]
     image = np.where((inset < 46)[..., None], blocks, image)
     image = blend(image, INK, (np.abs(inset - 46) < 4).astype(float))
     image = blend(image, CREAM, (inset < 10).astype(float))
@@ -242,9 +238,7 @@ def painted(height: int, width: int, tone: tuple, rng: Rng) -> Array:
     """Brushed, worn paint over wood."""
     shape = (height, width)
     streaks = fbm(shape, (4, 120), rng, 4) - 0.5
-    image = (
-        np.asarray(tone) * (1 + 0.35 * streaks + 0.2 * (fbm(shape, (80, 80), rng) - 0.5))[..., None]
-    )
+    image = np.asarray(tone) * (1 + 0.35 * streaks + 0.2 * (fbm(shape, (80, 80), rng) - 0.5))[..., None]
     chips = step(fbm(shape, (26, 40), rng, 5), 0.80, 0.05)
     return np.clip(blend(image, (0.66, 0.52, 0.36), chips), 0, 1)
 
