@@ -1,9 +1,10 @@
 """PlayCanvas' compressed .ply: chunks of 256 Gaussians with bounds, four packed uint32 each, SH as bytes.
 
-position, scale: 11 + 10 + 11 bits between the chunk's bounds (scales as logarithms); colour: 4 x 8 bits,
-the last is the opacity; rotation: 2 bits say which component is the largest, 3 x 10 bits are the others in
-+-1/sqrt(2). Our own decoder, because the one in gsply checks no bounds and runs on numba's thread pool,
-which ends the process when two threads enter it; gsply is the peer in the tests.
+Position, scale: 11 + 10 + 11 bits between the chunk's bounds (scales as logarithms); colour: 4 x 8 bits, the last is
+the opacity; rotation: 2 bits say which component is the largest, 3 x 10 bits are the others in +-1/sqrt(2).
+
+Our own decoder: gsply's checks no bounds, and runs on numba's default thread pool, which is documented as not safe
+for concurrent callers. A file that gsply wrote is the golden one in the tests.
 """
 
 from __future__ import annotations
