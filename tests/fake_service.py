@@ -9,7 +9,8 @@ from __future__ import annotations
 import io
 import re
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 
@@ -50,6 +51,18 @@ def jpeg(rgb: tuple[int, int, int], width: int = PHOTO.width, height: int = PHOT
 def render_rgb(index: int, *, matched: bool) -> tuple[int, int, int]:
     """The colour of a fake render: tells which record it is of, and from which camera."""
     return (200 if matched else 20, (40 * index) % 256, 90)
+
+
+def until(condition: Callable[[], object], what: str, seconds: float = 20.0) -> None:
+    """Wait for another thread's work."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain: {what}"
+        time.sleep(0.01)
+
+
+def threads(name: str) -> list[threading.Thread]:
+    return [t for t in threading.enumerate() if t.name == name]
 
 
 def orbit(share: float) -> Pose:
@@ -138,9 +151,7 @@ class FakeJob:
 
     def out(self) -> JobOut:
         versions = {"splatfix": "0"}
-        result = self.estimate and result_out(
-            self.estimate, Timing(stage="decode", wall_s=0, cpu_s=0), versions
-        )
+        result = self.estimate and result_out(self.estimate, Timing(stage="decode", wall_s=0, cpu_s=0), versions)
         links = dict.fromkeys(JobLinks.model_fields, "/")
         return JobOut(
             id=self.id,

@@ -91,10 +91,7 @@ class JobView:
     photo: Intrinsics
     """Of the image that `Service.photo` returns."""
     answer: Answer | None
-
-    @property
-    def finished(self) -> bool:
-        return self.state in FINISHED
+    """None until it has ended."""
 
 
 class Service:

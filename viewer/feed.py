@@ -43,6 +43,8 @@ class JobFeed:
         self.trouble = ""
         """Why nothing comes, in words; empty while all is well."""
         self.listeners: set[Listener] = set()
+        self.complete = False
+        """All records are here, and the answer."""
         self._service = service
         self._stop = threading.Event()
         self._photo: UInt8[np.ndarray, "h w 3"] | None = None
@@ -55,10 +57,6 @@ class JobFeed:
     def stop(self) -> None:
         """Let the thread end at the next event or ping."""
         self._stop.set()
-
-    @property
-    def finished(self) -> bool:
-        return self.job is not None and self.job.finished
 
     def photo(self) -> UInt8[np.ndarray, "h w 3"]:
         """Return the job's photo, fetched once. Raises ServiceTrouble, ValueError."""
@@ -81,13 +79,12 @@ class JobFeed:
         return image
 
     def _follow(self) -> None:
-        while not self._stop.is_set() and not self.finished:
+        while not self._stop.is_set() and not self.complete:
             try:
-                self.job = self._service.job(self.id)
+                self.job, self.trouble = self._service.job(self.id), ""
                 self._tell()
                 for event in self._service.events(self.id, self._stop):
                     self._take(event)
-                self.trouble = ""
             except (ServiceTrouble, ValueError, KeyError) as error:
                 gone = isinstance(error, ServiceTrouble) and error.status == 404
                 log.warning("job %s: %s", self.id, error)
@@ -99,7 +96,7 @@ class JobFeed:
 
     def _take(self, event: IterationRecord | JobView) -> None:
         if isinstance(event, JobView):
-            self.job = event
+            self.job, self.complete = event, True
         elif event.index == len(self.records):  # after a broken stream they come again from the first one on
             self.records.append(event)
         else:

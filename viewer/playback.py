@@ -170,5 +170,5 @@ def _padded(inner: str) -> str:
     return f"<div style='padding:.2em .6em;font-size:.9em;line-height:1.5'>{inner}</div>"
 
 
-def _or_dash(value: float | None, spec: str, unit: str = "") -> str:
+def _or_dash(value: float | int | None, spec: str, unit: str = "") -> str:
     return "–" if value is None else f"{value:{spec}}{unit}"

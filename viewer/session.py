@@ -47,6 +47,7 @@ class Session:
         self._shown: tuple[str, int] | None = None
         """Job and record that the 3D shows."""
         self._picture_due = False
+        self._asked_step = 0
         self._todo: list[Action] = []
         self._ready = threading.Condition()
         self._closed = False
@@ -112,7 +113,7 @@ class Session:
         panel = self.panel
         self._on_user(panel.jobs, self._user_chose_job)
         self._on_user(panel.newest, self._user_chose_newest)
-        self._on_user(panel.step, self._user_moved_slider)
+        self._on_user(panel.step, self._user_moved_slider, self._remember_slider)
         self._on_user(panel.matches, self._show_picture)
         self._on_user(panel.weight, self._show_picture)
         for layer, box in panel.layers.items():
@@ -126,9 +127,20 @@ class Session:
         command("Previous step", hotkey="P").on_trigger(lambda _: self.post(lambda: self._press("◀ previous")))
         command("Play or pause", hotkey="space").on_trigger(lambda _: self.post(lambda: self._press("play / pause")))
 
-    def _on_user(self, widget: Any, action: Action) -> None:
-        """Post the action when the user, not this program, has changed the widget."""
-        widget.on_update(lambda event: self.post(action) if event.client is not None else None)
+    def _on_user(self, widget: Any, action: Action, at_once: Action | None = None) -> None:
+        """Post the action when the user, not this program, has changed the widget; `at_once` runs before that."""
+
+        async def changed(event: Any) -> None:  # async: runs on viser's own loop, not in its pool of threads
+            if event.client is not None:
+                if at_once is not None:
+                    at_once()
+                self.post(action)
+
+        widget.on_update(changed)
+
+    def _remember_slider(self) -> None:
+        """Note what the user asked for: a running job moves the slider, too, perhaps before this is looked at."""
+        self._asked_step = self.panel.step.value
 
     def _jobs_changed(self) -> None:
         self.post(self._sync_jobs)
@@ -242,7 +254,7 @@ class Session:
 
     def _user_moved_slider(self) -> None:
         self._playback.playing = False
-        self._playback.go(self.panel.step.value)
+        self._playback.go(self._asked_step)
         self._show()
 
     def _press(self, button: str) -> None:

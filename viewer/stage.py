@@ -138,7 +138,7 @@ class Stage:
         largest = float(splats.covariances[:, [0, 3, 5]].max(initial=1e-12))
         k = 200.0 / np.sqrt(largest)
         self._nodes["splats"]["splats"] = self._client.scene.add_gaussian_splats(
-            "/scene/splats",
+            "/splats/splats",
             centers=splats.centres * np.float32(k),
             covariances=shapes.full_covariances(splats.covariances * np.float32(k * k)),
             rgbs=splats.rgba[:, :3],

@@ -1,0 +1,345 @@
+"""The viewer without a browser: what it reads, what it draws, what it tells viser; live, and for several people."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import cv2
+import fake_service
+import httpx
+import numpy as np
+import pytest
+from fake_service import PHOTO, FakeService, orbit, records, render_rgb, threads, until
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.api.convert import record_out
+from service.api.splats import importance, packed_splats
+from service.geometry import project, transformed
+from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Reason, Status
+from viewer import draw, shapes
+from viewer.client import Answer, JobView, Service, ServiceTrouble, parsed_record, parsed_splats, sse_events
+from viewer.feed import JobFeed, Library
+from viewer.playback import Playback, headline_html, record_html, scene_html
+
+# ---------------------------------------------------------------- what the service says
+
+
+@pytest.mark.parametrize("record", [*records(2), replace(records(1)[0], matches=None, candidates=None, loss=None)])
+def test_records_survive_the_wire(record: IterationRecord) -> None:
+    back = parsed_record(record_out(record).model_dump(mode="json"))
+    np.testing.assert_array_equal(back.pose.world_from_camera, record.pose.world_from_camera)
+    for name in ("stage", "index", "elapsed_s", "loss", "num_matches", "num_inliers", "step_deg", "step_units"):
+        assert getattr(back, name) == getattr(record, name)
+    for name, parts in (
+        ("matches", ("photo_px", "render_px", "inlier")),
+        ("candidates", ("world_from_camera", "scores")),
+    ):
+        ours, theirs = getattr(back, name), getattr(record, name)
+        assert (ours is None) == (theirs is None)
+        for part in parts if theirs is not None else ():
+            np.testing.assert_array_equal(getattr(ours, part), getattr(theirs, part))
+            assert getattr(ours, part).dtype == getattr(theirs, part).dtype
+
+
+def test_splats_are_read_as_the_service_packs_them() -> None:
+    scene = fake_service.scene(40)
+    splats = parsed_splats(packed_splats(scene, 25))
+    best = np.argsort(-importance(scene), kind="stable")[:25]
+    assert splats.total == 40
+    np.testing.assert_array_equal(splats.centres, scene.means[best])
+    full = shapes.full_covariances(splats.covariances)
+    np.testing.assert_array_equal(full, full.transpose(0, 2, 1))
+    # Isotropic in the fake scene: 0.05^2 on the diagonal; 1e-9 seen.
+    np.testing.assert_allclose(full, np.tile(0.05**2 * np.eye(3), (25, 1, 1)), atol=1e-8)
+    assert np.all(splats.rgba[:, 3] == round(0.9 * 255))
+    with pytest.raises(ValueError, match="bytes for 25 splats"):
+        parsed_splats(packed_splats(scene, 25)[:-1])
+
+
+def test_server_sent_events() -> None:
+    # Comments, several data lines, an event without data (dropped) and one without a name: as the standard has it.
+    text = ": ping\n\nevent: record\nid: 0\ndata: one\ndata: two\n\nevent: empty\n\ndata:  spaced\n\n"
+    assert list(sse_events(iter(text.split("\n")))) == [("", ""), ("record", "one\ntwo"), ("message", " spaced")]
+
+
+def test_troubles_name_the_path_and_the_status() -> None:
+    service = Service("http://fake", FakeService().transport)
+    with pytest.raises(ServiceTrouble, match=r"^/jobs/nope: HTTP 404$") as told:
+        service.job("nope")
+    assert told.value.status == 404
+    refused = httpx.MockTransport(lambda request: (_ for _ in ()).throw(httpx.ConnectError("refused")))
+    with pytest.raises(ServiceTrouble, match="refused") as told:
+        Service("http://fake", refused).jobs()
+    assert told.value.status is None
+
+
+# ---------------------------------------------------------------- which record is shown
+
+
+@given(st.lists(st.one_of(st.sampled_from(["toggle", "tick", "grow"]), st.integers(-50, 50)), max_size=40))
+def test_playback_stays_within_the_records(moves: list[str | int]) -> None:
+    playback, count = Playback(), 0
+    for move in moves:
+        if move == "grow":
+            count += 3
+            playback.grow(count)
+        elif isinstance(move, int):
+            playback.go(move) if move % 2 else playback.step(move)
+        else:
+            getattr(playback, move)()
+        assert 0 <= playback.index <= max(0, count - 1)
+        assert not (playback.playing and count < 2)
+
+
+def test_playback_follows_a_live_job_until_someone_looks_back() -> None:
+    playback = Playback()
+    playback.grow(5)
+    assert playback.index == 4
+    playback.step(-2)
+    playback.grow(8)
+    assert playback.index == 2
+    playback.go(7)
+    playback.grow(9)
+    assert playback.index == 8
+
+
+def test_play_starts_over_at_the_end_and_stops_there() -> None:
+    playback = Playback()
+    playback.grow(3)
+    playback.toggle()
+    seen = [playback.index]
+    while playback.playing:
+        playback.tick()
+        seen.append(playback.index)
+    assert seen == [0, 1, 2]
+
+
+# ---------------------------------------------------------------- what is drawn
+
+
+@given(st.floats(0, 1), st.floats(0.1, 3), st.integers(40, 900), st.integers(40, 900))
+def test_frusta_project_onto_the_corners_of_their_images(share: float, depth: float, width: int, height: int) -> None:
+    k = Intrinsics(width, height, 300.0, 320.0, 0.4 * width, 0.6 * height)
+    pose = orbit(share)
+    segments = shapes.frusta(shapes.stacked([pose]), [k], depth)
+    rim = segments[4:, 0]  # the first four edges lead from the apex to the corners
+    in_camera = transformed(pose.camera_from_world, rim)
+    np.testing.assert_allclose(in_camera[:, 2], depth, rtol=1e-5)
+    corners = [(0, 0), (width, 0), (width, height), (0, height)]
+    np.testing.assert_allclose(project(in_camera, k), corners, atol=2e-2)  # float32 points: 4e-3 px seen
+    np.testing.assert_allclose(segments[:4, 0], np.tile(pose.position_in_world, (4, 1)), atol=1e-6)
+
+
+def test_no_poses_give_empty_drawings() -> None:
+    assert shapes.frusta(shapes.stacked([]), [], 1.0).shape == (0, 2, 3)
+    assert draw.score_colours(np.zeros(0)).shape == (0, 3)
+
+
+@given(st.floats(0.3, 3), st.floats(-3, 3))
+def test_looking_through_a_camera_shows_its_whole_image(aspect: float, roll: float) -> None:
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
+    pose = replace(orbit(0.2), world_from_camera=orbit(0.2).world_from_camera @ turn)
+    scene = shapes.extent(
+        np.zeros((0, 3), np.float32), [Camera(PHOTO, orbit(s)) for s in (0.0, 0.3, 0.6)], (0.0, 0.0, 1.0)
+    )
+    view = shapes.through(Camera(PHOTO, pose), scene, aspect)
+    forward = view.look_at - view.position
+    forward /= np.linalg.norm(forward)
+    np.testing.assert_allclose(forward, pose.axis_in_world, atol=1e-9)
+    # The browser's camera: y towards up, made orthogonal to the viewing direction. Its roll is the photo's.
+    up = view.up - (view.up @ forward) * forward
+    np.testing.assert_allclose(up / np.linalg.norm(up), -pose.world_from_camera[:3, 1], atol=1e-6)
+    # In units of the viewport's half height the image's corners lie within it, and touch it on one side.
+    reach = np.tan(view.fov_rad / 2)
+    x, y = 0.5 * PHOTO.width / PHOTO.fx / reach / aspect, 0.5 * PHOTO.height / PHOTO.fy / reach
+    assert max(x, y) == pytest.approx(1, abs=1e-9)
+
+
+def test_extent_ignores_floaters_and_survives_an_empty_scene() -> None:
+    points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    points[:20] *= 1000
+    found = shapes.extent(points, [], None)
+    assert found.radius < 4  # the 90 % quantile of a normal cloud is 2.5
+    np.testing.assert_array_equal(found.up, [0, 0, 1])
+    assert shapes.extent(np.zeros((0, 3), np.float32), [], None).radius == 1.0
+
+
+def test_up_comes_from_the_scene_else_from_its_cameras() -> None:
+    cameras = [Camera(PHOTO, orbit(s)) for s in (0, 0.25, 0.5, 0.75)]
+    nothing = np.zeros((0, 3), np.float32)
+    np.testing.assert_allclose(shapes.extent(nothing, cameras, None).up, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(shapes.extent(nothing, cameras, (0.0, -2.0, 0.0)).up, [0, -1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("width", "height"), [(300, 400), (400, 300), (200, 200), (64, 900)])
+def test_match_lines_end_where_the_matches_are(width: int, height: int) -> None:
+    # Black pictures, each with one white pixel; the match between them must be drawn from the one to the other.
+    photo, render = np.zeros((height, width, 3), np.uint8), np.zeros((height // 2, width // 2, 3), np.uint8)
+    at_photo, at_render = (width // 3, height // 4), (width // 4, height // 5)
+    photo[at_photo[1], at_photo[0]] = 255
+    render[at_render[1], at_render[0]] = 255
+    camera = Camera(Intrinsics(width // 2, height // 2, 100, 100, width / 4, height / 4), orbit(0))
+    pixels = [np.float32([p]) + np.float32(0.5) for p in (at_photo, at_render)]
+    spots = [_centre(draw.side_by_side(photo * a, render * (1 - a)), 30) for a in (1, 0)]
+    plain = draw.side_by_side(photo * 0, render * 0)
+    lined = draw.side_by_side(photo * 0, render * 0, MatchVectors(*pixels, np.array([True]), camera))
+    drawn = np.abs(lined.astype(int) - plain).max(-1) > 100
+    rows, columns = np.nonzero(drawn)
+    for x, y in spots:
+        nearest = np.hypot(columns + 0.5 - x, rows + 0.5 - y).min()
+        assert nearest < 3, (x, y)  # the dot's radius is 4
+    # And nowhere beyond: the line lies in the box that the two ends span, but for the dots.
+    (x0, y0), (x1, y1) = np.min(spots, 0) - 6, np.max(spots, 0) + 6
+    assert columns.min() > x0
+    assert columns.max() < x1
+    assert rows.min() > y0
+    assert rows.max() < y1
+
+
+def _centre(picture: np.ndarray, above: int) -> np.ndarray:
+    """The centre of what is bright, left out the window's grey ground."""
+    weight = picture[..., 0].astype(float) * (picture[..., 0] != 36) * (picture[..., 0] > above)
+    rows, columns = np.nonzero(weight)
+    return np.array(
+        [
+            np.average(columns + 0.5, weights=weight[rows, columns]),
+            np.average(rows + 0.5, weights=weight[rows, columns]),
+        ]
+    )
+
+
+def test_inliers_and_outliers_differ_in_colour() -> None:
+    grey, camera = np.full((60, 80, 3), 90, np.uint8), Camera(Intrinsics(80, 60, 80, 80, 40, 30), orbit(0))
+    px = np.float32([[40, 30]])
+    green, red = (draw.side_by_side(grey, grey, MatchVectors(px, px, np.array([ok]), camera)) for ok in (True, False))
+    spot = np.unravel_index(np.abs(green.astype(int) - red).sum(-1).argmax(), green.shape[:2])
+    assert green[spot][1] > green[spot][0] + 50
+    assert red[spot][0] > red[spot][1] + 50
+
+
+def test_overlays_compare_pixel_by_pixel() -> None:
+    photo, render = np.full((30, 40, 3), 100, np.uint8), np.full((15, 20, 3), 180, np.uint8)
+    inside = (100, 400)
+    assert draw.overlaid("blend", photo, render, 0.25)[inside].tolist() == [120, 120, 120]
+    assert draw.overlaid("difference", photo, render)[inside].tolist() == [160, 160, 160]
+    assert draw.overlaid("difference", photo, photo)[inside].max() == 0
+    assert draw.overlaid("difference", photo * 0, render + 70)[inside].max() == 255  # doubled, not wrapped round
+
+
+def test_decoding_and_scaling() -> None:
+    image = draw.decode(fake_service.jpeg((200, 100, 50)))
+    assert np.abs(image.reshape(-1, 3).mean(0) - [200, 100, 50]).max() < 3  # RGB, not BGR
+    assert draw.reduced(image, 48).shape == (32, 48, 3)
+    for garbage in (b"", b"not an image"):
+        with pytest.raises(ValueError, match="not an image"):
+            draw.decode(garbage)
+
+
+def test_better_scores_are_brighter() -> None:
+    colours = draw.score_colours(np.linspace(-3, 5, 50))
+    lightness = cv2.cvtColor(colours[None], cv2.COLOR_RGB2LAB)[0, :, 0].astype(int)
+    assert np.all(np.diff(lightness) >= 0)
+    assert lightness[-1] - lightness[0] > 100
+    assert np.array_equal(draw.score_colours(np.array([2.0, 2.0])), draw.score_colours(np.array([0.0, 1.0]))[[1, 1]])
+
+
+def test_texts_escape_what_others_wrote() -> None:
+    answer = Answer("not_localized", "few_features", "Take it <sharper>.", 0.1, 3)
+    job = JobView("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, answer)
+    text = headline_html(job, 4, "")
+    assert "not localized" in text
+    assert "few features, score 0.10, 3 inliers" in text
+    assert "Take it &lt;sharper&gt;." in text
+    for html in (text, headline_html(job, 0, "<i>"), scene_html("<b>", 1, 2, 3)):
+        assert not {"<b>", "<s>", "<i>", "<sharper>"} & {html[m:n] for m in range(len(html)) for n in (m + 3, m + 9)}
+    assert "–" in record_html(replace(records(1)[0], loss=None))
+
+
+# ---------------------------------------------------------------- following jobs
+
+
+def test_a_feed_follows_a_job_to_its_end() -> None:
+    fake = FakeService()
+    job = fake.job("a", 2)
+    feed = JobFeed(Service("http://fake", fake.transport), "a")
+    feed.start()
+    until(lambda: len(feed.records) == 2, "what there was before")
+    job.add(records(3)[2])
+    until(lambda: len(feed.records) == 3, "what came then")
+    assert feed.job is not None
+    assert feed.job.answer is None
+    job.finish(Status.UNCERTAIN, Reason.FEW_INLIERS)
+    until(lambda: feed.complete, "the end")
+    assert feed.job.answer is not None
+    assert (feed.job.answer.status, feed.job.answer.inliers) == ("uncertain", 212)
+    assert feed.job.answer.hint
+    until(lambda: not threads("feed-a"), "the thread's end")
+
+
+def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = FakeService()
+    job = fake.job("b", 4)
+    whole, breaks = job.events, iter([True, False])
+
+    def events() -> Iterator[bytes]:
+        broken = next(breaks)
+        for count, chunk in enumerate(whole()):
+            if broken and count == 2:
+                raise httpx.ReadError("cut")
+            yield chunk
+
+    monkeypatch.setattr(job, "events", events)
+    feed = JobFeed(Service("http://fake", fake.transport), "b")
+    troubles: list[str] = []
+    feed.listeners.add(lambda: troubles.append(feed.trouble))
+    feed.start()
+    job.finish()
+    until(lambda: feed.complete, "the end")
+    assert any("cut" in t for t in troubles)
+    assert [r.index for r in feed.records] == [0, 1, 2, 3]
+    assert feed.trouble == ""
+
+
+def test_a_job_that_is_gone_is_told_and_not_asked_for_again() -> None:
+    fake = FakeService()
+    feed = JobFeed(Service("http://fake", fake.transport), "gone")
+    feed.start()
+    until(lambda: feed.trouble and not threads("feed-gone"), "the thread's end")
+    assert "no job gone" in feed.trouble
+    assert fake.asked == ["/jobs/gone"]
+
+
+def test_a_feed_is_shared_and_ends_with_its_last_listener() -> None:
+    fake = FakeService()
+    fake.job("c", 1)
+    library = Library(Service("http://fake", fake.transport))
+
+    def one() -> None: ...
+    def two() -> None: ...
+
+    feed = library.follow("c", one)
+    assert library.follow("c", two) is feed
+    library.leave(feed, one)
+    assert threads("feed-c")
+    library.leave(feed, two)
+    until(lambda: not threads("feed-c"), "the thread's end")
+    assert library.follow("c", one) is not feed
+    library.close()
+
+
+def test_pictures_and_scenes_are_fetched_once() -> None:
+    fake = FakeService()
+    fake.job("d", 3)
+    library = Library(Service("http://fake", fake.transport))
+    assert library.scene("ball") is library.scene("ball")
+    feed = JobFeed(library.service, "d")
+    pose, matched = feed.render(1, matched=False), feed.render(1, matched=True)
+    for image, is_matched in ((pose, False), (matched, True)):
+        # JPEG: 2 seen.
+        assert np.abs(image.reshape(-1, 3).mean(0) - render_rgb(1, matched=is_matched)).max() < 4
+    assert feed.render(1, matched=False) is pose
+    assert feed.photo() is feed.photo()
+    assert len(fake.asked) == len(set(fake.asked)) + 1  # the two renders have the same path

@@ -1,0 +1,236 @@
+"""The viewer as a browser meets it: real sessions on a real viser server, spoken to over its socket."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+from fake_browser import FakeBrowser
+from fake_service import FakeService, records, render_rgb, threads, until
+
+from service.types import Reason, Status
+from viewer import app, draw, shapes
+from viewer.app import Viewer, job_of
+from viewer.client import Service
+
+
+@pytest.fixture
+def fake() -> FakeService:
+    return FakeService()
+
+
+@pytest.fixture
+def viewer(fake: FakeService) -> Iterator[Viewer]:
+    viewer = Viewer(Service("http://fake", fake.transport), "127.0.0.1", 0)
+    yield viewer
+    viewer.stop()
+
+
+def _browser(viewer: Viewer, path: str = "/") -> FakeBrowser:
+    return FakeBrowser(viewer.server.get_port(), path)
+
+
+def test_a_finished_job_is_shown_by_its_address(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("old", 4, finished=True)
+    fake.job("new", 2)
+    with _browser(viewer, "/jobs/old") as browser:
+        browser.wait(lambda: "localized" in browser.text() and browser.widget("step")["max"] == 3, "the answer")
+        browser.wait(lambda: "without view-dependent colour" in browser.text(), "the scene's line")
+        assert "300 splats" in browser.text()
+        names = (
+            {"/splats/splats", "/training cameras/cameras"}
+            | {f"/trajectory/{n}" for n in ("path", "steps", "initial", "current", "final")}
+            | {"/candidates/candidates"}
+        )
+        browser.wait(lambda: names <= set(browser.nodes), "the nodes")
+        assert browser.nodes["/trajectory/final"]["props"]["color"] == [60, 180, 90]
+        assert browser.nodes["/trajectory/current"]["props"]["_image_data"]
+        assert not browser.nodes["/trajectory/initial"]["props"]["_image_data"]
+        assert browser.widget("follow newest")["value"] is False
+        browser.wait(lambda: "old" in browser.widget("job")["value"], "the job's line in the list")
+
+
+def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: FakeService, viewer: Viewer) -> None:
+    with _browser(viewer) as browser:
+        browser.wait(lambda: "/splats/splats" in browser.nodes and "first job" in browser.text(), "the empty scene")
+        job = fake.job("first", 1)
+        browser.wait(lambda: "/trajectory/current" in browser.nodes, "the new job")
+        assert "running" in browser.text()
+        assert "/trajectory/final" not in browser.nodes
+        for record in records(6)[1:]:
+            job.add(record)
+        browser.wait(lambda: browser.widget("step")["value"] == 5, "the newest step")
+        job.finish(Status.NOT_LOCALIZED, Reason.FEW_FEATURES)
+        browser.wait(lambda: "few features" in browser.text() and "sharper" in browser.text(), "reason and hint")
+        browser.wait(lambda: "/trajectory/final" in browser.nodes, "the final camera")
+        fake.job("second", 2, finished=True)
+        browser.wait(lambda: "second" in browser.widget("job")["value"], "the next job, by itself")
+        browser.wait(lambda: browser.widget("step")["max"] == 1, "its steps")
+
+
+def _render_shown(browser: FakeBrowser) -> np.ndarray:
+    """The colour of the render in the picture: low and to the right, where the fake matches have no lines."""
+    image = next(w for w in browser.widgets.values() if w["type"] == "GuiImageMessage")
+    picture = draw.decode(bytes(image["_data"]))
+    return picture[int(0.95 * picture.shape[0]), int(0.93 * picture.shape[1])].astype(int)
+
+
+def test_steps_change_picture_pose_and_numbers(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 5, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+
+        def shows(rgb: tuple[int, int, int]) -> bool:
+            return bool(np.abs(_render_shown(browser) - rgb).max() < 6)  # two rounds of JPEG: 3 seen
+
+        browser.wait(lambda: shows(render_rgb(4, matched=True)), "the last picture")
+        for label, value, index in (("step", 1, 1), ("", "next ▶", 2), ("", "◀ previous", 1), ("step", 0, 0)):
+            browser.set(label, value)
+            browser.wait(lambda k=index: f">{100 + k}<" in browser.text(), f"the numbers of step {index}")
+            browser.wait(lambda k=index: shows(render_rgb(k, matched=True)), f"the picture of step {index}")
+            assert browser.widget("step")["value"] == index
+            position = browser.nodes["/trajectory/current"]["position"]
+            np.testing.assert_allclose(position, records(5)[index].pose.position_in_world, atol=1e-6)
+        browser.set("match vectors", False)
+        browser.wait(lambda: shows(render_rgb(0, matched=False)), "the render at the pose")
+        browser.set("compare", "difference")
+        browser.wait(lambda: "doubled" in browser.text(), "the difference")
+        assert browser.widget("match vectors")["visible"] is False
+        browser.set("compare", "blend")
+        browser.wait(lambda: browser.widget("render's share")["visible"], "the blend")
+        browser.set("render's share", 1.0)
+        browser.wait(lambda: shows(render_rgb(0, matched=False)), "nothing but the render")
+        browser.set("render's share", 0.0)
+        browser.wait(lambda: shows((120, 160, 200)), "nothing but the photo")
+
+
+def test_layers_can_be_hidden_and_stay_hidden(fake: FakeService, viewer: Viewer) -> None:
+    job = fake.job("j", 2)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: "/trajectory/current" in browser.nodes, "the job")
+        (client,) = viewer.server.get_clients().values()
+        shown = lambda: {n: h.visible for n, h in client.scene._handle_from_node_name.items()}  # noqa: E731
+        browser.set("trajectory", False)
+        browser.set("training cameras", False)
+        browser.wait(lambda: not shown()["/trajectory/current"] and not shown()["/training cameras/cameras"], "hiding")
+        job.add(records(3)[2])
+        browser.wait(lambda: browser.widget("step")["value"] == 2, "the next record")
+        browser.wait(lambda: not any(v for n, v in shown().items() if n.startswith("/trajectory/")), "still hidden")
+        assert shown()["/splats/splats"]
+
+
+def test_nothing_grows_however_long_a_job_is(fake: FakeService, viewer: Viewer) -> None:
+    job = fake.job("long", 5)
+    with _browser(viewer, "/jobs/long") as browser:
+        browser.wait(lambda: browser.widget("step")["max"] == 4 and "agree" in browser.text(), "the start")
+        (client,) = viewer.server.get_clients().values()
+        count = lambda: (len(client.scene._handle_from_node_name), len(browser.widgets))  # noqa: E731
+        before = count()
+        for record in records(80)[5:]:
+            job.add(record)
+        browser.wait(lambda: browser.widget("step")["value"] == 79, "80 steps")
+        assert count() == before
+
+
+def test_browsers_do_not_disturb_one_another_and_leave_nothing(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("one", 3)
+    fake.job("two", 6)
+    names = ("feed-one", "feed-two", "browser-0", "browser-1")
+    with _browser(viewer, "/jobs/one") as first, _browser(viewer, "/jobs/two") as second:
+        first.wait(lambda: first.widget("step")["value"] == 2 and "agree" in first.text(), "the first job")
+        second.wait(lambda: second.widget("step")["value"] == 5 and "agree" in second.text(), "the second job")
+        second.set("step", 1)
+        second.wait(lambda: ">101<" in second.text(), "the second browser's step")
+        assert first.widget("step")["value"] == 2
+        assert all(threads(name) for name in names)
+    until(lambda: not any(threads(name) for name in names), "the end of all threads")
+    assert not viewer._sessions
+    assert not viewer._library._feeds
+
+
+def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("aaa", 2, finished=True)
+    fake.job("bbb", 3, finished=True)
+    with _browser(viewer) as browser:
+        browser.wait(
+            lambda: "bbb" in browser.widget("job")["value"] and browser.widget("step")["max"] == 2, "the newest"
+        )
+        label = next(o for o in browser.widget("job")["options"] if "aaa" in o)
+        browser.set("job", label)
+        browser.wait(lambda: browser.widget("step")["max"] == 1, "the chosen job")
+        assert browser.widget("follow newest")["value"] is False
+        fake.job("ccc", 5)
+        browser.wait(lambda: any("ccc" in o for o in browser.widget("job")["options"]), "the new job in the list")
+        assert browser.widget("job")["value"] == label
+        browser.set("follow newest", True)
+        browser.wait(lambda: browser.widget("step")["max"] == 4, "the newest job again")
+
+
+def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 3, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: not browser.widget("look through this camera")["disabled"], "the job")
+        browser.set("step", 1)
+        browser.wait(lambda: ">101<" in browser.text(), "step 1")
+        (client,) = viewer.server.get_clients().values()
+        browser.set("look through this camera", True)
+        there = records(3)[1].pose.position_in_world
+        browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "looking through")
+        browser.set("fly to result", True)
+        goal = shapes.behind(records(3)[-1].pose, viewer._library.scene("ball").extent)
+        browser.wait(lambda: np.allclose(client.camera.position, goal.position, atol=1e-6), "arrival")
+        np.testing.assert_allclose(client.camera.look_at, goal.look_at, atol=1e-6)
+
+
+def test_an_unknown_job_is_told(viewer: Viewer) -> None:
+    with _browser(viewer, "/jobs/unknown") as browser:
+        browser.wait(lambda: "no job unknown" in browser.text(), "the message")
+
+
+@pytest.mark.parametrize("forbidden", [True, False])
+def test_no_browser_can_open_a_public_tunnel(
+    fake: FakeService, monkeypatch: pytest.MonkeyPatch, *, forbidden: bool
+) -> None:
+    asked = threading.Event()
+    monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: asked.set())
+    if not forbidden:  # shows that the message is the right one: without the ban it has its effect
+        monkeypatch.setattr(app, "forbid_sharing", lambda server: None)
+    viewer = Viewer(Service("http://fake", fake.transport), "127.0.0.1", 0)
+    try:
+        with _browser(viewer) as browser:
+            browser.send(type="ShareUrlRequest")
+            browser.wait(lambda: "first job" in browser.text(), "what is sent after")
+            assert asked.wait(0.3) is not forbidden
+    finally:
+        viewer.stop()
+
+
+def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
+    stopped = threading.Event()
+    other: Any = object.__new__(viser.ViserServer)
+    other._websock_server, other.stop = SimpleNamespace(_handlers={}), stopped.set
+    with pytest.raises(RuntimeError, match="tunnel"):
+        app.forbid_sharing(other)
+    assert stopped.is_set()
+
+
+def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
+    with pytest.raises(OSError, match="is taken"):
+        Viewer(Service("http://fake", fake.transport), "127.0.0.1", viewer.server.get_port())
+
+
+@pytest.mark.parametrize(
+    ("path", "job"),
+    [("/jobs/abc", "abc"), ("/jobs/abc/", "abc"), ("/jobs/abc?x=1", "abc"), ("/", None), ("/jobs/", None)]
+    + [(p, None) for p in ("/jobs/../etc", "/jobs/a/b", "/jobs/%2e%2e", "/x/jobs/abc", "/jobs/" + 65 * "a")],
+)
+def test_only_plain_ids_are_taken_from_an_address(path: str, job: str | None) -> None:
+    assert job_of(path) == job
+
+
+def test_a_path_that_cannot_be_told_means_the_newest_job(viewer: Viewer) -> None:
+    assert app.requested_path(viewer.server, 12345) == "/"
