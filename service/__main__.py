@@ -18,7 +18,6 @@ import typer
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
-from rich.table import Table
 
 from service import __version__
 from service.errors import InvalidRequest, SplatfixError
@@ -264,7 +263,11 @@ def bench_localize(
     _write_json(json_file, outcome)
     for name, value in outcome.items():
         if name != "per_query":
-            out.print(f"{name:28} {value}", markup=False, highlight=False)
+            out.print(f"{name:28} {_short(value)}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 @bench_app.command("render")
@@ -279,10 +282,8 @@ def bench_render(
     with _progress() as progress:
         outcome = run(repeats=repeats, progress=_counter(progress, "cases"))
     _write_json(json_file, outcome)
-    table = Table(*outcome[0].keys())
-    for row in outcome:
-        table.add_row(*(f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()))
-    out.print(table)
+    for row in [outcome[0].keys(), *(row.values() for row in outcome)]:
+        out.print(" ".join(f"{_short(value):>13}" for value in row), highlight=False, soft_wrap=True)
 
 
 @scenes_app.command("list")
@@ -311,10 +312,16 @@ def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or sc
 
 
 @app.command()
-def doctor() -> None:
+def doctor(
+    warm: Annotated[bool, typer.Option("--warm", help="Compile every kernel first: a minute, once.")] = False,
+) -> None:
     """Say what runs on this machine, and why the rest doesn't."""
     from service.doctor import findings
+    from service.doctor import warm as compile_kernels
 
+    if warm:
+        with err.status("compiling"):
+            compile_kernels()
     healthy = True
     with err.status("examining"):
         for finding in findings():
@@ -366,7 +373,7 @@ def _loaded(scene: Path, estimator: str | None = None) -> LoadedScene:
 def _tell_machine() -> None:
     from service.doctor import processor
 
-    err.print(processor(), markup=False, highlight=False)
+    err.print(processor(), markup=False, highlight=False, soft_wrap=True)
 
 
 def _progress() -> Progress:

@@ -16,10 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from service import __version__
+from service.bench.render import room_cameras, synthetic_room
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, DEFAULT_RASTERIZER
 from service.matchers import MATCHERS
+from service.pose.alignment import align
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
@@ -36,9 +38,7 @@ class Finding:
 
 def findings() -> Iterator[Finding]:
     """Examine the machine; some of it takes seconds, so one after the other."""
-    yield Finding(
-        "splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}"
-    )
+    yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
     yield _tried("renderer", _try_renderer)
     yield _tried("matcher", _try_matcher)
@@ -47,6 +47,16 @@ def findings() -> Iterator[Finding]:
     yield _package("viser", "the viewer")
     yield _gpu()
     yield _browser()
+
+
+def warm() -> None:
+    """Compile every kernel now, so that nothing has to later: a minute the first time, seconds after that."""
+    (camera,) = room_cameras(64)[:1]
+    rasterizer = RASTERIZERS.load(DEFAULT_RASTERIZER).create(synthetic_room(2000))
+    frame = rasterizer.render([camera])[0]
+    rasterizer.pose_gradient(camera, frame.rgb)
+    rasterizer.scene_gradients(camera, frame.rgb)
+    align((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera.pose, 2)
 
 
 def processor() -> str:
@@ -101,9 +111,7 @@ def _try_matcher() -> str:
 
 def _package(name: str, purpose: str) -> Finding:
     found = importlib.util.find_spec(name.replace("-", "_")) is not None
-    return Finding(
-        purpose, found, f"{name} {metadata.version(name)}" if found else f"{name} is not installed"
-    )
+    return Finding(purpose, found, f"{name} {metadata.version(name)}" if found else f"{name} is not installed")
 
 
 def _plugins() -> Iterator[Finding]:
@@ -118,9 +126,7 @@ def _gpu() -> Finding:
     tool = shutil.which("nvidia-smi")
     if not tool:
         return Finding("GPU", False, "no NVIDIA driver; rendering is on the CPU", needed=False)
-    listed = subprocess.run(
-        [tool, "-L"], capture_output=True, text=True, timeout=20, check=False
-    ).stdout.strip()
+    listed = subprocess.run([tool, "-L"], capture_output=True, text=True, timeout=20, check=False).stdout.strip()
     if importlib.util.find_spec("gsplat") is None:
         return Finding("GPU", False, f"{listed or 'none'}; gsplat is not installed", needed=False)
     return Finding("GPU", bool(listed), listed or "none", needed=False)
@@ -128,6 +134,4 @@ def _gpu() -> Finding:
 
 def _browser() -> Finding:
     found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    return Finding(
-        "browser", found is not None, found or "no Chromium: browser tests are skipped", needed=False
-    )
+    return Finding("browser", found is not None, found or "no Chromium: browser tests are skipped", needed=False)
