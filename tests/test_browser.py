@@ -1,0 +1,169 @@
+"""The viewer in a real browser, through the relay: what a person sees and clicks. Needs Debian's chromium."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import threading
+import time
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import uvicorn
+from fake_service import FakeService, records
+from fastapi import FastAPI
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+from service.api.relay import Relay
+from viewer.app import Viewer
+from viewer.client import Service
+
+CHROMIUM = shutil.which("chromium") or ""
+# WebGL in software, asked for explicitly; no services in the background.
+FLAGS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+]
+PATIENCE_MS = 90_000
+"""Software rendering on a busy machine: 20 s were seen for a first picture."""
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium on this machine"),
+]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def fake() -> FakeService:
+    return FakeService()
+
+
+@pytest.fixture
+def url(fake: FakeService) -> Iterator[str]:
+    """A service that has nothing but the relay to a viewer of the fake service."""
+    viewer = Viewer(Service("http://fake", fake.transport), "127.0.0.1", 0)
+    relay = Relay(SimpleNamespace(port=viewer.server.get_port()))
+    relay_only = FastAPI()
+    relay_only.include_router(relay.router)
+    relay_only.router.add_event_handler("shutdown", relay.close)
+    config = uvicorn.Config(relay_only, port=0, log_level="critical", ws="websockets-sansio", ws_max_size=2**26)
+    server = uvicorn.Server(config)
+    thread = threading.Thread(target=server.run)
+    thread.start()
+    while not server.started:
+        time.sleep(0.01)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}/viewer"
+    server.should_exit = True
+    thread.join()
+    viewer.stop()
+
+
+def opened(browser: Browser, address: str) -> Page:
+    page = browser.new_page(viewport={"width": 1100, "height": 700})
+    page.set_default_timeout(PATIENCE_MS)
+    page.goto(address)
+    return page
+
+
+def step_shown(page: Page) -> str:
+    return page.get_by_role("slider").first.get_attribute("aria-valuenow") or ""
+
+
+def wait_for_step(page: Page, index: int) -> None:
+    # The slider's thumb and, from the fake records, the number of matches.
+    page.get_by_text(str(100 + index), exact=True).wait_for()
+    assert step_shown(page) == str(index)
+
+
+def picture(page: Page) -> str:
+    """The address of the photo beside the render: another one for another picture."""
+    return page.locator("img[src^='blob:']").first.get_attribute("src") or ""
+
+
+def wait_for_other_picture(page: Page, old: str) -> None:
+    deadline = time.monotonic() + PATIENCE_MS / 1000
+    while picture(page) == old:
+        assert time.monotonic() < deadline, "the picture did not change"
+        page.wait_for_timeout(50)
+
+
+def colours_in_3d(page: Page) -> float:
+    """How much the colours differ in the middle of the 3D: 0 for a blank canvas."""
+    shot = np.asarray(Image.open(io.BytesIO(page.locator("canvas").first.screenshot())).convert("RGB"), float)
+    height, width = shot.shape[:2]
+    middle = shot[height // 4 : -height // 4, width // 4 : -width // 4]
+    return float(middle.std((0, 1)).mean())
+
+
+def wait_for_splats(page: Page) -> None:
+    deadline = time.monotonic() + PATIENCE_MS / 1000
+    while (spread := colours_in_3d(page)) < 15:  # 50 seen; 8 with a single splat
+        assert time.monotonic() < deadline, f"the 3D is blank: {spread}"
+        page.wait_for_timeout(100)
+
+
+def test_an_old_job_opens_by_its_address_and_can_be_stepped_through(
+    browser: Browser, fake: FakeService, url: str
+) -> None:
+    fake.job("older", 4, finished=True)
+    fake.job("newer", 2, finished=True)
+    page = opened(browser, f"{url}/jobs/older/")
+    page.get_by_text("localized", exact=True).wait_for()
+    page.get_by_text("15 agree").wait_for()
+    wait_for_step(page, 3)
+    assert page.title() == "splatfix"
+    wait_for_splats(page)
+    first = picture(page)
+    page.get_by_role("button", name="previous").click()
+    wait_for_step(page, 2)
+    wait_for_other_picture(page, first)
+    second = picture(page)
+    page.get_by_role("button", name="difference").click()
+    page.get_by_text("doubled").wait_for()
+    wait_for_other_picture(page, second)
+    page.close()
+
+
+def test_a_new_job_is_followed_while_it_runs(browser: Browser, fake: FakeService, url: str) -> None:
+    page = opened(browser, f"{url}/")
+    page.get_by_text("first job").wait_for()
+    job = fake.job("live", 1)
+    page.get_by_text("running", exact=True).wait_for()
+    for record in records(6)[1:]:
+        job.add(record)
+    wait_for_step(page, 5)
+    job.finish()
+    page.get_by_text("localized", exact=True).wait_for()
+    page.close()
+
+
+def test_two_pages_show_two_jobs(browser: Browser, fake: FakeService, url: str) -> None:
+    fake.job("one", 3, finished=True)
+    fake.job("two", 5, finished=True)
+    one, two = opened(browser, f"{url}/jobs/one/"), opened(browser, f"{url}/jobs/two/")
+    wait_for_step(one, 2)
+    wait_for_step(two, 4)
+    two.get_by_role("button", name="previous").click()
+    wait_for_step(two, 3)
+    assert step_shown(one) == "2"
+    one.close()
+    two.close()
