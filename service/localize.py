@@ -197,5 +197,7 @@ def _timings(records: list[IterationRecord], clock: _Clock) -> tuple[StageTiming
         entry[0] += record.elapsed_s - wall
         entry[1] += record.cpu_s - cpu
         wall, cpu = record.elapsed_s, record.cpu_s
-    spent["verify"] = [clock.wall_s - wall, clock.cpu_s - cpu]
+    entry = spent.setdefault("verify", [0.0, 0.0])
+    entry[0] += clock.wall_s - wall
+    entry[1] += clock.cpu_s - cpu
     return tuple(StageTiming(stage, *times) for stage, times in spent.items())

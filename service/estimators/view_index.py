@@ -3,18 +3,21 @@
     features of the photo -> views that look like it (VLAD) -> matches, lifted to 3D -> PnP
     -> while few agree: render there, match again -> align photometrically on two renders -> verification gate
 
-Only if the gate doesn't accept the answer are the dearer searches tried: a vote of features instead of VLAD, and
-the photo turned by quarters. A prior pose is one more candidate view.
+Only if the gate doesn't accept the answer are the dearer searches tried: the photo turned by a quarter or a half,
+and a vote of features instead of VLAD. A prior pose is one more candidate view. Sizes and rounds are the research's;
+numbers that were measured stand beside the constants.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
+from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Features, Tools
 from service.pose.alignment import align
@@ -49,18 +52,22 @@ SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 
 
+REMATCHES, ALIGNMENTS = 3, 4
+"""Rounds of rendering at the pose and matching, or aligning, with that; at most."""
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     candidates: int = 5
-    """Index views that the photo is matched with in one search."""
-    rematches: int = 3
-    """Rounds of rendering at the pose and matching again, at most, where few matches agree."""
-    alignments: int = 4
-    """Rounds of rendering at the pose and aligning photometrically, at most; 0 leaves the pose as matched."""
+    """Index views that the photo is matched with in one search, 1 to 64."""
     escalate: bool = True
-    """Search on (vote of features, quarter turns) while the verification gate doesn't accept the answer."""
+    """Search on (the photo turned, a vote of features) while the verification gate doesn't accept the answer."""
 
-    __pydantic_config__ = {"extra": "forbid", "use_attribute_docstrings": True}
+    __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.candidates <= 64:
+            raise InvalidOptions(f"must lie in 1..64, is {self.candidates}.", where="candidates")
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
@@ -70,17 +77,17 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
-    best_pose, best_score = None, -1.0
+    answer: tuple[Pose, float] | None = None
     for search in _searches(query, tools, options):
-        last = None
+        last: IterationRecord | None = None
         for last in search:
-            yield last if best_pose is None else replace(last, pose=best_pose)
-        if last is None or last.stage != "align" and best_pose is not None:
-            continue
+            yield last if answer is None else replace(last, pose=answer[0])
+        if last is None or (answer and last.stage != "align"):
+            continue  # the search gave up
         verdict = verify(query, last.pose, tools)
-        if verdict.score > best_score:
-            best_pose, best_score = last.pose, verdict.score
-        yield IterationRecord("verify", best_pose, loss=1.0 - best_score, num_inliers=verdict.inliers)
+        if answer is None or verdict.score > answer[1]:
+            answer = last.pose, verdict.score
+        yield IterationRecord("verify", answer[0], loss=1.0 - answer[1], num_inliers=verdict.inliers)
         if verdict.status is Status.LOCALIZED:
             return
 
@@ -110,16 +117,15 @@ def _search(
     chosen = top(scores, options.candidates)
     views = [index.views[i] for i in chosen]
     poses = np.stack([view.camera.pose.world_from_camera for view in views])
-    yield IterationRecord(
-        stage, views[0].camera.pose, candidates=Candidates(poses, scores[chosen].astype(np.float64))
-    )
-    if query.prior is not None and stage == "retrieve":
+    candidates = Candidates(poses, scores[chosen].astype(np.float64))
+    yield IterationRecord(stage, query.prior or views[0].camera.pose, candidates=candidates)
+    if query.prior and stage == "retrieve":
         views.insert(0, rendered_view(query.prior, query, tools)[0])
     found = yield from _matched(photo, views, query, tools)
     if found and found.num_inliers < STRONG:
-        found = yield from _rematched(found, query, tools, options.rematches)
+        found = yield from _rematched(found, query, tools)
     if found:
-        yield from _aligned(found, query, tools, options.alignments)
+        yield from _aligned(found, query, tools)
 
 
 def _matched(
@@ -136,7 +142,7 @@ def _matched(
         yield _match_record("match", best.pose if best else views[0].camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
-    pooled = Correspondences(*(np.concatenate(part) for part in zip(*map(astuple, seen), strict=True)))
+    pooled = Correspondences.pooled(seen)
     together = _resected(pooled, query, MATCH_ERROR_PX, 2000)
     if together and (best is None or together.num_inliers > best.num_inliers):
         best = together
@@ -146,12 +152,10 @@ def _matched(
     return best
 
 
-def _rematched(
-    found: Resection, query: Query, tools: Tools, rounds: int
-) -> Generator[IterationRecord, None, Resection | None]:
+def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
     """Render at the pose and match with that: a right pose gains matches, a chance one has none there."""
     photo = photo_features(query, tools)
-    for _ in range(rounds):
+    for _ in range(REMATCHES):
         view, _ = rendered_view(found.pose, query, tools)
         matches = correspondences(photo, view, tools.matcher)
         again = _resected(matches, query, REMATCH_ERROR_PX, 500)
@@ -167,10 +171,10 @@ def _rematched(
     return found
 
 
-def _aligned(found: Resection, query: Query, tools: Tools, rounds: int) -> Iterator[IterationRecord]:
+def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Align on a render, render at the result, align again, until a new render would be the same."""
     pose, camera = found.pose, None
-    for round_number in range(rounds):
+    for round_number in range(ALIGNMENTS):
         frame, new_camera = rendered_frame(pose, query, tools, SETTLED_PX if camera else 1.0)
         if new_camera is camera:
             return
@@ -191,9 +195,7 @@ def _aligned(found: Resection, query: Query, tools: Tools, rounds: int) -> Itera
         )
 
 
-def _resected(
-    matches: Correspondences, query: Query, max_error_px: float, max_trials: int
-) -> Resection | None:
+def _resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> Resection | None:
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     return resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, max_trials)
 

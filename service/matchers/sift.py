@@ -21,14 +21,10 @@ class Sift:
         detector = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02)
         keypoints, descriptors = detector.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
         if len(keypoints) == 0:
-            return Features(
-                np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.float32)
-            )
+            return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.float32))
         points = np.array([k.pt for k in keypoints], np.float32)
         scores = np.array([k.response for k in keypoints], np.float32)
-        _, first = np.unique(
-            points, axis=0, return_index=True
-        )  # one orientation a place: indices stay unique
+        _, first = np.unique(points, axis=0, return_index=True)  # one orientation a place: indices stay unique
         order = first[np.argsort(-scores[first], kind="stable")][:limit]
         root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), 1e-9))
         # OpenCV has the centre of the top-left pixel at (0, 0).
@@ -39,5 +35,6 @@ class Sift:
 
 
 def create() -> Sift:
+    """Return a matcher; it has no state."""
     cv2.setNumThreads(1)  # a job runs on one thread
     return Sift()

@@ -84,6 +84,8 @@ def _folded(module: torch.nn.Module) -> torch.nn.Module:
     for name, child in module.named_children():
         if isinstance(child, BasicLayer):
             convolution, normalization, activation = child.layer
+            assert isinstance(convolution, torch.nn.Conv2d)
+            assert isinstance(normalization, torch.nn.BatchNorm2d)
             folded = fuse_conv_bn_eval(convolution, normalization)
             setattr(module, name, torch.nn.Sequential(folded, activation))
         else:
@@ -111,9 +113,7 @@ def _strongest(
     return points[best], scores[best]
 
 
-def _sampled(
-    grid: Float32[np.ndarray, "rows columns d"], at: Float32[np.ndarray, "n 2"]
-) -> Float32[np.ndarray, "n d"]:
+def _sampled(grid: Float32[np.ndarray, "rows columns d"], at: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
     """Bilinear; `at` in units of cells, the centre of the first one at (0.5, 0.5); the border is continued."""
     rows, columns, depth = grid.shape
     x = np.clip(at[:, 0] - 0.5, 0, columns - 1)

@@ -32,9 +32,13 @@ MAX_STEPS = 12
 SIGMA_PX = 0.7
 """Blur of photo and render at each level: renders are softer than photos."""
 MIN_ALPHA = 0.5
+EDGE_PX = 2
+EDGE_JUMP = 0.06
+"""Relative; a surface seen at 80 degrees from its normal changes by 0.02 over two pixels."""
 MAX_PIXELS = 8_000
 """A level with more uses every second, third...: 6000 were as exact as 30000 on the six test scenes."""
 MIN_PIXELS = 200
+FAR = np.float32(1e30)
 SETTLED_PX = 0.005
 
 
@@ -45,16 +49,14 @@ class Alignment:
     """Mean absolute residual (0..1) at the finest level; infinite where too few pixels overlap."""
 
 
-def align(
-    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, start: Pose, levels: int
-) -> Alignment:
+def align(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, start: Pose, levels: int) -> Alignment:
     """Move `start` until the photo agrees with the frame, which `camera` rendered.
 
     The photo has the frame's size and intrinsics. `start` need not be the camera's pose.
     """
     photo_levels = _pyramid(_luma(photo), levels)
     render_levels = _pyramid(_luma(frame.rgb), levels)
-    depth_levels = _depth_pyramid(np.where(frame.alpha > MIN_ALPHA, frame.median_depth, 0.0), levels)
+    depth_levels = _depth_pyramid(_edge_owner_depth(frame), levels)
     state = _State(start.camera_from_world @ camera.pose.world_from_camera)
     loss = np.inf
     for level in reversed(range(levels)):
@@ -81,7 +83,7 @@ def _align_level(
 ) -> float:
     """Run Gauss-Newton at one level, changing `state`; return the mean absolute residual."""
     pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
-    pixels = pixels[:: max(1, len(pixels) // MAX_PIXELS)]
+    pixels = np.ascontiguousarray(pixels[:: max(1, len(pixels) // MAX_PIXELS)])  # one layout: one compilation
     if len(pixels) < MIN_PIXELS:
         return np.inf
     k = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
@@ -134,6 +136,20 @@ def _pyramid(image: Float32[np.ndarray, "h w"], levels: int) -> list[Float32[np.
         height, width = raw[-1].shape
         raw.append(np.asarray(cv2.resize(raw[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)))
     return [np.asarray(cv2.GaussianBlur(level, (0, 0), SIGMA_PX)) for level in raw]
+
+
+def _edge_owner_depth(frame: Frame) -> Float32[np.ndarray, "h w"]:
+    """Return the depth with which each pixel's gradient moves; 0 where nothing is seen.
+
+    An occluding edge moves with what occludes, on both of its sides: within EDGE_PX of a depth edge, or of the
+    object's outline, the nearer depth holds. Without this a blurred photo of an object pulls the camera away
+    (s1 of 26 blurred photos: 0 without, 16 with; medians of sharp ones gain a fifth).
+    """
+    depth = np.where(frame.alpha > MIN_ALPHA, frame.median_depth, np.float32(0))
+    around = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
+    nearest = cv2.erode(np.where(depth > 0, depth, FAR), around)
+    edge = (nearest < FAR) & ((depth == 0) | (depth > (1 + EDGE_JUMP) * nearest))
+    return np.where(edge, nearest, depth).astype(np.float32)
 
 
 def _depth_pyramid(depth: Float32[np.ndarray, "h w"], levels: int) -> list[Float32[np.ndarray, "_ _"]]:

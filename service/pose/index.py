@@ -16,8 +16,8 @@ from jaxtyping import Float32
 
 from service.interfaces import Features, Tools
 from service.pose.retrieval import visual_words, vlad
-from service.pose.views import VIEW_FEATURES, View, render_views
 from service.pose.viewpoints import INDEX_PX, index_cameras
+from service.pose.views import VIEW_FEATURES, View, render_views
 from service.types import Camera, Intrinsics, Pose
 
 VERSION = 1
@@ -49,10 +49,11 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
+    """Render the views, in batches that may use idle cores, and learn the visual words from their features."""
     views: list[View] = []
     for start in range(0, len(cameras), BATCH):
         rendered = render_views(cameras[start : start + BATCH], tools.rasterizer, tools.matcher)
-        views += [view for view, _ in rendered if len(view.points_in_world)]
+        views += [view for view, _ in rendered]
     descriptors = [view.features.descriptors for view in views]
     words = visual_words(np.concatenate(descriptors), tools.rng)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
@@ -81,9 +82,7 @@ def _write(index: ViewIndex, path: Path) -> None:
         "vectors": index.vectors,
         "counts": np.array([len(view.points_in_world) for view in index.views]),
         "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
-        "pinholes": np.array(
-            [(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]
-        ),
+        "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
         "world_from_camera": np.stack([c.pose.world_from_camera for c in cameras]),
         "points_px": np.concatenate([view.features.points_px for view in index.views]),
         "scores": np.concatenate([view.features.scores for view in index.views]),
@@ -93,7 +92,7 @@ def _write(index: ViewIndex, path: Path) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, **arrays)
+            np.savez(file, allow_pickle=False, **arrays)
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
@@ -106,9 +105,8 @@ def _read(path: Path) -> ViewIndex:
     stops = np.cumsum(stored["counts"])
     views = []
     for i, (start, stop) in enumerate(zip(stops - stored["counts"], stops, strict=True)):
-        width, height = (int(v) for v in stored["sizes"][i])
-        intrinsics = Intrinsics(width, height, *(float(v) for v in stored["pinholes"][i]))
+        (width, height), (fx, fy, cx, cy) = stored["sizes"][i].tolist(), stored["pinholes"][i].tolist()
         features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
-        camera = Camera(intrinsics, Pose(stored["world_from_camera"][i]))
+        camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
         views.append(View(camera, features, stored["points_in_world"][start:stop]))
     return ViewIndex(tuple(views), stored["words"], stored["vectors"])

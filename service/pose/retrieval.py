@@ -18,9 +18,7 @@ K_MEANS_SAMPLE = 20_000
 VOTERS = 300
 
 
-def visual_words(
-    descriptors: Float32[np.ndarray, "n d"], rng: np.random.Generator
-) -> Float32[np.ndarray, "words d"]:
+def visual_words(descriptors: Float32[np.ndarray, "n d"], rng: np.random.Generator) -> Float32[np.ndarray, "words d"]:
     """Return the centres of a spherical k-means, at most WORDS."""
     chosen = rng.permutation(len(descriptors))[:K_MEANS_SAMPLE]
     sample = descriptors[chosen]
@@ -35,12 +33,10 @@ def visual_words(
     return words
 
 
-def vlad(
-    descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "words d"]
-) -> Float32[np.ndarray, "size"]:
+def vlad(descriptors: Float32[np.ndarray, "n d"], words: Float32[np.ndarray, "words d"]) -> Float32[np.ndarray, "size"]:
     """Return the image's vector, of unit length; zeros for an image without features."""
     sums = np.zeros_like(words)
-    if len(descriptors):
+    if len(descriptors) and len(words):
         nearest = (descriptors @ words.T).argmax(1)
         order = np.argsort(nearest, kind="stable")
         present, start, count = np.unique(nearest[order], return_index=True, return_counts=True)

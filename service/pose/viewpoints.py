@@ -112,9 +112,7 @@ def _places(poses: Sequence[Pose], unit: float) -> Float64[np.ndarray, "n 6"]:
     return np.concatenate([positions / max(unit, 1e-9), np.stack([pose.axis_in_world for pose in poses])], 1)
 
 
-def _shell_poses(
-    middle: Float64[np.ndarray, "3"], radius: float, up: Float64[np.ndarray, "3"]
-) -> list[Pose]:
+def _shell_poses(middle: Float64[np.ndarray, "3"], radius: float, up: Float64[np.ndarray, "3"]) -> list[Pose]:
     """Look at the middle from evenly spread directions (a Fibonacci lattice)."""
     i = np.arange(SHELL_CANDIDATES) + 0.5
     z, angle = 1 - 2 * i / SHELL_CANDIDATES, np.pi * (1 + np.sqrt(5.0)) * i

@@ -48,13 +48,20 @@ class Correspondences:
     view_px: Float32[np.ndarray, "m 2"]
     points_in_world: Float32[np.ndarray, "m 3"]
 
+    @classmethod
+    def pooled(cls, parts: Sequence[Correspondences]) -> Correspondences:
+        """Put the matches with several views together; `view_px` then refers to none of them."""
+        return cls(
+            np.concatenate([part.photo_px for part in parts]),
+            np.concatenate([part.view_px for part in parts]),
+            np.concatenate([part.points_in_world for part in parts]),
+        )
+
 
 def sized(intrinsics: Intrinsics, long_side: int) -> Intrinsics:
     """Return the camera at about this size, both sides multiples of 32."""
     factor = long_side / intrinsics.long_side / SIZE_MULTIPLE_PX
-    width, height = (
-        SIZE_MULTIPLE_PX * max(1, round(side * factor)) for side in (intrinsics.width, intrinsics.height)
-    )
+    width, height = (SIZE_MULTIPLE_PX * max(1, round(side * factor)) for side in (intrinsics.width, intrinsics.height))
     return intrinsics.resized(width, height)
 
 
@@ -100,9 +107,7 @@ def _turned_back(
     return points
 
 
-def render_views(
-    cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Matcher
-) -> list[tuple[View, Frame]]:
+def render_views(cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Matcher) -> list[tuple[View, Frame]]:
     """Render, find features, lift them."""
     frames = rasterizer.render(cameras)
     return [
@@ -111,22 +116,21 @@ def render_views(
     ]
 
 
-def rendered_frame(
-    pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0
-) -> tuple[Frame, Camera]:
+def rendered_frame(pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0) -> tuple[Frame, Camera]:
     """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
     intrinsics = sized(query.intrinsics, RENDER_PX)
-    last = tools.memo.get("last_frame")
-    if last is None or last[1].intrinsics != intrinsics or not _nearly_seen(*last, pose, tolerance_px):
-        camera = Camera(intrinsics, pose)
-        last = tools.memo["last_frame"] = (tools.rasterizer.render([camera])[0], camera)
-    return last
+    last: tuple[Frame, Camera] | None = tools.memo.get("last_frame")
+    if last and last[1].intrinsics == intrinsics and _nearly_seen(last[0], last[1], pose, tolerance_px):
+        return last
+    camera = Camera(intrinsics, pose)
+    tools.memo["last_frame"] = tools.rasterizer.render([camera])[0], camera
+    return tools.memo["last_frame"]
 
 
 def rendered_view(pose: Pose, query: Query, tools: Tools) -> tuple[View, Frame]:
     """Return `rendered_frame` with its features."""
     frame, camera = rendered_frame(pose, query, tools)
-    last = tools.memo.get("last_view")
+    last: View | None = tools.memo.get("last_view")
     if last is None or last.camera is not camera:
         found = tools.matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES)
         last = tools.memo["last_view"] = lifted(found, frame, camera)
@@ -153,9 +157,7 @@ def lifted(features: Features, frame: Frame, camera: Camera) -> View:
     height, width = frame.alpha.shape
     column = np.clip(features.points_px[:, 0].astype(int), 1, width - 2)
     row = np.clip(features.points_px[:, 1].astype(int), 1, height - 2)
-    around = np.stack(
-        [frame.median_depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], 1
-    )
+    around = np.stack([frame.median_depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], 1)
     nearest, farthest = around.min(1, initial=np.inf), around.max(1, initial=0.0)
     smooth = (nearest > 0) & (farthest - nearest < MAX_DEPTH_RANGE * nearest)
     keep = np.flatnonzero(smooth & (frame.alpha[row, column] > MIN_ALPHA))
@@ -168,10 +170,12 @@ def lifted(features: Features, frame: Frame, camera: Camera) -> View:
 
 
 def correspondences(photo: Features, view: View, matcher: Matcher) -> Correspondences:
+    """Match the photo with a view."""
     pairs = matcher.match(photo, view.features)
     a, b = pairs[:, 0], pairs[:, 1]
     return Correspondences(photo.points_px[a], view.features.points_px[b], view.points_in_world[b])
 
 
 def to_uint8(rgb: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a render as a photo has it."""
     return (np.clip(rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
