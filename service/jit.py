@@ -10,6 +10,7 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numba
 
@@ -29,8 +30,12 @@ def _cache_dir() -> Path:
 if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_cache_dir())  # type: ignore[attr-defined]
 
-kernel: Callable = numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)
-"""Decorator for a compiled function: no GIL, no bounds checks, C division; strict floating point."""
 
-inline: Callable = numba.njit(nogil=True, error_model="numpy", boundscheck=False)
-"""Decorator for a function that only kernels call: compiled into them."""
+def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a compiled function: no GIL, no bounds checks, C division; strict floating point."""
+    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)(function)
+
+
+def inline(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a function that only kernels call: it is compiled into them."""
+    return numba.njit(nogil=True, error_model="numpy", boundscheck=False)(function)

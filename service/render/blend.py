@@ -68,7 +68,6 @@ def exp2(x):
 def gather_batch(records, entries, first, count, local):
     """Bring up to 128 records into structure of arrays; pad with Gaussians that touch nothing."""
     for group in range(0, count, 16):
-        base = LOCAL + group * 16
         for lane in range(16):
             entry = first + min(group + lane, count - 1)
             store(local, LOCAL + lane * 16, load(records, at(entries, entry) * 16))
@@ -76,7 +75,6 @@ def gather_batch(records, entries, first, count, local):
         if group + 16 > count:
             real = (iota() + isplat(group)) < isplat(count)
             store(local, O + group, select(real, load(local, O + group), -1e9))
-    return base
 
 
 @inline

@@ -52,7 +52,7 @@ def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
 
 def pack(scene: GaussianScene) -> Packed:
     """Order the Gaussians along a space-filling curve and lay them out."""
-    order = _morton_order(scene.means)
+    order = morton_order(scene.means)
     padded = -(-scene.count // LANES) * LANES
     order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])
     chunks = padded // LANES
@@ -78,7 +78,8 @@ def fill(packed: Packed, scene: GaussianScene) -> None:
     )  # fmt: skip
 
 
-def _morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
+def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
+    """Return the order along a Z-shaped space-filling curve of 1024^3 cells."""
     # Quantiles, not extremes: a few far floaters must not squeeze the rest into one cell.
     low, high = np.quantile(means[:: max(1, len(means) // 20_000)], [0.01, 0.99], axis=0)
     cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.uint32)

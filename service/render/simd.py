@@ -14,13 +14,15 @@ broadcast. Everything here is usable inside kernels only.
 from __future__ import annotations
 
 import operator
+from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import lower_builtin
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
-from numba.extending import intrinsic, models, register_model
+from numba.extending import intrinsic as numba_intrinsic
+from numba.extending import models, register_model
 
 LANES = 16
 _F32, _I32, _I1, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(1), ir.IntType(64)
@@ -46,6 +48,11 @@ class VectorM(Vector):
 
 f32x16, i32x16, mask16 = VectorF("f32x16"), VectorI("i32x16"), VectorM("mask16")
 _LLVM = {f32x16: _VF, i32x16: _VI, mask16: _VM}
+
+
+def intrinsic(emit: Callable[..., Any]) -> Callable[..., Any]:
+    """numba's decorator, typed as what it makes: a function without `typingctx`, callable in kernels."""
+    return numba_intrinsic(emit)
 
 
 def _model(numba_type: type, llvm_type: ir.Type) -> None:
@@ -87,7 +94,7 @@ def _vector_of(args: tuple) -> Vector | None:
 def _operator(op: Any, kinds: dict[Vector, tuple[Vector, Any]], operands: int = 2) -> None:
     """Register a Python operator: kinds maps the operands' type to the result's type and an IR emitter."""
 
-    @infer_global(op)
+    @infer_global(op)  # pyright: ignore[reportOptionalCall]
     class _Template(AbstractTemplate):
         def generic(self, args: tuple, kws: dict) -> Any:
             vector = _vector_of(args)
@@ -266,16 +273,6 @@ def bits(typingctx: Any, mask: Any) -> Any:
 def popcount(typingctx: Any, x: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         return builder.zext(builder.ctpop(args[0]), _I64)
-
-    return types.intp(types.uint32), codegen
-
-
-@intrinsic
-def trailing_zeros(typingctx: Any, x: Any) -> Any:
-    """Index of the lowest set bit of a non-zero integer."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
-        return builder.zext(builder.cttz(args[0], ir.Constant(_I1, 1)), _I64)
 
     return types.intp(types.uint32), codegen
 
