@@ -1,6 +1,8 @@
 # Two commands matter: `make demo` and `make test`. Both set up what they need, in .venv.
 PYTHON ?= python3
 PORT ?= 8000
+# bpy has wheels for 3.11 only.
+STUDIO_PYTHON ?= python3.11
 BIN := .venv/bin
 STUDIO_BIN := scenes/studio/.venv/bin
 
@@ -33,7 +35,7 @@ lint: setup
 
 # Rebuilds the demo scene from nothing: some 30 minutes of path tracing and 10 of training on two cores.
 studio: setup
-	$(PYTHON) -m venv scenes/studio/.venv
+	$(STUDIO_PYTHON) -m venv scenes/studio/.venv
 	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
 	cd scenes/studio && .venv/bin/python build.py --out build
 	$(BIN)/python scenes/train.py scenes/studio/build --out scenes/studio/scene.compressed.ply

@@ -1,6 +1,6 @@
 """Train a 3D Gaussian scene on the CPU, with the gradients of our own renderer.
 
-    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 60000] [--iterations 4000]
+    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 200000] [--iterations 8000]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
 (float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
@@ -25,25 +25,47 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from service.interfaces import SceneGradients
 from service.jit import kernel
 from service.render.cpu import CpuRasterizer
+from service.render.pack import morton_order
 from service.scene_formats import load_scene
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
 SH_C0 = 0.28209479177387814
-DEGREE = 3
+DEGREE = 2
+"""Of the SH: beyond it the file grows faster than the picture betters."""
 SH_EVERY = 500
 """Iterations between two SH degrees."""
 RELOCATE_EVERY = 100
-FADED = 0.01
+HALF_SIZE_UNTIL, RELOCATE_UNTIL = 0.25, 0.75
+"""Shares of the iterations."""
+FADED = 0.02
 SSIM_SHARE = 0.2
-OPACITY_DECAY, SCALE_DECAY = 2e-6, 2e-7
+OPACITY_DECAY = 1e-7
 """A gentle pull on what is seen: what the photos don't need fades, and can be moved."""
 
 
 @dataclass(slots=True)
 class Photo:
-    name: str
     camera: Camera
     rgb: np.ndarray
+    _blurred: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    _half: Photo | None = None
+
+    def half(self) -> Photo:
+        """The photo at half its size: what the first iterations need, for a quarter of the time."""
+        if self._half is None:
+            k = self.camera.intrinsics
+            lens = k.resized(k.width // 2, k.height // 2)
+            pixels = cv2.resize(self.rgb, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
+            self._half = Photo(Camera(lens, self.camera.pose), pixels)
+        return self._half
+
+    def blurred(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The photo as float32 with its local means and variances, which SSIM asks for at every visit."""
+        if self._blurred is None:
+            target = self.rgb.astype(np.float32) / np.float32(255)
+            means = blur(target)
+            self._blurred = target, means, blur(target * target) - means * means
+        return self._blurred
 
 
 class Model:
@@ -53,14 +75,21 @@ class Model:
         n = len(points)
         self.means = points.astype(np.float32)
         self.quats = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
-        self.log_scales = np.log(np.repeat(spacing[:, None], 3, 1)).astype(np.float32)
-        self.logits = np.full(n, np.log(0.3 / 0.7), np.float32)
+        self.log_scales = np.log(np.repeat(0.7 * spacing[:, None], 3, 1)).astype(np.float32)
+        self.logits = np.zeros(n, np.float32)
         self.sh = np.zeros((n, (DEGREE + 1) ** 2, 3), np.float32)
         self.sh[:, 0] = (colours - 0.5) / SH_C0
         self.scales, self.opacities = np.empty_like(self.log_scales), np.empty_like(self.logits)
         self.moments = np.zeros((n, 2, 11 + self.sh[0].size), np.float32)
         self.steps = np.zeros(n, np.int32)
         self.pull = np.zeros(n, np.float32)
+        self.sort()
+
+    def sort(self) -> None:
+        """Bring neighbours in space together in memory: the renderer keeps that order, and walks it."""
+        order = morton_order(self.means)
+        for name in ("means", "quats", "log_scales", "logits", "sh", "moments", "steps", "pull"):
+            setattr(self, name, getattr(self, name)[order])
         self.activate()
 
     def activate(self) -> None:
@@ -96,80 +125,106 @@ class Model:
             both = np.concatenate([faded, chosen])
             self.moments[both] = 0
             self.steps[both] = 0
-            self.activate()
         self.pull[:] = 0
+        self.sort()
         return len(faded)
 
 
 @kernel
-def adam_rows(index, gradients, values, moments, first, steps, rate, beta1, beta2, epsilon):
+def adam_rows(index, gradients, values, moments, first, steps, rate):
     """One step of Adam on the rows in view; `first` is the parameter's place in `moments`."""
-    for v in range(index.shape[0]):
-        i = index[v]
-        fix1 = np.float32(1 / (1 - beta1 ** steps[i]))
-        fix2 = np.float32(1 / (1 - beta2 ** steps[i]))
-        for k in range(values.shape[1]):
+    beta1, beta2 = np.float32(0.9), np.float32(0.999)
+    rest1, rest2 = np.float32(0.1), np.float32(0.001)
+    for v in range(np.uint64(index.shape[0])):
+        i = np.uint64(index[v])
+        # After 5000 steps both corrections are 1 to float32's precision.
+        count = min(steps[i], 5000)
+        fix1 = np.float32(1 / (1 - 0.9**count))
+        fix2 = np.float32(1 / (1 - 0.999**count))
+        for k in range(np.uint64(values.shape[1])):
             g = gradients[v, k]
-            m = beta1 * moments[i, 0, first + k] + (np.float32(1) - beta1) * g
-            s = beta2 * moments[i, 1, first + k] + (np.float32(1) - beta2) * g * g
+            m = beta1 * moments[i, 0, first + k] + rest1 * g
+            s = beta2 * moments[i, 1, first + k] + rest2 * g * g
             moments[i, 0, first + k], moments[i, 1, first + k] = m, s
-            values[i, k] -= rate[k] * m * fix1 / (np.sqrt(s * fix2) + epsilon)
+            values[i, k] -= rate[k] * m * fix1 / (np.sqrt(s * fix2) + np.float32(1e-15))
 
 
-def step(model: Model, g: SceneGradients, means_rate: float, degree: int) -> None:
-    """Adam on the Gaussians in view (rates of 3DGS), with the chain rule of the activations."""
+def step(model: Model, g: SceneGradients, means_rate: float, rate: float, degree: int) -> None:
+    """Adam on the Gaussians in view (3DGS's rates, times `rate`), with the chain rule of the activations."""
     i = g.index
     model.steps[i] += 1
     model.pull[i] += np.linalg.norm(g.means, axis=1) * model.scales[i].max(1)
     opacity = model.opacities[i]
     d_logits = ((g.opacities + OPACITY_DECAY) * opacity * (1 - opacity))[:, None]
-    d_scales = g.scales * model.scales[i] + SCALE_DECAY
-    d_sh = g.sh.reshape(len(i), -1)
-    sh_rate = np.full(model.sh[0].size, 2.5e-3 / 20, np.float32)
-    sh_rate[:3] = 2.5e-3
-    sh_rate[3 * (degree + 1) ** 2 :] = 0
-    place = 0
-    for values, gradients, rate in (
+    d_scales = g.scales * model.scales[i]
+    sh_rate = np.full(model.sh[0].size, 2.5e-3 / 10 * rate, np.float32)
+    sh_rate[:3] = 2.5e-3 * rate
+    active = 3 * (degree + 1) ** 2
+    flat = model.sh.reshape(len(model.sh), -1)[:, :active]
+    place = np.uint64(0)
+    for values, gradients, rates in (
         (model.means, g.means, np.full(3, means_rate, np.float32)),
-        (model.quats, g.quats, np.full(4, 1e-3, np.float32)),
-        (model.log_scales, d_scales, np.full(3, 5e-3, np.float32)),
-        (model.logits[:, None], d_logits, np.full(1, 5e-2, np.float32)),
-        (model.sh.reshape(len(model.sh), -1), d_sh, sh_rate),
+        (model.quats, g.quats, np.full(4, 1e-3 * rate, np.float32)),
+        (model.log_scales, d_scales, np.full(3, 5e-3 * rate, np.float32)),
+        (model.logits[:, None], d_logits, np.full(1, 5e-2 * rate, np.float32)),
+        (flat, g.sh.reshape(len(i), -1)[:, :active], sh_rate[:active]),
     ):
-        adam_rows(
-            i, np.ascontiguousarray(gradients, np.float32), values, model.moments, place, model.steps, rate,
-            np.float32(0.9), np.float32(0.999), np.float32(1e-15),
-        )  # fmt: skip
-        place += values.shape[1]
+        adam_rows(i, gradients, values, model.moments, place, model.steps, rates)
+        place += np.uint64(values.shape[1])
     model.quats[i] /= np.linalg.norm(model.quats[i], axis=1, keepdims=True)
     model.scales[i] = np.exp(model.log_scales[i])
     model.opacities[i] = 1 / (1 + np.exp(-model.logits[i]))
 
 
-def loss_gradient(picture: np.ndarray, photo: np.ndarray) -> tuple[float, np.ndarray]:
-    """0.8 L1 + 0.2 (1 - SSIM) over the image, and its gradient by the picture.
+def blur(image: np.ndarray) -> np.ndarray:
+    """SSIM's window (Wang 2004): 11 pixels, sigma 1.5. Symmetric, so it is its own adjoint."""
+    return cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT)
 
-    SSIM = A1 A2 / (B1 B2) with the 11-pixel Gaussian window (sigma 1.5) of Wang 2004; the window is symmetric, so its
-    adjoint is itself.
-    """
 
-    def blur(image: np.ndarray) -> np.ndarray:
-        return cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT)
+def loss_gradient(picture: np.ndarray, photo: Photo) -> tuple[float, np.ndarray]:
+    """0.8 L1 + 0.2 (1 - SSIM) over the image, and its gradient by the picture."""
+    d_mu, d_s11, d_s12, gradient = (np.empty_like(picture) for _ in range(4))
+    target, mu2, s22 = photo.blurred()
+    mu1, m11, m12 = blur(picture), blur(picture * picture), blur(picture * target)
+    ssim = _ssim(
+        mu1.ravel(), m11.ravel(), m12.ravel(), mu2.ravel(), s22.ravel(), d_mu.ravel(), d_s11.ravel(), d_s12.ravel()
+    )
+    parts = [blur(d).ravel() for d in (d_mu, d_s11, d_s12)]
+    l1 = _gather_gradient(picture.ravel(), target.ravel(), *parts, np.float32(SSIM_SHARE), gradient.ravel())
+    return (1 - SSIM_SHARE) * l1 + SSIM_SHARE * (1 - ssim), gradient
 
-    c1, c2 = 0.01**2, 0.03**2
-    mu1, mu2 = blur(picture), blur(photo)
-    s11, s22 = blur(picture * picture) - mu1 * mu1, blur(photo * photo) - mu2 * mu2
-    s12 = blur(picture * photo) - mu1 * mu2
-    a1, a2 = 2 * mu1 * mu2 + c1, 2 * s12 + c2
-    b1, b2 = mu1 * mu1 + mu2 * mu2 + c1, s11 + s22 + c2
-    ssim = a1 * a2 / (b1 * b2)
-    d_s12, d_s11 = 2 * a1 / (b1 * b2), -ssim / b2
-    d_mu = 2 * (mu2 * a2 / (b1 * b2) - mu1 * ssim / b1 - mu1 * d_s11) - mu2 * d_s12
-    d_ssim = blur(d_mu) + 2 * picture * blur(d_s11) + photo * blur(d_s12)
-    error = picture - photo
-    loss = (1 - SSIM_SHARE) * np.abs(error).mean() + SSIM_SHARE * (1 - ssim.mean())
-    gradient = ((1 - SSIM_SHARE) * np.sign(error) - SSIM_SHARE * d_ssim) / error.size
-    return float(loss), gradient.astype(np.float32)
+
+@kernel
+def _ssim(mu1, m11, m12, mu2, s22, d_mu, d_s11, d_s12):
+    """Mean of SSIM = A1 A2 / (B1 B2), and its derivatives by the three blurred images."""
+    one, two = np.float32(1), np.float32(2)
+    c1, c2 = np.float32(0.01**2), np.float32(0.03**2)
+    total = 0.0
+    for i in range(np.uint64(mu1.shape[0])):
+        a, b = mu1[i], mu2[i]
+        a1, b1 = two * a * b + c1, a * a + b * b + c1
+        a2, b2 = two * (m12[i] - a * b) + c2, m11[i] - a * a + s22[i] + c2
+        scale = one / (b1 * b2)
+        ssim = a1 * a2 * scale
+        s12, s11 = two * a1 * scale, -ssim / b2
+        d_s12[i], d_s11[i] = s12, s11
+        d_mu[i] = two * (b * a2 * scale - a * ssim / b1 - a * s11) - b * s12
+        total += ssim
+    return total / mu1.shape[0]
+
+
+@kernel
+def _gather_gradient(picture, target, d_mu, d_s11, d_s12, share, gradient):
+    """Mean absolute difference, and the whole loss' gradient from the parts of SSIM's."""
+    scale = np.float32(1.0 / picture.shape[0])
+    total = 0.0
+    for i in range(np.uint64(picture.shape[0])):
+        difference = picture[i] - target[i]
+        total += abs(difference)
+        sign = np.float32(1) if difference > 0 else np.float32(-1)
+        d_ssim = d_mu[i] + np.float32(2) * picture[i] * d_s11[i] + target[i] * d_s12[i]
+        gradient[i] = ((np.float32(1) - share) * sign - share * d_ssim) * scale
+    return total / picture.shape[0]
 
 
 def read_photos(folder: Path, key: str) -> list[Photo]:
@@ -182,7 +237,7 @@ def read_photos(folder: Path, key: str) -> list[Photo]:
         pixels = Image.open(folder / frame["file_path"]).convert("RGB")
         lens = Intrinsics(*pixels.size, frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"])
         opencv = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
-        photos.append(Photo(frame["file_path"], Camera(lens, Pose(opencv)), np.asarray(pixels)))
+        photos.append(Photo(Camera(lens, Pose(opencv)), np.asarray(pixels)))
     return photos
 
 
@@ -229,7 +284,7 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
 
     def gradients(photo: Photo) -> tuple[float, SceneGradients]:
         picture = rasterizer.render([photo.camera])[0].rgb
-        loss, d_rgb = loss_gradient(picture, photo.rgb.astype(np.float32) / 255)
+        loss, d_rgb = loss_gradient(picture, photo)
         return loss, rasterizer.scene_gradients(photo.camera, d_rgb)
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -240,11 +295,16 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
             if len(order) < 2:
                 order = list(rng.permutation(len(photos)))
             batch = [photos[order.pop()] for _ in range(2)]
-            means_rate = 1.6e-4 * extent * 0.01 ** (iteration / iterations)
+            done = iteration / iterations
+            if done < HALF_SIZE_UNTIL:
+                batch = [photo.half() for photo in batch]
+            means_rate = 1.6e-4 * extent * 0.01**done
+            # Calming every rate at the end lets the last steps agree on what the noise of single photos hides.
+            rate = 0.03 ** max(0.0, 2 * done - 1)
             for loss, g in pool.map(gradients, batch):
-                step(model, g, means_rate, min(DEGREE, iteration // SH_EVERY))
+                step(model, g, means_rate, rate, min(DEGREE, iteration // SH_EVERY))
                 average += 0.01 * (loss - average)
-            if iteration % RELOCATE_EVERY == 0 and 0 < iteration < 0.85 * iterations:
+            if iteration % RELOCATE_EVERY == 0 and 0 < done < RELOCATE_UNTIL:
                 model.relocate(rng)
                 rasterizer = CpuRasterizer(model.scene(info))
             else:
@@ -270,8 +330,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--gaussians", type=int, default=60_000)
-    parser.add_argument("--iterations", type=int, default=4000)
+    parser.add_argument("--gaussians", type=int, default=200_000)
+    parser.add_argument("--iterations", type=int, default=8000)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     scene = train(arguments.folder, arguments.gaussians, arguments.iterations)
