@@ -40,7 +40,7 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
     if path and path.exists():
         try:
             return _read(path)
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
     index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
     if path:
@@ -100,7 +100,7 @@ def _write(index: ViewIndex, path: Path) -> None:
 
 
 def _read(path: Path) -> ViewIndex:
-    with np.load(path, allow_pickle=False) as file:
+    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         stored = {name: file[name] for name in file.files}
     stops = np.cumsum(stored["counts"])
     views = []

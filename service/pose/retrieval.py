@@ -23,7 +23,7 @@ def visual_words(descriptors: Float32[np.ndarray, "n d"], rng: np.random.Generat
     chosen = rng.permutation(len(descriptors))[:K_MEANS_SAMPLE]
     sample = descriptors[chosen]
     words = sample[:WORDS].copy()
-    for _ in range(K_MEANS_ROUNDS):
+    for _ in range(K_MEANS_ROUNDS if len(sample) else 0):
         nearest = (sample @ words.T).argmax(1)
         for word in range(len(words)):
             members = sample[nearest == word]
