@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import io
 import logging
 import os
 import signal
 import threading
+from contextlib import redirect_stdout
 
 from viewer.app import Viewer
 from viewer.client import Service
+
+log = logging.getLogger("viewer")
 
 
 def main() -> None:
@@ -23,15 +27,19 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
+    for chatty in ("httpx", "websockets"):  # they log every request and connection
+        logging.getLogger(chatty).setLevel(logging.WARNING)
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     service = Service(arguments.service)
-    viewer = Viewer(service, arguments.host, arguments.port)
+    with redirect_stdout(io.StringIO()):  # viser prints an address that no one but the relay shall use
+        viewer = Viewer(service, arguments.host, arguments.port)
+    log.info("the viewer listens on port %s", viewer.server.get_port())
     while not ended.wait(1.0) and os.getppid() == arguments.parent:
         pass
-    viewer.stop()
+    with redirect_stdout(io.StringIO()):
+        viewer.stop()
     service.close()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import threading
+import time
 
 import viser
 from viser import _messages
@@ -44,6 +45,11 @@ class Viewer:
         for session in sessions:
             session.close()
         self._library.close()
+        # viser's own stop() leaves the closing of connections to callbacks that it has just switched off.
+        self.server._websock_server.disconnect_all_clients()
+        deadline = time.monotonic() + 1.0
+        while self.server.get_clients() and time.monotonic() < deadline:
+            time.sleep(0.01)
         self.server.stop()
 
     def _open(self, client: viser.ClientHandle) -> None:

@@ -81,14 +81,18 @@ def side_by_side(
     k = matches.render_camera.intrinsics
     starts = matches.photo_px * [a.shape[1] / photo.shape[1], a.shape[0] / photo.shape[0]] + corners[0]
     ends = matches.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
+    colours = [INLIER if inlier else OUTLIER for inlier in matches.inlier]
+    order = np.argsort(matches.inlier, kind="stable")
     lines = pair.copy()
-    for i in np.argsort(matches.inlier, kind="stable"):
-        colour = INLIER if matches.inlier[i] else OUTLIER
-        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), colour, 2, cv2.LINE_AA, _SHIFT)
+    for i in order:
+        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), colours[i], 2, cv2.LINE_AA, _SHIFT)
+    # Lines translucent, the more the denser: three hundred must not hide what they connect. The ends are plain.
+    opacity = 0.3 + 0.4 / (1 + len(order) / 50)
+    picture = cv2.addWeighted(pair, 1 - opacity, lines, opacity, 0)
+    for i in order:
         for end in (starts[i], ends[i]):
-            cv2.circle(lines, _fixed(end), 4 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
-    # Translucent, so that three hundred lines don't hide what they connect.
-    return cv2.addWeighted(pair, 0.35, lines, 0.65, 0)
+            cv2.circle(picture, _fixed(end), 3 << _SHIFT, colours[i], -1, cv2.LINE_AA, _SHIFT)
+    return picture
 
 
 def score_colours(scores: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:

@@ -27,7 +27,7 @@ MAX_SPLATS = 400_000
 """Drawn of a scene: 13 MB a browser, smooth on an integrated GPU."""
 _RENDERS_KEPT = 64
 _SCENES_KEPT = 2
-_POLL_S = 1.0
+_POLL_S = 0.5
 
 Listener = Callable[[], None]
 
@@ -120,8 +120,8 @@ class Library:
 
     def __init__(self, service: Service) -> None:
         self.service = service
-        self.jobs: tuple[JobSummary, ...] = ()
-        """Newest first, at most a second old while somebody listens."""
+        self.jobs: tuple[JobSummary, ...] | None = None
+        """Newest first, up to date while somebody listens; None: not known yet."""
         self._feeds: dict[str, JobFeed] = {}
         self._scenes: OrderedDict[str, SceneContent] = OrderedDict()
         self._listeners: set[Listener] = set()
@@ -186,11 +186,14 @@ class Library:
 
     def _watch(self) -> None:
         """Poll the list of jobs while somebody listens."""
+        trouble = ""
         while self._awake.wait() and not self._closed.is_set():
             try:
-                jobs = tuple(self.service.jobs())
+                jobs, trouble = tuple(self.service.jobs()), ""
             except (ServiceTrouble, ValueError, KeyError) as error:
-                log.warning("list of jobs: %s", error)
+                if str(error) != trouble:  # once, not at every poll
+                    trouble = str(error)
+                    log.warning("list of jobs: %s", error)
                 jobs = self.jobs
             if jobs != self.jobs:
                 self.jobs = jobs

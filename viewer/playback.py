@@ -158,6 +158,11 @@ def _badge(text: str, colour: tuple[int, int, int]) -> str:
     )
 
 
+def small_html(text: str) -> str:
+    """A line of small print."""
+    return _small(escape(text))
+
+
 def _small(html: str) -> str:
     return f"<div style='padding:0 .6em .2em;font-size:.8em;opacity:.75'>{html}</div>"
 

@@ -19,7 +19,7 @@ from viewer.client import ServiceTrouble
 from viewer.draw import Mode, overlaid, reduced, side_by_side
 from viewer.feed import JobFeed, Library
 from viewer.panel import NO_JOB, Panel
-from viewer.playback import Playback, caption_html, headline_html, job_label, record_html, scene_html
+from viewer.playback import Playback, caption_html, headline_html, job_label, record_html, scene_html, small_html
 from viewer.stage import Stage
 
 log = logging.getLogger(__name__)
@@ -150,13 +150,13 @@ class Session:
 
     def _sync_jobs(self) -> None:
         """Bring the list of jobs up to date, and change to the newest job if that is wanted."""
-        jobs = self._library.jobs
+        jobs = self._library.jobs or ()
         if jobs:
             self.panel.jobs.options = tuple(job_label(job) for job in jobs)
         wanted = self._wanted or (jobs[0].id if jobs else None)
         if wanted is not None and (self._feed is None or self._feed.id != wanted):
             self._open(wanted)
-        elif wanted is None and self._scene_id is None:
+        elif wanted is None and self._scene_id is None and self._library.jobs is not None:
             self._show_scene(self._library.service.first_scene())
             self.panel.headline.content = headline_html(None, 0, "")
         if self._feed is not None:
@@ -219,20 +219,24 @@ class Session:
 
     def _show_picture(self) -> None:
         """Compose photo and render of the record that is shown."""
-        record, feed, panel = self._record, self._feed, self.panel
+        panel, pair = self.panel, self._mode == "side by side"
+        panel.matches.visible, panel.weight.visible = pair, self._mode == "blend"
+        record, feed = self._record, self._feed
         if record is None or feed is None:
             return
-        photo = feed.photo()
-        pair = self._mode == "side by side"
         matches = record.matches if pair and panel.matches.value else None
-        # Matches may refer to another view than the record's pose: then that view stands beside the photo.
-        render = feed.render(record.index, matched=matches is not None)
+        try:
+            photo = feed.photo()
+            # Matches may refer to another view than the record's pose: then that view stands beside the photo.
+            render = feed.render(record.index, matched=matches is not None)
+        except (ServiceTrouble, ValueError) as error:
+            panel.caption.content = small_html(f"There is no picture of this step: {error}")
+            return
         if self._mode == "side by side":
             panel.picture.image = side_by_side(photo, render, matches)
         else:
             panel.picture.image = overlaid(self._mode, photo, render, panel.weight.value)
         panel.caption.content = caption_html(self._mode, matches)
-        panel.matches.visible, panel.weight.visible = pair, self._mode == "blend"
         panel.window.visible = True
 
     @property
@@ -242,7 +246,7 @@ class Session:
 
     def _user_chose_job(self) -> None:
         label = self.panel.jobs.value
-        chosen = next((job.id for job in self._library.jobs if job_label(job) == label), None)
+        chosen = next((job.id for job in self._library.jobs or () if job_label(job) == label), None)
         if label != NO_JOB and chosen is not None:
             self._wanted = chosen
             self.panel.newest.value = False

@@ -92,7 +92,9 @@ class Stage:
             return
         segments = shapes.frusta(poses, [photo] * len(poses), 0.7 * self._scene.extent.frustum)
         scores = candidates.scores if candidates else np.zeros(0)
-        colours = shapes.frustum_colours(score_colours(scores))
+        # viser takes one colour as sRGB, but colours by vertex as linear light.
+        linear = (255 * (score_colours(scores) / 255) ** 2.2).astype(np.uint8)
+        colours = shapes.frustum_colours(linear)
         self._lines("candidates", "candidates", segments, colours, 1.5)
 
     def clear_job(self) -> None:
