@@ -1,6 +1,6 @@
 """Train a 3D Gaussian scene on the CPU, with the gradients of our own renderer.
 
-    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 200000] [--iterations 8000]
+    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 7000]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
 (float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
@@ -35,7 +35,7 @@ DEGREE = 2
 SH_EVERY = 500
 """Iterations between two SH degrees."""
 RELOCATE_EVERY = 100
-HALF_SIZE_UNTIL, RELOCATE_UNTIL = 0.25, 0.75
+RELOCATE_UNTIL, CALM_FROM = 0.7, 0.7
 """Shares of the iterations."""
 FADED = 0.02
 SSIM_SHARE = 0.2
@@ -48,16 +48,6 @@ class Photo:
     camera: Camera
     rgb: np.ndarray
     _blurred: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-    _half: Photo | None = None
-
-    def half(self) -> Photo:
-        """The photo at half its size: what the first iterations need, for a quarter of the time."""
-        if self._half is None:
-            k = self.camera.intrinsics
-            lens = k.resized(k.width // 2, k.height // 2)
-            pixels = cv2.resize(self.rgb, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-            self._half = Photo(Camera(lens, self.camera.pose), pixels)
-        return self._half
 
     def blurred(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The photo as float32 with its local means and variances, which SSIM asks for at every visit."""
@@ -157,7 +147,7 @@ def step(model: Model, g: SceneGradients, means_rate: float, rate: float, degree
     opacity = model.opacities[i]
     d_logits = ((g.opacities + OPACITY_DECAY) * opacity * (1 - opacity))[:, None]
     d_scales = g.scales * model.scales[i]
-    sh_rate = np.full(model.sh[0].size, 2.5e-3 / 10 * rate, np.float32)
+    sh_rate = np.full(model.sh[0].size, 2.5e-3 / 4 * rate, np.float32)
     sh_rate[:3] = 2.5e-3 * rate
     active = 3 * (degree + 1) ** 2
     flat = model.sh.reshape(len(model.sh), -1)[:, :active]
@@ -296,11 +286,9 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
                 order = list(rng.permutation(len(photos)))
             batch = [photos[order.pop()] for _ in range(2)]
             done = iteration / iterations
-            if done < HALF_SIZE_UNTIL:
-                batch = [photo.half() for photo in batch]
             means_rate = 1.6e-4 * extent * 0.01**done
             # Calming every rate at the end lets the last steps agree on what the noise of single photos hides.
-            rate = 0.03 ** max(0.0, 2 * done - 1)
+            rate = 0.1 ** max(0.0, (done - CALM_FROM) / (1 - CALM_FROM))
             for loss, g in pool.map(gradients, batch):
                 step(model, g, means_rate, rate, min(DEGREE, iteration // SH_EVERY))
                 average += 0.01 * (loss - average)
@@ -330,8 +318,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--gaussians", type=int, default=200_000)
-    parser.add_argument("--iterations", type=int, default=8000)
+    parser.add_argument("--gaussians", type=int, default=240_000)
+    parser.add_argument("--iterations", type=int, default=7000)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     scene = train(arguments.folder, arguments.gaussians, arguments.iterations)

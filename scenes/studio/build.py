@@ -10,7 +10,7 @@ Cycles on the CPU, and writes to the `--out` folder
                               3 partly occluded, 2 wide-angle, 2 stored turned with an EXIF tag
     transforms.json           all poses in nerfstudio's layout
     truth.json                poses and intrinsics of photos/*.jpg, OpenCV axes, upright image
-    points.npy                200,000 coloured surface points to start training from
+    points.npy                240,000 coloured surface points to start training from
 
 Needs Python 3.11 with bpy 5.0, numpy below 2 and Pillow. A photo takes 10 to 15 s on two idle
 cores, everything about half an hour. Photos that are there are kept, so an interrupted run goes

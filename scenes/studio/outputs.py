@@ -12,7 +12,7 @@ from cameras import Room, View
 
 Array = np.ndarray
 
-POINTS = 200_000
+POINTS = 240_000
 OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL camera axes to OpenCV's, and back
 
 
