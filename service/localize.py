@@ -38,11 +38,14 @@ from service.types import (
     Reason,
     StageTiming,
     Status,
+    Verdict,
 )
 
 DEFAULT_ESTIMATOR = "view_index"
 DEFAULT_RASTERIZER = "cpu"
 DEFAULT_MATCHER = "xfeat"
+GUESSED_SCORE = 0.49
+"""The best score that a pose with guessed intrinsics gets: below what `localized` means."""
 
 
 class Cancelled(Exception):
@@ -82,9 +85,7 @@ class LoadedScene:
         rasterizer: str = DEFAULT_RASTERIZER,
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
-        return cls(
-            scene, RASTERIZERS.load(rasterizer).create(scene), MATCHERS.load(matcher).create(), cache_dir
-        )
+        return cls(scene, RASTERIZERS.load(rasterizer).create(scene), MATCHERS.load(matcher).create(), cache_dir)
 
     def prepare(self, estimator: str) -> Any:
         """Return what the estimator prepares for this scene (e.g. its view index), made once."""
@@ -142,9 +143,7 @@ def localize(
     if not records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
     pose = records[-1].pose
-    verdict = verify(query, pose, tools)
-    if exhausted and verdict.status is not Status.LOCALIZED:
-        verdict = replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
+    verdict = _qualified(verify(query, pose, tools), query, exhausted)
     return PoseEstimate(
         pose=pose,
         verdict=verdict,
@@ -161,6 +160,17 @@ def localize(
         warnings=query.warnings + loaded.scene.info.warnings,
         records=tuple(records),
     )
+
+
+def _qualified(verdict: Verdict, query: Query, exhausted: bool) -> Verdict:
+    """Put on record what the gate can't see in the pictures: a guessed lens, a budget that cut the search short."""
+    if verdict.status is not Status.LOCALIZED:
+        return replace(verdict, reason=Reason.BUDGET_EXHAUSTED) if exhausted else verdict
+    if query.intrinsics_source == "guessed":
+        # A focal length 5 % off moves the pose by 5 % of the distance, and photo and render still agree.
+        score = min(verdict.score, GUESSED_SCORE)
+        return replace(verdict, status=Status.UNCERTAIN, reason=Reason.GUESSED_INTRINSICS, score=score)
+    return verdict
 
 
 def _driven(

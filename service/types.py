@@ -284,6 +284,7 @@ class Reason(StrEnum):
     RENDER_DISAGREES = "render_disagrees"
     FEW_INLIERS = "few_inliers"
     LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
+    GUESSED_INTRINSICS = "guessed_intrinsics"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -299,6 +300,9 @@ HINTS: dict[Reason, str] = {
         "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
     ),
     Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: show the captured part, or send a prior.",
+    Reason.GUESSED_INTRINSICS: (
+        "The photo fits the scene, but its focal length was guessed, and a wrong one shifts the pose: send intrinsics."
+    ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }
 
