@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from service.api.convert import record_out
 from service.api.splats import importance, packed_splats
-from service.geometry import project, transformed
+from service.geometry import look_at, project, transformed
 from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Reason, Status
 from viewer import draw, shapes
 from viewer.client import Answer, JobView, Service, ServiceTrouble, parsed_record, parsed_splats, sse_events
@@ -156,6 +156,26 @@ def test_looking_through_a_camera_shows_its_whole_image(aspect: float, roll: flo
     reach = np.tan(view.fov_rad / 2)
     x, y = 0.5 * PHOTO.width / PHOTO.fx / reach / aspect, 0.5 * PHOTO.height / PHOTO.fy / reach
     assert max(x, y) == pytest.approx(1, abs=1e-9)
+
+
+@pytest.mark.parametrize("wall", [None, 0.9])
+@given(share=st.floats(0, 1))
+def test_over_the_shoulder_the_whole_frustum_is_seen_and_no_wall_between(share: float, wall: float | None) -> None:
+    pose = orbit(share)
+    scene = shapes.extent(np.zeros((0, 3), np.float32), [Camera(PHOTO, orbit(s)) for s in (0.0, 0.3, 0.6)], None)
+    across = np.random.default_rng(0).uniform(-1, 1, (5000 if wall else 0, 2))
+    centres = transformed(pose.world_from_camera, np.column_stack([across, np.full(len(across), -(wall or 0))]))
+    view = shapes.behind(pose, scene, centres.astype(np.float32))
+    distance = -(view.position - pose.position_in_world) @ pose.axis_in_world
+    assert distance < (wall or 2)
+    seen = look_at(view.position, view.look_at, view.up)
+    focal = 50 / np.tan(view.fov_rad / 2)
+    corners = shapes.frusta(shapes.stacked([pose]), [PHOTO], scene.frustum).reshape(-1, 3)
+    in_view = transformed(seen.camera_from_world, corners)
+    assert in_view[:, 2].min() > 1.15 * scene.frustum  # the near plane
+    px = project(in_view, Intrinsics(100, 100, focal, focal, 50, 50))
+    assert px.min() > 5
+    assert px.max() < 95
 
 
 def test_extent_ignores_floaters_and_survives_an_empty_scene() -> None:

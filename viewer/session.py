@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -26,6 +27,7 @@ log = logging.getLogger(__name__)
 
 _PLAY_PERIOD_S = 0.5
 _TEXTURE_PX = 512
+_ARRIVAL_S = 2.0
 
 Action = Callable[[], None]
 
@@ -46,6 +48,7 @@ class Session:
         self._mode: Mode = "side by side"
         self._shown: tuple[str, int] | None = None
         """Job and record that the 3D shows."""
+        self._opened = 0.0
         self._picture_due = False
         self._asked_step = 0
         self._todo: list[Action] = []
@@ -171,6 +174,7 @@ class Session:
         self.stage.clear_job()
         self._playback = Playback()
         self._shown = None
+        self._opened = time.monotonic()
         self._feed = self._library.follow(job_id, self._feed_changed)
         self.post(self._sync_feed)
 
@@ -188,6 +192,9 @@ class Session:
         self.panel.step.max = max(0, count - 1)
         self.panel.step.disabled = self.panel.look_through.disabled = self.panel.fly.disabled = count == 0
         self.stage.show_trajectory(feed.records[:count], feed.job)
+        # A job that has just been opened is looked at where it is; later on the view is the user's.
+        if count and (self._shown is None or time.monotonic() < self._opened + _ARRIVAL_S):
+            self.stage.look_over(feed.records[count - 1].pose)
         self._show()
 
     def _show_scene(self, scene_id: str | None) -> None:
@@ -273,9 +280,11 @@ class Session:
         self._show_picture()
 
     def _look_through(self) -> None:
+        self._opened = 0.0  # from now on the view is the user's
         if self._record is not None and self._feed is not None and self._feed.job is not None:
             self.stage.look_through(Camera(self._feed.job.photo, self._record.pose))
 
     def _fly(self) -> None:
+        self._opened = 0.0
         if self._feed is not None and self._feed.records:
             self.stage.fly_to(self._feed.records[-1].pose)

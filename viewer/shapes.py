@@ -91,12 +91,32 @@ def through(camera: Camera, scene: Extent, aspect: float) -> Viewpoint:
     return Viewpoint(position, look_at, up / np.linalg.norm(up), float(2 * np.arctan(half_height)))
 
 
-def behind(pose: Pose, scene: Extent) -> Viewpoint:
-    """Look over a camera's shoulder: its frustum before the scene that it sees."""
-    back = 4.0 * scene.frustum
-    position = pose.position_in_world - back * pose.axis_in_world + 0.4 * back * scene.up
-    look_at = pose.position_in_world + 2 * back * pose.axis_in_world
-    return Viewpoint(position, look_at, scene.up, float(np.radians(60)))
+def behind(pose: Pose, scene: Extent, centres: Float32[np.ndarray, "n 3"]) -> Viewpoint:
+    """Look over a camera's shoulder: its frustum before the scene that it sees, and no wall between.
+
+    `centres` are the Gaussians': where they are dense on the way back from the camera, the viewpoint stays closer.
+    """
+    position, axis = pose.position_in_world, pose.axis_in_world
+    eye = position
+    for back in (4.0, 3.0, 2.2):  # frustum depths; any closer, and the frustum does not fit the view
+        eye = position + back * scene.frustum * (0.4 * scene.up - axis)
+        if _crowd(position, eye, centres, 0.5 * scene.frustum) < _WALL:
+            break
+    return Viewpoint(eye, position + 8.0 * scene.frustum * axis, scene.up, float(np.radians(60)))
+
+
+_WALL = 12
+"""Gaussians around a way that bar the view; floaters are fewer, surfaces have dozens."""
+
+
+def _crowd(
+    start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"], points: Float32[np.ndarray, "n 3"], reach: float
+) -> int:
+    """Count the points within `reach` of a segment."""
+    along = (end - start).astype(np.float32)
+    offset = points - start.astype(np.float32)
+    share = np.clip(offset @ along / (along @ along), 0, 1)
+    return int((np.linalg.norm(offset - share[:, None] * along, axis=1) < reach).sum())
 
 
 def between(a: Viewpoint, b: Viewpoint, share: float) -> Viewpoint:

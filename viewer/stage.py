@@ -119,13 +119,18 @@ class Stage:
         if self._scene is not None:
             self.look(shapes.through(camera, self._scene.extent, self._client.camera.aspect))
 
+    def look_over(self, pose: Pose) -> None:
+        """Stand behind a camera, at once."""
+        if self._scene is not None:
+            self.look(shapes.behind(pose, self._scene.extent, self._scene.splats.centres))
+
     def fly_to(self, pose: Pose) -> None:
         """Move over the shoulder of a camera within a second; blocks for that long."""
         if self._scene is None:
             return
         camera = self._client.camera
         start = shapes.Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov)
-        goal = shapes.behind(pose, self._scene.extent)
+        goal = shapes.behind(pose, self._scene.extent, self._scene.splats.centres)
         began = time.monotonic()
         share = 0.0
         while share < 1:
