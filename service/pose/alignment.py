@@ -63,6 +63,8 @@ def align(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, start
         height, width = photo_levels[level].shape
         intrinsics = camera.intrinsics.resized(width, height)
         loss = _align_level(photo_levels[level], render_levels[level], depth_levels[level], intrinsics, state)
+        if not np.isfinite(loss):
+            return Alignment(start, loss)
     render_from_photo = np.linalg.inv(state.photo_from_render)
     return Alignment(moved(camera.pose, se3_log(render_from_photo)), loss)
 
@@ -99,6 +101,8 @@ def _align_level(
             return np.inf
         loss = total / count
         step = _solved(columns, residuals, weights, state.gain)
+        if not np.all(np.isfinite(step)):
+            return np.inf
         state.photo_from_render = state.photo_from_render @ se3_exp(-step[:6])
         state.gain += step[6]
         state.bias += step[7]

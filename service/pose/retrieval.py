@@ -15,7 +15,8 @@ from jaxtyping import Float32, Float64, Int64
 WORDS = 32
 K_MEANS_ROUNDS = 12
 K_MEANS_SAMPLE = 20_000
-VOTERS = 300
+VOTERS, CANDIDATES = 150, 300
+"""Of the photo and of each view, the strongest: found the right view as often as all, in a fifth of the time."""
 
 
 def visual_words(descriptors: Float32[np.ndarray, "n d"], rng: np.random.Generator) -> Float32[np.ndarray, "words d"]:
@@ -55,8 +56,8 @@ def vote(
     Unlike VLAD's sum over the image it is not drowned by features of things that the scene doesn't have: each
     feature counts by how much a view's best answer to it exceeds the average view's.
     """
-    voters = descriptors[:VOTERS].T
-    best = np.stack([(view @ voters).max(0, initial=0.0) for view in views], 1)
+    voters = np.ascontiguousarray(descriptors[:VOTERS].T)
+    best = np.stack([(view[:CANDIDATES] @ voters).max(0, initial=0.0) for view in views], 1)
     return np.maximum(best - best.mean(1, keepdims=True), 0.0).sum(0, dtype=np.float64)
 
 

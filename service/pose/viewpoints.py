@@ -25,13 +25,13 @@ MAX_INDEX_VIEWS = 256
 MAX_FOUND_VIEWS = 128
 SPREAD = 0.35
 """A wide scene gets more views, until each training camera has one within this distance (see `spread`)."""
-SEARCH_PX = 96
+SEARCH_PX = 64
 SEARCH_FOV_DEG = 60.0
 SHELLS = (1.2, 2.0, 3.4)
 """Radii, in units of the radius that holds half of the opaque Gaussians."""
-SHELL_CANDIDATES = 100
-VOLUME_CANDIDATES = 200
-BEST, OFFSPRING = 60, 5
+SHELL_CANDIDATES = 60
+VOLUME_CANDIDATES = 150
+BEST, OFFSPRING = 50, 4
 MIN_OPACITY = 0.3
 
 

@@ -1,0 +1,200 @@
+"""The contract of every estimator, in a small room with the real renderer, and what the default one promises."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
+
+from service.errors import InvalidOptions
+from service.estimators import ESTIMATORS
+from service.geometry import moved, pose_distance
+from service.interfaces import Tools
+from service.localize import LoadedScene, Request, localize
+from service.pose.views import to_uint8
+from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query, Reason, Status
+
+LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+DEFAULT = "view_index"
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    folder = tmp_path_factory.mktemp("room")
+    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+
+
+@pytest.fixture(scope="module", params=ESTIMATORS.names())
+def estimator(request: pytest.FixtureRequest) -> str:
+    reason = ESTIMATORS.missing(request.param)
+    if reason:
+        pytest.skip(reason)
+    return request.param
+
+
+def photo_at(room: LoadedScene, pose: Pose, lens: Intrinsics = LENS, prior: Pose | None = None) -> Query:
+    """A photo that nobody trained with: a render, darker and noisy."""
+    rgb = room.rasterizer.render([Camera(lens, pose)])[0].rgb
+    noise = np.random.default_rng(0).normal(0, 0.02, rgb.shape).astype(np.float32)
+    return Query(to_uint8(0.85 * rgb + 0.04 + noise), lens, "given", lens, prior)
+
+
+def unseen_pose(seed: int = 0) -> Pose:
+    rng = np.random.default_rng(seed)
+    pose = pose_at(rng.uniform(0, 2 * np.pi), 0.1)
+    return moved(pose, np.concatenate([rng.uniform(-0.1, 0.1, 3), rng.uniform(-0.15, 0.15, 3)]))
+
+
+def assert_near(found: Pose, truth: Pose, degrees: float = 0.2, units: float = 0.01) -> None:
+    """The room is 4 x 3 x 2.5. Seen: up to 0.05 degrees and 0.002."""
+    angle, distance = pose_distance(found, truth)
+    assert angle < degrees
+    assert distance < units
+
+
+def trace(records: tuple[IterationRecord, ...]) -> list[tuple]:
+    return [(r.stage, r.pose.world_from_camera.tobytes(), r.num_matches, r.num_inliers) for r in records]
+
+
+# --- every estimator
+
+
+def test_finds_a_planted_pose_from_a_prior_nearby(estimator: str, room: LoadedScene) -> None:
+    truth = unseen_pose()
+    prior = moved(truth, np.array([0.05, -0.05, 0.03, 0.05, 0.02, -0.05]))
+    found = localize(photo_at(room, truth, prior=prior), room, Request(estimator))
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+
+
+def test_the_trace_is_well_formed(estimator: str, room: LoadedScene) -> None:
+    truth = unseen_pose(1)
+    found = localize(photo_at(room, truth, prior=truth), room, Request(estimator))
+    assert found.records
+    for record in found.records:
+        assert record.stage
+        assert record.matches is None or len(record.matches.inlier) <= MatchVectors.LIMIT
+        assert record.matches is None or record.num_matches is not None
+        if record.candidates:
+            assert len(record.candidates.scores) == len(record.candidates.world_from_camera)
+            assert np.all(np.isfinite(record.candidates.scores))
+    assert np.array_equal(found.records[-1].pose.world_from_camera, found.pose.world_from_camera)
+
+
+def test_the_same_seed_gives_the_same_trace(estimator: str, room: LoadedScene) -> None:
+    query = photo_at(room, unseen_pose(2), prior=unseen_pose(2))
+    a, b = (localize(query, room, Request(estimator, seed=5)) for _ in range(2))
+    assert trace(a.records) == trace(b.records)
+    assert a.verdict.score == b.verdict.score
+
+
+def test_can_be_stopped_at_any_record(estimator: str, room: LoadedScene) -> None:
+    """Every record carries an answer; closing the generator early is no error."""
+    plugin = ESTIMATORS.load(estimator)
+    query = photo_at(room, unseen_pose(3), prior=unseen_pose(3))
+    for count in (1, 2, 3):
+        tools = Tools(room.scene, room.rasterizer, room.matcher, np.random.default_rng(0), room.prepare(estimator))
+        steps = plugin.run(query, tools, plugin.Options())
+        records = [record for record, _ in zip(steps, range(count), strict=False)]
+        steps.close()
+        assert all(isinstance(record.pose, Pose) for record in records)
+
+
+def test_a_photo_without_texture_is_no_error(estimator: str, room: LoadedScene) -> None:
+    blank = Query(np.full((HEIGHT, WIDTH, 3), 120, np.uint8), LENS, "given", LENS)
+    found = localize(blank, room, Request(estimator))
+    assert found.verdict.status is Status.NOT_LOCALIZED
+    assert found.verdict.reason is Reason.FEW_FEATURES
+
+
+# --- the default: no prior at all
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_needs_no_prior(seed: int, room: LoadedScene) -> None:
+    truth = unseen_pose(seed)
+    found = localize(photo_at(room, truth), room)
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+    assert found.verdict.covariance is not None
+    assert [record.stage for record in found.records][:2] == ["retrieve", "match"]
+
+
+def test_another_matcher_will_do(room: LoadedScene) -> None:
+    other = LoadedScene.of(room.scene, matcher="sift")
+    found = localize(photo_at(other, unseen_pose(1)), other)
+    assert found.matcher == "sift"
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, unseen_pose(1))
+
+
+@pytest.mark.parametrize("quarter_turns", [1, 2])
+def test_a_turned_photo_is_found_by_turning_it(quarter_turns: int, room: LoadedScene) -> None:
+    truth = moved(unseen_pose(4), np.array([0, 0, np.pi / 2 * quarter_turns, 0, 0, 0]))
+    found = localize(photo_at(room, truth), room)
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+    assert "turn" in {record.stage for record in found.records}
+
+
+def test_a_photo_half_hidden_is_found_or_refused_but_never_wrong(room: LoadedScene) -> None:
+    truth = unseen_pose(5)
+    query = photo_at(room, truth)
+    for share in (0.2, 0.35, 0.6):
+        rgb = query.rgb.copy()
+        rgb[:, : int(share * WIDTH)] = [200, 30, 30]
+        found = localize(replace(query, rgb=rgb), room)
+        if found.verdict.status is Status.LOCALIZED:
+            assert_near(found.pose, truth, 0.5, 0.02)
+        assert share > 0.2 or found.verdict.status is Status.LOCALIZED
+
+
+def test_a_photo_of_another_place_is_not_localized(room: LoadedScene, tmp_path: Path) -> None:
+    """The room painted anew: same geometry, other pictures on the walls."""
+    rng = np.random.default_rng(8)
+    scene = room.scene
+    shuffled = replace(scene, sh=np.asarray(scene.sh)[rng.permutation(scene.count)])
+    foreign = LoadedScene.of(shuffled)
+    found = localize(photo_at(foreign, unseen_pose()), room)
+    assert found.verdict.status is Status.NOT_LOCALIZED
+    assert found.verdict.score < 0.25
+    options = ESTIMATORS.load(DEFAULT).Options(escalate=False)
+    once = localize(photo_at(foreign, unseen_pose()), room, Request(options=options))
+    assert {record.stage for record in once.records}.isdisjoint({"turn", "vote"})
+    assert not {record.stage for record in found.records}.isdisjoint({"turn", "vote"})
+
+
+def test_without_training_cameras_the_room_is_found_from_the_inside(
+    room: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, count in (("SHELL_CANDIDATES", 20), ("VOLUME_CANDIDATES", 80), ("BEST", 20)):
+        monkeypatch.setattr(f"service.pose.viewpoints.{name}", count)
+    bare = LoadedScene.of(replace(room.scene, cameras=()))
+    half = np.array([2.0, 1.5, 1.25])
+    views = bare.prepare(DEFAULT).views
+    inside = [np.all(np.abs(view.camera.pose.position_in_world) < half) for view in views]
+    assert np.mean(inside) > 0.5
+    located = [localize(photo_at(bare, unseen_pose(seed)), bare) for seed in range(3)]
+    for seed, found in enumerate(located):
+        assert found.verdict.status is Status.LOCALIZED
+        assert_near(found.pose, unseen_pose(seed))
+
+
+def test_a_prior_is_one_more_candidate_and_may_be_wrong(room: LoadedScene) -> None:
+    truth = unseen_pose(2)
+    right = localize(photo_at(room, truth, prior=truth), room)
+    away = moved(truth, np.array([0, 2.5, 0, 0, 0, 0]))
+    wrong = localize(photo_at(room, truth, prior=away), room)
+    for found in (right, wrong):
+        assert found.verdict.status is Status.LOCALIZED
+        assert_near(found.pose, truth)
+    assert len(right.records) <= len(wrong.records)
+
+
+@pytest.mark.parametrize("candidates", [0, -1, 65])
+def test_senseless_options_are_refused(candidates: int) -> None:
+    with pytest.raises(InvalidOptions, match="candidates"):
+        ESTIMATORS.load(DEFAULT).Options(candidates=candidates)
