@@ -15,7 +15,7 @@ import pytest
 import service.localize
 from service.errors import EstimatorFault
 from service.geometry import moved
-from service.interfaces import Features, Frame
+from service.interfaces import Features, Frame, SceneGradients
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.types import (
     Camera,
@@ -44,6 +44,12 @@ class Nothing:
         shape = (cameras[0].intrinsics.height, cameras[0].intrinsics.width)
         zero = np.zeros(shape, np.float32)
         return [Frame(np.zeros((*shape, 3), np.float32), zero, zero, zero) for _ in cameras]
+
+    def pose_gradient(self, *args: object) -> np.ndarray:
+        raise NotImplementedError
+
+    def scene_gradients(self, *args: object) -> SceneGradients:
+        raise NotImplementedError
 
     def extract(self, rgb: np.ndarray, limit: int) -> Features:
         return Features(np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 8), np.float32))

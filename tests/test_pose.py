@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry import look_at, moved, pose_distance, project, se3_log, transformed
-from service.interfaces import Features, Frame, Tools
+from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.alignment import align
 from service.pose.gate import Scale, colour_agreement, covariance_of, gradient_agreement, verify
 from service.pose.index import built_index, prepared_index
@@ -39,6 +39,12 @@ class PaintedWalls:
     """A rasterizer that is exact: rays meet a wall at z = 0 and a nearer, smaller board, both smoothly painted."""
 
     name = "painted_walls"
+
+    def pose_gradient(self, *args: object) -> np.ndarray:
+        raise NotImplementedError
+
+    def scene_gradients(self, *args: object) -> SceneGradients:
+        raise NotImplementedError
 
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         return [self._render(camera) for camera in cameras]
@@ -168,7 +174,7 @@ def test_features_on_depth_edges_and_in_the_void_are_not_lifted() -> None:
     points = np.array([[10.5, 10.5], [19.5, 10.5], [20.5, 10.5], [30.5, 10.5], [10.5, 35.5]], np.float32)
     features = Features(points, np.ones(5, np.float32), np.eye(5, dtype=np.float32))
     frame = Frame(np.zeros((40, 40, 3), np.float32), alpha, depth, depth)
-    view = lifted(features, frame, Camera(Intrinsics(40, 40, 50, 50, 20, 20), Pose(np.eye(4))))
+    view = lifted(features, frame, Camera(Intrinsics(40, 40, 50.0, 50.0, 20.0, 20.0), Pose(np.eye(4))))
     assert view.features.points_px.tolist() == [[10.5, 10.5], [30.5, 10.5]]
     assert np.allclose(view.points_in_world[:, 2], [2, 3])
 
@@ -185,7 +191,7 @@ def test_features_of_the_turned_photo_lie_where_they_are_in_the_photo(quarter_tu
 
     rgb = np.zeros((384, 512, 3), np.uint8)
     rgb[100, 37] = 255
-    lens = Intrinsics(512, 384, 400, 400, 256, 192)
+    lens = Intrinsics(512, 384, 400.0, 400.0, 256.0, 192.0)
     tools = Tools(a_scene(), PaintedWalls(), BrightDot(), np.random.default_rng(0))
     found = photo_features(Query(rgb, lens, "given", lens), tools, quarter_turns)
     assert found.points_px.tolist() == [[37.5, 100.5]]
@@ -409,8 +415,8 @@ def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place()
 
 @given(st.floats(-10, 1000), st.floats(-10, 1000))
 def test_scales_are_monotonous_and_meet_their_marks(a: float, b: float) -> None:
-    scale = Scale(15, 50, 400)
-    assert (scale(0), scale(15), scale(50), scale(400)) == (0, 0.25, 0.5, 1)
+    scale = Scale(15.0, 50.0, 400.0)
+    assert (scale(0.0), scale(15.0), scale(50.0), scale(400.0)) == (0, 0.25, 0.5, 1)
     assert (a <= b) <= (scale(a) <= scale(b))
     assert 0 <= scale(a) <= 1
 

@@ -56,7 +56,7 @@ class Scale:
 # (mirrored view of repeated spheres), 0.81, 0.60 and 91 (seen one sphere further); the next 0.37 and 14.
 GRADIENTS = Scale(0.4, 0.65, 0.95)
 COLOURS = Scale(0.3, 0.62, 0.95)
-INLIERS = Scale(15, 50, 400)
+INLIERS = Scale(15.0, 50.0, 400.0)
 COVERAGE = Scale(0.02, 0.04, 0.3)
 
 
@@ -75,13 +75,14 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     intrinsics = view.camera.intrinsics
     error = reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
     inlier = error * (intrinsics.long_side / query.intrinsics.long_side) < MAX_ERROR_PX
+    inliers = int(inlier.sum())
     resized = photo_at(query, tools, intrinsics)
     agreement, colours = gradient_agreement(resized, frame), colour_agreement(resized, frame)
     coverage = float((frame.alpha > MIN_ALPHA).mean())
     score, reason = min(
         (GRADIENTS(agreement), Reason.RENDER_DISAGREES),
         (COLOURS(colours), Reason.RENDER_DISAGREES),
-        (INLIERS(inlier.sum()), Reason.FEW_INLIERS),
+        (INLIERS(float(inliers)), Reason.FEW_INLIERS),
         (COVERAGE(coverage), Reason.LITTLE_SCENE_IN_VIEW),
     )
     status = Status.LOCALIZED if score >= 0.5 else Status.UNCERTAIN if score >= 0.25 else Status.NOT_LOCALIZED
@@ -89,10 +90,10 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
         reason = Reason.AGREES
     elif len(photo.scores) < MIN_FEATURES:
         reason = Reason.FEW_FEATURES
-    elif status is Status.NOT_LOCALIZED and GRADIENTS(agreement) < 0.25 and INLIERS(inlier.sum()) < 0.25:
+    elif status is Status.NOT_LOCALIZED and GRADIENTS(agreement) < 0.25 and INLIERS(float(inliers)) < 0.25:
         reason = Reason.NO_MATCHING_VIEW
     covariance = covariance_of(found.points_in_world[inlier], error[inlier], Camera(query.intrinsics, pose))
-    return Verdict(status, reason, score, int(inlier.sum()), agreement, coverage, covariance)
+    return Verdict(status, reason, score, inliers, agreement, coverage, covariance)
 
 
 def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
