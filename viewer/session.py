@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import viser
 
-from service.types import Camera, IterationRecord
+from service.types import Camera, IterationRecord, Pose
 from viewer.client import ServiceTrouble
 from viewer.draw import Mode, overlaid, reduced, side_by_side
 from viewer.feed import JobFeed, Library
@@ -160,7 +160,7 @@ class Session:
         if wanted is not None and (self._feed is None or self._feed.id != wanted):
             self._open(wanted)
         elif wanted is None and self._scene_id is None and self._library.jobs is not None:
-            self._show_scene(self._library.service.first_scene())
+            self._show_scene(self._library.service.first_scene(), None)
             self.panel.headline.content = headline_html(None, 0, "")
         if self._feed is not None:
             label = next((job_label(job) for job in jobs if job.id == self._feed.id), None)
@@ -187,21 +187,22 @@ class Session:
         self.panel.headline.content = headline_html(feed.job, count, feed.trouble)
         if feed.job is None:
             return
-        self._show_scene(feed.job.scene)
+        newest = feed.records[count - 1].pose if count else None
+        self._show_scene(feed.job.scene, newest)
         self._playback.grow(count)
         self.panel.step.max = max(0, count - 1)
         self.panel.step.disabled = self.panel.look_through.disabled = self.panel.fly.disabled = count == 0
         self.stage.show_trajectory(feed.records[:count], feed.job)
         # A job that has just been opened is looked at where it is; later on the view is the user's.
-        if count and (self._shown is None or time.monotonic() < self._opened + _ARRIVAL_S):
-            self.stage.look_over(feed.records[count - 1].pose)
+        if newest is not None and (self._shown is None or time.monotonic() < self._opened + _ARRIVAL_S):
+            self.stage.look_over(newest)
         self._show()
 
-    def _show_scene(self, scene_id: str | None) -> None:
+    def _show_scene(self, scene_id: str | None, pose: Pose | None) -> None:
         if scene_id is None or scene_id == self._scene_id:
             return
         content = self._library.scene(scene_id)
-        self.stage.show_scene(content)
+        self.stage.show_scene(content, pose)
         self._scene_id = scene_id
         self.panel.scene.content = scene_html(
             content.view.name, len(content.splats.rgba), content.splats.total, len(content.view.cameras)

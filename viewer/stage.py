@@ -40,8 +40,8 @@ class Stage:
         )
         self._nodes: dict[Layer, dict[str, viser.SceneNodeHandle]] = {layer: {} for layer in self._visible}
 
-    def show_scene(self, content: SceneContent) -> None:
-        """Draw a scene and go to its first view."""
+    def show_scene(self, content: SceneContent, pose: Pose | None) -> None:
+        """Draw a scene; stand behind a camera in it, or at its first view."""
         self._scene = content
         scene, client = content.extent, self._client
         cameras = [named.camera for named in content.view.cameras]
@@ -49,7 +49,10 @@ class Stage:
             client.scene.set_up_direction(scene.up)
             # Nearer than this nothing is drawn: the frusta that one stands in would cover what one looks at.
             client.camera.near, client.camera.far = 1.15 * scene.frustum, 500 * scene.radius
-            self.look(shapes.first_view(scene, cameras))
+            if pose is None:
+                self.look(shapes.first_view(scene, cameras))
+            else:
+                self.look_over(pose)
         client.flush()
         background = np.array([[content.view.background_rgb]])
         client.scene.set_background_image((255 * background).astype(np.uint8), format="png")
