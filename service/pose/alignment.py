@@ -6,11 +6,13 @@ For the pixels x of a render I (intensity, depth: the point X in the render's ca
 
 by inverse compositional steps (Baker and Matthews, IJCV 2004): the render is moved by a small twist, so its
 gradients and Jacobians are computed once; each step solves 8 normal equations (twist, gain, bias) with weights
-1 / max(|r|, DELTA). Coarse to fine over an image pyramid. The render's own change with the pose (occlusion,
-highlights) is ignored: render again at the result and repeat.
+1 / max(|r|, DELTA) that fall to nothing at CUT times the median residual: what hides the scene has no say. Coarse
+to fine over an image pyramid. The render's own change with the pose (occlusion, highlights) is ignored: render
+again at the result and repeat.
 
-Measured in the research: L1 with weights, Tukey, RGB, forward or symmetric gradients are equal on real photos; L2
-is worst; two renders are enough; the basin with four levels is some 10 degrees.
+Measured in the research: RGB, forward or symmetric gradients are no better on real photos; L2 is worst; two renders
+are enough; the basin with four levels is some 10 degrees. The cut, here: with a third of the photo hidden medians
+halve, and clean photos of poor models gain as much; blurred ones lose a little.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ from service.types import Camera, Intrinsics, Pose
 
 DELTA = 0.02
 """Residuals (0..1) below it are noise: they weigh like least squares."""
+CUT = 9.0
+MIN_SPREAD = 0.01
 MAX_STEPS = 12
 SIGMA_PX = 0.7
 """Blur of photo and render at each level: renders are softer than photos."""
@@ -100,6 +104,7 @@ def _align_level(
         if count < MIN_PIXELS:
             return np.inf
         loss = total / count
+        weights *= _bisquare(residuals, weights)
         step = _solved(columns, residuals, weights, state.gain)
         if not np.all(np.isfinite(step)):
             return np.inf
@@ -110,6 +115,14 @@ def _align_level(
         if moved_px < SETTLED_PX:
             break
     return loss
+
+
+def _bisquare(residuals: Float32[np.ndarray, "n"], weights: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
+    """Return Tukey's weights: 1 at no residual, 0 from CUT medians on."""
+    some = np.abs(residuals[::4][weights[::4] > 0])
+    spread = max(float(np.median(some)), MIN_SPREAD) if len(some) else MIN_SPREAD
+    ratio = residuals / np.float32(CUT * spread)
+    return np.maximum(1 - ratio * ratio, 0) ** 2
 
 
 def _solved(
