@@ -174,7 +174,9 @@ def localize(
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         task, query = make_task(body, fields, loaded)
         estimate = run(query, loaded, task.request)
-        results.append((body.name, result_out(estimate, timing_out(task.decode), versions())))
+        results.append(
+            (body.name, result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor))
+        )
         if not as_json:
             out.print(_line(*results[-1]), markup=False, highlight=False, soft_wrap=True)
     if as_json:
@@ -213,9 +215,9 @@ def render(
     intrinsics: IntrinsicsOption = "",
 ) -> None:
     """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
-    from service.api.intake import prior_from, read_fields
-    from service.images import encode_image, intrinsics_from
-    from service.types import Camera, Intrinsics
+    from service.api.intake import read_fields
+    from service.api.pictures import picture
+    from service.api.schemas import RenderIn
 
     fields = read_fields({"prior": _json(pose, "prior")})
     if fields.prior is None:
@@ -223,12 +225,10 @@ def render(
     kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
     if kind not in ("png", "jpg"):
         raise InvalidRequest("must end with .png or .jpg.", where="--out")
-    given = _json(intrinsics, "intrinsics")
-    loaded = _loaded(scene)
-    cameras = [named.camera.intrinsics for named in loaded.scene.cameras]
-    default = cameras[0] if cameras else Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
-    camera = Camera(intrinsics_from(given) if given else default, prior_from(fields.prior))
-    out_file.write_bytes(encode_image(loaded.rasterizer.render([camera])[0].rgb, kind))
+    wanted = RenderIn(
+        pose=fields.prior, intrinsics=_json(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
+    )
+    out_file.write_bytes(picture(_loaded(scene), wanted))
 
 
 @bench_app.command("localize")

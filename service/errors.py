@@ -8,6 +8,7 @@
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
       |     `-- SceneNotReady  (still loading; try again later)
       |-- JobNotFound, RecordNotFound, JobNotReady
+      |-- NoPose, NoGeoAnchor  what an export needs isn't there
       |-- QueueFull          too much work is waiting; try again later
       |-- BackendMissing     a package or device that a plug-in needs is not here
       `-- EstimatorFault     an estimator broke its contract (our mistake)
@@ -94,6 +95,14 @@ class RecordNotFound(SplatfixError):
 
 class JobNotReady(SplatfixError):
     code = "job_not_ready"
+
+
+class NoPose(SplatfixError):
+    code = "no_pose"
+
+
+class NoGeoAnchor(SplatfixError):
+    code = "no_geo_anchor"
 
 
 class QueueFull(SplatfixError):

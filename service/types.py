@@ -132,6 +132,21 @@ class NamedCamera:
 
 
 @dataclass(frozen=True, slots=True)
+class GeoAnchor:
+    """Where on Earth a scene is: its world frame in the local East-North-Up frame of a point on WGS84."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    """Above the ellipsoid."""
+    enu_from_world: Float64[np.ndarray, "4 4"]
+    """A similarity: turns, shifts and scales the world frame to metres east, north and up of the point."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "enu_from_world", frozen(self.enu_from_world, np.float64))
+
+
+@dataclass(frozen=True, slots=True)
 class SceneInfo:
     """What is known of a scene besides its Gaussians."""
 
@@ -150,6 +165,7 @@ class SceneInfo:
     """Median focal length of the training photos; the renderer scales its dilation by it."""
     training_long_side_px: int | None = None
     """Long side of the training photos, where the focal length is unknown."""
+    geo_anchor: GeoAnchor | None = None
     warnings: tuple[str, ...] = ()
 
 

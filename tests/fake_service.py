@@ -166,7 +166,7 @@ class FakeJob:
             status=result and result.status,
             score=result and result.score,
             links=JobLinks(**links),
-            photo=PhotoOut(name="<b>holiday</b>.jpg", intrinsics=intrinsics_out(PHOTO)),
+            photo=PhotoOut(name="<b>holiday</b>.jpg", sha256="0" * 64, intrinsics=intrinsics_out(PHOTO)),
             seed=0,
             budget_s=None,
             options={},

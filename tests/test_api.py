@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import importlib
 import io
 import json
@@ -319,6 +320,32 @@ def test_old_finished_jobs_are_forgotten(stepping):
         assert [client.get(path).status_code for path in paths] == [404, 404, 200, 200]
 
 
+def test_the_list_of_jobs_has_pages_and_filters(stepping):
+    scenes = {name: make_scene(name) for name in ("attic", "cellar")}
+    with serving(create_app(settings(), scenes)) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        made = [post(client, scene=("attic", "cellar")[k % 2], seed=str(k)).json()["id"] for k in range(5)]
+        failed = post(client, photo(size=(64, 48)), scene="attic", options={"fail": "bug"}).json()
+
+        def listed(**query) -> list[str]:
+            return [job["id"] for job in client.get("/jobs", params=query).json()["jobs"]]
+
+        assert listed() == [failed["id"], *made[::-1]]
+        assert listed(scene="cellar") == [made[3], made[1]]
+        assert listed(state="failed") == [failed["id"]]
+        assert listed(status="not_localized", scene="attic") == [made[4], made[2], made[0]]
+        assert listed(photo=hashlib.sha256(photo()).hexdigest()) == made[::-1]
+        assert listed(photo="0" * 64) == []
+        assert_problem(client.get("/jobs", params={"state": "lost"}), 400, "invalid_request", "query.state")
+        seen, path = [], "/jobs?scene=attic&limit=2"
+        while path:
+            page = client.get(path).json()
+            assert len(page["jobs"]) <= 2
+            seen += [job["id"] for job in page["jobs"]]
+            path = page["next"]
+        assert seen == listed(scene="attic")
+
+
 # ------------------------------------------------------------------ pictures and scenes
 
 
@@ -342,6 +369,79 @@ def test_a_render_that_may_still_come_is_not_ready(client, stepping):
     path = post(client, prefer="", options={"hold": True}).headers["location"]
     answer = client.get(f"{path}/iterations/2/render.jpg")
     assert (answer.status_code, answer.json()["code"]) == (409, "job_not_ready")
+
+
+@pytest.mark.parametrize("wanted", ["png", "jpeg", "depth"])
+def test_a_scene_is_rendered_from_any_pose(shared, wanted):
+    pose = {"world_from_camera": TURNED.tolist()}
+    intrinsics = {"width": 40, "height": 30, "fx": 30, "fy": 30, "cx": 20, "cy": 15}
+    body = {"pose": pose, "intrinsics": intrinsics, "format": wanted}
+    answer = shared.post("/scenes/room/render", json=body)
+    assert answer.status_code == 200
+    if wanted == "depth":
+        depth = np.load(io.BytesIO(answer.content), allow_pickle=False)
+        assert (depth.dtype, depth.shape, depth[3, 4]) == (np.dtype("<f4"), (30, 40), 0.5)
+    else:
+        assert answer.headers["content-type"] == f"image/{wanted}"
+        image = Image.open(io.BytesIO(answer.content))
+        assert (image.size, image.format) == ((40, 30), wanted.upper())
+        assert image.getpixel((3, 4)) == (128, 128, 128)
+
+
+def test_the_rendered_camera_is_the_one_that_was_asked_for(stepping):
+    """A scene of one Gaussian before the camera, rendered for real: it appears where it projects to."""
+    one = GaussianScene(
+        means=np.array([[0.4, 0.0, 2.0]], np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 0.05, np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.full((1, 1, 3), 1.7, np.float32),
+        info=SceneInfo("dot", "Dot", "ab" * 32, "ply"),
+        cameras=(NamedCamera("a.jpg", Camera(Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0), Pose(TURNED))),),
+    )
+    with serving(create_app(settings(), {"dot": LoadedScene.of(one)})) as client:
+        moved = np.eye(4)
+        moved[2, 3] = -1.0  # one unit back: the depth is 3
+        for pose in ({"world_from_camera": moved.tolist()}, {"position": [0, 0, -1], "quaternion_wxyz": [1, 0, 0, 0]}):
+            answer = client.post("/scenes/dot/render", json={"pose": pose, "format": "depth"})
+            depth = np.load(io.BytesIO(answer.content))
+            rows, columns = np.nonzero(depth)
+            # The first training camera's lens is taken: x = 320 + 500 * 0.4 / 3. The centre of the
+            # visible disc is that within a pixel.
+            assert abs(columns.mean() + 0.5 - 386.7) < 1
+            assert abs(rows.mean() + 0.5 - 240) < 1
+            assert depth.max() == pytest.approx(3.0, abs=1e-3)
+
+
+GIVEN = {"world_from_camera": TURNED.tolist()}
+DOUBLED = {"world_from_camera": np.diag([2, 2, 2, 1]).tolist()}
+TINY = {"width": 9, "height": 9, "fx": 1, "fy": 1, "cx": 1, "cy": 1}
+BENT = TINY | {"model": "OPENCV", "distortion": [0, 0, 0, 0]}
+HUGE = TINY | {"width": 90_000, "height": 90_000}
+
+
+@pytest.mark.parametrize(
+    ("body", "status", "code", "where"),
+    [
+        ({}, 400, "invalid_request", "body.pose"),
+        ({"pose": {}}, 422, "invalid_prior", "pose"),
+        ({"pose": DOUBLED}, 422, "invalid_prior", "pose.world_from_camera"),
+        ({"pose": GIVEN, "format": "gif"}, 400, "invalid_request", "body.format"),
+        ({"pose": GIVEN, "intrinsics": {}}, 422, "invalid_intrinsics", "intrinsics.width"),
+        ({"pose": GIVEN, "intrinsics": HUGE}, 422, "invalid_intrinsics", "intrinsics"),
+        ({"pose": GIVEN, "intrinsics": BENT}, 422, "invalid_intrinsics", "intrinsics.model"),
+    ],
+)
+def test_a_bad_render_request_is_told(shared, body, status, code, where):
+    assert_problem(shared.post("/scenes/room/render", json=body), status, code, where)
+
+
+def test_a_pose_is_exported_only_if_there_is_one(client, stepping):
+    nothing = post(client).json()["links"]["export"]  # grey: not localized
+    assert_problem(client.get(f"{nothing}/colmap"), 409, "no_pose", "job")
+    assert_problem(client.get(f"{nothing}/dwg"), 400, "invalid_request", "path.format")
+    held = post(client, prefer="", options={"hold": True}).json()["links"]["export"]
+    assert_problem(client.get(f"{held}/tum"), 409, "job_not_ready", "job")
 
 
 def test_splats_are_the_most_important_in_the_documented_layout(shared):

@@ -47,6 +47,7 @@ WRAPPED = {
     "annotated_types": {"service/api/schemas.py"},
     "pydantic": {"service/api", "service/__main__.py"},
     "pydantic_settings": {"service/api/settings.py"},
+    "pyproj": {"service/api/geo.py"},
     "yaml": {"service/api/app.py"},
     "websockets": {"service/api/relay.py"},
     "httpx": {"service/api/relay.py", "viewer/client.py"},

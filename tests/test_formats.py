@@ -343,6 +343,9 @@ class TestFolder:
             assert callable(reader.read)
 
 
+ANCHOR = {"latitude": 47.0, "longitude": 8.0, "height": 400.0, "enu_from_world": np.eye(4).tolist()}
+
+
 class TestManifest:
     def test_all_keys(self, tmp_path):
         manifest = {
@@ -355,12 +358,15 @@ class TestManifest:
             "background": [0.1, 0.2, 0.3],
             "training_size": [1280, 720],
             "render_mode": "antialiased",
+            "geo_anchor": ANCHOR,
         }
         info = load_scene(written(tmp_path, name="room.ply", manifest=manifest)).info
         assert (info.name, info.up_in_world, info.metres_per_unit) == ("Room", (0, 0, 1), 0.5)
         assert info.background_rgb == (0.1, 0.2, 0.3)
         assert (info.training_long_side_px, info.training_focal_px) == (1280, None)
         assert info.render_mode == "antialiased"
+        assert info.geo_anchor is not None
+        assert (info.geo_anchor.latitude_deg, info.geo_anchor.height_m) == (47.0, 400.0)
 
     @pytest.mark.parametrize(
         ("manifest", "error", "says"),
@@ -381,6 +387,9 @@ class TestManifest:
             ({"world_from_scene": np.diag([1, 1, -1, 1]).tolist()}, CorruptScene, "mirroring"),
             ({"world_from_scene": np.diag([1, 2, 1, 1]).tolist()}, CorruptScene, "shear"),
             ({"world_from_scene": np.diag([1, 1, 1, 2]).tolist()}, CorruptScene, "last row"),
+            ({"geo_anchor": {"latitude": 1}}, CorruptScene, "exactly the keys"),
+            ({"geo_anchor": ANCHOR | {"latitude": 91}}, CorruptScene, "geo_anchor.latitude"),
+            ({"geo_anchor": ANCHOR | {"enu_from_world": np.diag([1, 2, 1, 1]).tolist()}}, CorruptScene, "shear"),
             ({"world_from_scene": [[1, 0], [0, 1]]}, CorruptScene, "4 x 4"),
         ],
     )

@@ -29,7 +29,8 @@ from service import __version__
 from service.api.jobs import Jobs
 from service.api.problems import install, problem_response
 from service.api.relay import Relay
-from service.api.routes import Parts, router
+from service.api.routes import router
+from service.api.routes.parts import Parts
 from service.api.scenes import Scenes
 from service.api.schemas import LocalizeIn, Problem, Record
 from service.api.settings import Settings

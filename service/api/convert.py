@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.api.geo import geographic
 from service.api.schemas import (
     Axes,
     CameraOut,
     CandidatesOut,
     Covariance,
+    GeoPose,
+    GeoPosition,
+    GeoQuaternion,
     IntrinsicsOut,
     MatchesOut,
     Matrix,
@@ -24,6 +28,7 @@ from service.geometry import quat_from_rotation
 from service.types import (
     HINTS,
     Camera,
+    GeoAnchor,
     Intrinsics,
     IterationRecord,
     NamedCamera,
@@ -62,6 +67,13 @@ def pose_out(pose: Pose) -> PoseOut:
             camera_from_world=transform_out(opengl.camera_from_world),
         ),
     )
+
+
+def geopose_out(anchor: GeoAnchor, pose: Pose) -> GeoPose:
+    """Spell out a pose on Earth."""
+    (latitude, longitude, height), (w, x, y, z) = geographic(anchor, pose)
+    position = GeoPosition(lat=latitude, lon=longitude, h=height)
+    return GeoPose(position=position, quaternion=GeoQuaternion(x=x, y=y, z=z, w=w))
 
 
 def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
@@ -130,8 +142,10 @@ def timing_out(timing: StageTiming) -> Timing:
     return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
 
 
-def result_out(estimate: PoseEstimate, decode: Timing, versions: dict[str, str]) -> Result:
-    """Spell out a finished estimate; `decode` is what reading the photo took."""
+def result_out(
+    estimate: PoseEstimate, decode: Timing, versions: dict[str, str], anchor: GeoAnchor | None = None
+) -> Result:
+    """Spell out a finished estimate; `decode` is what reading the photo took, `anchor` the scene's."""
     verdict = estimate.verdict
     return Result(
         status=verdict.status,
@@ -139,6 +153,7 @@ def result_out(estimate: PoseEstimate, decode: Timing, versions: dict[str, str])
         hint=HINTS[verdict.reason],
         score=verdict.score,
         pose=pose_out(estimate.pose),
+        geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
         inliers=verdict.inliers,

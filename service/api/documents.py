@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from datetime import datetime
 from functools import cache
 from importlib import metadata
 
@@ -21,18 +22,21 @@ from service.api.schemas import (
     JobOut,
     JobSummary,
     PhotoOut,
+    Result,
     SceneLinks,
     SceneOut,
     SceneSummary,
     Trace,
 )
 from service.api.settings import Settings
+from service.errors import JobNotReady, NoPose
 from service.estimators import ESTIMATORS
 from service.localize import DEFAULT_MATCHER, DEFAULT_RASTERIZER
 from service.matchers import MATCHERS
 from service.plugins import PluginFolder
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
+from service.types import PoseEstimate, Status
 
 _PACKAGES = (
     "splatfix",
@@ -68,14 +72,27 @@ def job_document(job: Job, root: str) -> JobOut:
     estimate, error = (job.estimate, job.error) if job.done else (None, None)
     return JobOut(
         **summary,
-        photo=PhotoOut(name=job.task.photo_name, intrinsics=intrinsics_out(job.intrinsics)),
         seed=request.seed,
         budget_s=request.budget_s,
         options=job.task.options,
         prior=job.prior and pose_out(job.prior),
-        result=estimate and result_out(estimate, timing_out(job.task.decode), versions()),
+        result=estimate and job_result(job, estimate),
         error=error and problem_of(error, self),
     )
+
+
+def job_result(job: Job, estimate: PoseEstimate) -> Result:
+    """Describe the answer of a job."""
+    return result_out(estimate, timing_out(job.task.decode), versions(), job.task.scene.scene.info.geo_anchor)
+
+
+def answer(job: Job) -> tuple[str, datetime, Result]:
+    """Return the photo's name, when it came, and the result. Raises JobNotReady, NoPose."""
+    if not job.done:
+        raise JobNotReady(f"the job is {job.state}.", where="job")
+    if job.estimate is None or job.estimate.verdict.status is Status.NOT_LOCALIZED:
+        raise NoPose("the job found no pose that could be used.", where="job", hint="Its document says why.")
+    return job.task.photo_name, job.created, job_result(job, job.estimate)
 
 
 def _summary(job: Job, root: str) -> dict:
@@ -86,6 +103,9 @@ def _summary(job: Job, root: str) -> dict:
         "state": state,
         "scene": job.task.scene.scene.info.id,
         "estimator": job.task.request.estimator,
+        "photo": PhotoOut(
+            name=job.task.photo_name, sha256=job.task.photo_sha256, intrinsics=intrinsics_out(job.intrinsics)
+        ),
         "created": job.created,
         "started": job.started,
         "finished": job.finished,
@@ -99,6 +119,7 @@ def _summary(job: Job, root: str) -> dict:
             photo=f"{self}/photo",
             trace=f"{self}/trace",
             render=f"{self}/iterations/last/render.jpg",
+            export=f"{self}/export",
             viewer=f"{root}/viewer/jobs/{job.id}/",
         ),
     }

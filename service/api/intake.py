@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import hashlib
 import json
 import threading
 import time
@@ -125,13 +126,14 @@ def make_task(
         seed=fields.seed,
         budget_s=fields.budget_s,
     )
-    intrinsics = None if fields.intrinsics is None else _intrinsics_from(fields.intrinsics)
+    intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
     prior = None if fields.prior is None else prior_from(fields.prior)
     background = scene.scene.info.background_rgb
     wall, cpu = time.perf_counter(), time.thread_time()
     query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
     decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
-    return Task(scene, request, fields.options, body.name, decode), query
+    digest = hashlib.sha256(body.photo).hexdigest()
+    return Task(scene, request, fields.options, body.name, digest, decode), query
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
@@ -167,7 +169,8 @@ def options_adapter(kind: type) -> TypeAdapter:
         return _ADAPTERS[kind]
 
 
-def _intrinsics_from(values: Mapping[str, Any]) -> Intrinsics:
+def checked_intrinsics(values: Mapping[str, Any]) -> Intrinsics:
+    """Read intrinsics from outside. Raises InvalidIntrinsics, which names the field with its parent."""
     try:
         return intrinsics_from(values)
     except InvalidIntrinsics as error:
@@ -175,19 +178,19 @@ def _intrinsics_from(values: Mapping[str, Any]) -> Intrinsics:
         raise
 
 
-def prior_from(prior: PriorIn) -> Pose:
-    """Return the pose in our conventions. Raises InvalidPrior."""
+def prior_from(prior: PriorIn, where: str = "prior") -> Pose:
+    """Return the pose in our conventions. Raises InvalidPrior, at the field `where`."""
     spellings = ("world_from_camera", "camera_from_world", "position")
     given = [name for name in spellings if getattr(prior, name) is not None]
     if len(given) != 1 or (prior.position is None) != (prior.quaternion_wxyz is None):
         raise InvalidPrior(
             "give exactly one of: world_from_camera; camera_from_world; position and quaternion_wxyz.",
-            where="prior",
+            where=where,
         )
     try:
         pose = _as_given(prior)
     except InvalidPrior as error:
-        error.where = f"prior.{given[0]}"
+        error.where = f"{where}.{given[0]}"
         raise
     matrix = pose.camera_from_world if prior.camera_from_world else pose.world_from_camera
     return Pose(matrix @ OPENCV_FROM_OPENGL if prior.convention == "opengl" else matrix)

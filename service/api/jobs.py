@@ -38,7 +38,37 @@ class Task:
     options: dict[str, Any]
     """As the caller gave them; `request.options` is the same, parsed."""
     photo_name: str
+    photo_sha256: str
     decode: StageTiming
+
+
+@dataclass(frozen=True, slots=True)
+class JobFilter:
+    """Which jobs to list; None: any."""
+
+    scene: str | None = None
+    estimator: str | None = None
+    state: str | None = None
+    status: str | None = None
+    """Of the result."""
+    photo: str | None = None
+    """sha256 of the file."""
+    before: int | None = None
+    """Only jobs accepted before the one with that number."""
+
+    def fits(self, job: Job) -> bool:
+        estimate = job.estimate
+        facts = {
+            "scene": job.task.scene.scene.info.id,
+            "estimator": job.task.request.estimator,
+            "state": job.state,
+            "status": estimate and estimate.verdict.status,
+            "photo": job.task.photo_sha256,
+        }
+        wanted = {name: getattr(self, name) for name in facts}
+        return all(value in (None, facts[name]) for name, value in wanted.items()) and (
+            self.before is None or job.number < self.before
+        )
 
 
 class Job:
@@ -46,6 +76,8 @@ class Job:
 
     def __init__(self, task: Task, query: Query) -> None:
         self.id = secrets.token_hex(8)
+        self.number = 0
+        """In the order of acceptance, from 1."""
         self.task = task
         self.intrinsics = query.intrinsics
         """Of the photo that `jpeg` returns."""
@@ -233,6 +265,7 @@ class Jobs:
     def __init__(self, workers: int, queue_size: int, keep: int) -> None:
         self._keep = keep
         self._jobs: dict[str, Job] = {}
+        self._accepted = 0
         self._lock = threading.Lock()
         self._executor: Executor = ThreadExecutor(self._run, workers, queue_size)
 
@@ -241,6 +274,8 @@ class Jobs:
         job = Job(task, query)
         with self._lock:
             self._executor.submit(job)
+            self._accepted += 1
+            job.number = self._accepted
             self._jobs[job.id] = job
         return job
 
@@ -256,8 +291,15 @@ class Jobs:
         with self._lock:
             return list(reversed(self._jobs.values()))
 
+    def page(self, wanted: JobFilter, limit: int) -> list[Job]:
+        """Return the newest jobs that fit, at most `limit`."""
+        return [job for job in self.newest_first() if wanted.fits(job)][:limit]
+
     def waiting(self) -> int:
         return self._executor.waiting()
+
+    def running(self) -> int:
+        return sum(job.state == "running" for job in self.newest_first())
 
     def cancel(self, job: Job) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended."""

@@ -136,6 +136,6 @@ def _outside(loaded: LoadedScene) -> Camera:
     """A camera that looks at the middle of the Gaussians from outside."""
     means = loaded.scene.means
     centre = np.median(means, 0)
-    radius = float(np.median(np.linalg.norm(means - centre, axis=1)))
+    radius = float(np.median(np.linalg.norm(means - centre, axis=1))) or 1.0
     pose = look_at(centre + radius * np.array([0.0, 0.0, 3.0]), centre, np.array([0.0, 1.0, 0.0]))
     return Camera(Intrinsics(512, 384, 450.0, 450.0, 256.0, 192.0), pose)

@@ -163,6 +163,35 @@ class SceneRef(Model):
     sha256: str
 
 
+class GeoPosition(Model):
+    """On WGS84."""
+
+    lat: float = Field(ge=-90, le=90)
+    """Degrees."""
+    lon: float = Field(ge=-180, le=180)
+    """Degrees."""
+    h: float
+    """Metres above the ellipsoid."""
+
+
+class GeoQuaternion(Model):
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class GeoPose(Model):
+    """OGC GeoPose 1.0, Basic-Quaternion: where on Earth the camera is, and how it is turned.
+
+    The quaternion takes camera axes (OpenGL's and WebXR's: +x right, +y up, +z backwards) to the local East-North-Up
+    frame at the camera.
+    """
+
+    position: GeoPosition
+    quaternion: GeoQuaternion
+
+
 class Result(Model):
     """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
 
@@ -174,6 +203,8 @@ class Result(Model):
     """0..1; at least 0.5 is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
+    geopose: GeoPose | None
+    """The same on Earth, for scenes whose manifest has a `geo_anchor`."""
     intrinsics: IntrinsicsOut
     """Used for the whole upright photo."""
     intrinsics_source: Literal["given", "exif", "guessed"]
@@ -204,6 +235,8 @@ class JobLinks(Model):
     trace: str
     render: str
     """The scene rendered at the latest pose."""
+    export: str
+    """Followed by `/colmap`, `/nerfstudio`, `/tum` or `/geopose`."""
     viewer: str
 
 
@@ -211,6 +244,8 @@ class PhotoOut(Model):
     """The photo as it was decoded for the job: upright, undistorted, perhaps reduced."""
 
     name: str
+    sha256: str
+    """Of the file as it was sent: jobs on the same photo share it."""
     intrinsics: IntrinsicsOut
     """Pinhole, of the image that `/jobs/{id}/photo` returns."""
 
@@ -220,6 +255,7 @@ class JobSummary(Model):
     state: JobState
     scene: str
     estimator: str
+    photo: PhotoOut
     created: datetime
     started: datetime | None
     finished: datetime | None
@@ -236,7 +272,6 @@ class JobSummary(Model):
 class JobOut(JobSummary):
     """A job with its result (state `succeeded`) or its error (state `failed`)."""
 
-    photo: PhotoOut
     seed: int
     budget_s: float | None
     options: dict[str, Any]
@@ -248,7 +283,10 @@ class JobOut(JobSummary):
 class JobList(Model):
     jobs: list[JobSummary]
     """Newest first."""
+    next: str | None
+    """The path of the next page; None: this is the last."""
     queued: int
+    """Of all jobs, whatever the filter; so is `running`."""
     running: int
 
 
@@ -327,7 +365,7 @@ class Liveness(Model):
 
 
 class PriorIn(Model):
-    """A guess of the pose: exactly one of the three spellings."""
+    """A pose, a guess or a wish: exactly one of the three spellings."""
 
     convention: Literal["opencv", "opengl"] = "opencv"
     """The camera axes of what is given."""
@@ -337,6 +375,18 @@ class PriorIn(Model):
     """The camera's centre in the world; together with `quaternion_wxyz`."""
     quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
     """world_from_camera."""
+
+
+class RenderIn(Model):
+    """A picture of a scene."""
+
+    pose: PriorIn
+    intrinsics: dict[str, Any] | None = None
+    """Pinhole: `width, height, fx, fy, cx, cy`. Left out: those of the first training camera, or 640 x 480."""
+    format: Literal["png", "jpeg", "depth"] = "png"
+    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
+    quality: int = Field(default=90, ge=1, le=100)
+    """JPEG's."""
 
 
 class LocalizeFields(Model):

@@ -63,6 +63,7 @@ def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: boo
         render_mode=mode,
         training_focal_px=focal_px,
         training_long_side_px=max(size) if size else None,
+        geo_anchor=manifest.geo_anchor,
     )
     log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)

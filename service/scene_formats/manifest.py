@@ -2,7 +2,9 @@
 
     {"name": "Studio", "file": "scene.ply", "convention": "opengl", "up": [0, 0, 1], "metres_per_unit": 0.5,
      "world_from_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-     "background": [0, 0, 0], "training_size": [640, 480], "render_mode": "default"}
+     "background": [0, 0, 0], "training_size": [640, 480], "render_mode": "default",
+     "geo_anchor": {"latitude": 47.3, "longitude": 8.5, "height": 450.0,
+                    "enu_from_world": [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]}}
 
 Every key may be left out; an unknown one is an error, because a misspelt key would be ignored without a word.
 """
@@ -18,6 +20,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.errors import CorruptScene, SceneError, UnsupportedFormat
+from service.types import GeoAnchor
 
 MANIFEST = "scene.json"
 MAX_JSON_BYTES = 64 * 1024 * 1024
@@ -40,6 +43,7 @@ class Manifest:
     training_size: tuple[int, int] | None = None
     """Width and height of the photos in training, if the camera file is of larger ones or missing."""
     render_mode: str | None = None
+    geo_anchor: GeoAnchor | None = None
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -149,6 +153,18 @@ def _size(key: str, value: Any) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
+def _geo_anchor(key: str, value: Any) -> GeoAnchor:
+    where, names = f"{MANIFEST}: {key}", ("latitude", "longitude", "height", "enu_from_world")
+    if not isinstance(value, dict) or value.keys() != set(names):
+        raise CorruptScene(f"must be an object with exactly the keys {', '.join(names)}.", where=where)
+    latitude, longitude, height = (float(numbers(value[n], (), f"{where}.{n}")) for n in names[:3])
+    # 20 km: deeper than any sea, higher than any aircraft that takes photos.
+    for name, number, bound in (("latitude", latitude, 90), ("longitude", longitude, 180), ("height", height, 2e4)):
+        if abs(number) > bound:
+            raise CorruptScene(f"must lie in -{bound:g}..{bound:g}, is {number}.", where=f"{where}.{name}")
+    return GeoAnchor(latitude, longitude, height, _similarity(f"{key}.enu_from_world", value["enu_from_world"]))
+
+
 def require_render_mode(mode: Any, where: str) -> Literal["default", "antialiased"]:
     """Return the mode if we can render it. Raises UnsupportedFormat, which names it."""
     if mode == "default" or mode == "antialiased":
@@ -170,4 +186,5 @@ _READERS = {
     "background": lambda key, value: colour(f"{MANIFEST}: {key}", value),
     "training_size": _size,
     "render_mode": lambda key, value: require_render_mode(value, f"{MANIFEST}: {key}"),
+    "geo_anchor": _geo_anchor,
 }

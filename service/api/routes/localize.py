@@ -1,0 +1,91 @@
+"""A photo in: `POST /localize`."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Request, Response
+
+from service.api import documents
+from service.api.intake import make_task, read_body, read_fields
+from service.api.routes.parts import PartsOf, RootOf, errors
+from service.api.schemas import JobOut, LocalizeFields, LocalizeIn
+
+router = APIRouter()
+
+
+def _form_schema() -> dict[str, Any]:
+    """The multipart form: as the JSON body, but the photo is a file and the nested fields are JSON text."""
+    schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
+    schema.pop("$defs", None)
+    schema["description"] = "`options`, `intrinsics` and `prior` are JSON text."
+    for name in ("options", "intrinsics", "prior"):
+        described = LocalizeFields.model_fields[name].description or "See the JSON body."
+        schema["properties"][name] = {
+            "type": "string",
+            "contentMediaType": "application/json",
+            "description": described,
+        }
+    schema["properties"]["photo"] = {
+        "type": "string",
+        "format": "binary",
+        "description": "JPEG, PNG, WebP or HEIC.",
+    }
+    return schema
+
+
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {"schema": _form_schema()},
+            "application/json": {"schema": {"$ref": "#/components/schemas/LocalizeIn"}},
+        },
+    }
+}
+_ACCEPTED = {
+    200: {"description": "`Prefer: wait=N`, and the job ended in time", "model": JobOut},
+    202: {
+        "description": "Accepted",
+        "headers": {"Location": {"description": "The job", "schema": {"type": "string"}}},
+    },
+}
+
+
+@router.post(
+    "/localize",
+    status_code=202,
+    tags=["localize"],
+    response_model=JobOut,
+    responses=_ACCEPTED | errors(400, 404, 413, 415, 422, 501, 503),
+    openapi_extra=_BODY,
+)
+async def localize_photo(
+    request: Request,
+    response: Response,
+    parts: PartsOf,
+    root: RootOf,
+    prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
+) -> JobOut:
+    """Find where a photo was taken. What is wrong with the request is told at once; the search is a job."""
+    body = await read_body(request)
+    fields = read_fields(body.fields)
+    scene = parts.scenes.get(fields.scene)
+    prepare = partial(make_task, body, fields, scene, parts.settings.estimator)
+    job = parts.jobs.submit(*await to_thread.run_sync(prepare, limiter=parts.decoding))
+    wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
+    if wait_s:
+        await job.wait(wait_s)
+        response.headers["Preference-Applied"] = f"wait={wait_s:g}"
+    response.headers["Location"] = f"{root}/jobs/{job.id}"
+    response.status_code = 200 if job.done else 202
+    return documents.job_document(job, root)
+
+
+def wait_preference(header: str) -> float:
+    """Return the seconds of `wait=N` in a Prefer header (RFC 7240); 0 if it has none."""
+    found = re.search(r'(?:^|[,;])\s*wait\s*=\s*"?(\d{1,6})\b', header, re.IGNORECASE)
+    return float(found.group(1)) if found else 0.0

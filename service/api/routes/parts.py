@@ -1,0 +1,65 @@
+"""What the routes share: the app's parts as dependencies, and how errors are documented."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import anyio
+from fastapi import Depends, Path, Request
+
+from service.api.jobs import Job, Jobs
+from service.api.problems import MEDIA_TYPE
+from service.api.scenes import Scenes
+from service.api.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What the routes work with; one per app."""
+
+    settings: Settings
+    scenes: Scenes
+    jobs: Jobs
+    decoding: anyio.CapacityLimiter
+    """Photos decoded at once: each may take 200 MB for a moment."""
+    rendering: anyio.CapacityLimiter
+    """Pictures rendered at once for looking at: a renderer's thread keeps working memory."""
+
+
+def _parts(request: Request) -> Parts:
+    return request.app.state.parts
+
+
+def _root(request: Request) -> str:
+    return request.scope.get("root_path", "")
+
+
+def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id.")]) -> Job:
+    return parts.jobs.get(job_id)
+
+
+PartsOf = Annotated[Parts, Depends(_parts)]
+RootOf = Annotated[str, Depends(_root)]
+JobOf = Annotated[Job, Depends(_job)]
+
+
+def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    """Document the problem documents that a route may answer with."""
+    return {status: {"description": MEANINGS[status], "content": _PROBLEM} for status in statuses} | {
+        "default": {"description": "Any other error", "content": _PROBLEM}
+    }
+
+
+_PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
+MEANINGS = {
+    400: "The request can't be understood",
+    404: "There is no such thing",
+    409: "Not yet, or there is nothing to give",
+    413: "The body is too large",
+    415: "Neither a multipart form nor JSON",
+    422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",
+    501: "What was asked for can't run on this machine",
+    503: "Too much work is waiting, or the scene is still loading; see Retry-After",
+}
+JPEG = {200: {"description": "JPEG", "content": {"image/jpeg": {}}}}

@@ -1,0 +1,67 @@
+"""What photos are localized in: `/scenes`."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Response
+
+from service.api import documents, splats
+from service.api.pictures import PICTURE_TYPES, picture
+from service.api.routes.parts import PartsOf, RootOf, errors
+from service.api.schemas import RenderIn, SceneList, SceneOut
+
+MAX_SPLATS = 2_000_000
+
+router = APIRouter()
+
+
+@router.get("/scenes", tags=["scenes"], responses=errors())
+async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
+    """List the scenes and how far they have come."""
+    return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
+
+
+@router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors(404))
+def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
+    """Describe a scene, with its training cameras."""
+    return documents.scene_document(parts.scenes.entry(scene_id), root)
+
+
+@router.get(
+    "/scenes/{scene_id}/splats",
+    tags=["scenes"],
+    response_class=Response,
+    responses={
+        200: {
+            "description": (splats.__doc__ or "").split("\n", 1)[1].strip(),
+            "content": {splats.BINARY: {"schema": {"type": "string", "format": "binary"}}},
+        }
+    }
+    | errors(404, 422, 503),
+)
+async def scene_splats(
+    scene_id: str,
+    parts: PartsOf,
+    limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="At most so many.")] = 200_000,
+) -> Response:
+    """Return the scene's most important Gaussians for drawing, as little-endian binary."""
+    pack = partial(splats.packed_splats, parts.scenes.get(scene_id).scene, limit)
+    return Response(await to_thread.run_sync(pack, limiter=parts.rendering), media_type=splats.BINARY)
+
+
+@router.post(
+    "/scenes/{scene_id}/render",
+    tags=["scenes"],
+    response_class=Response,
+    responses={
+        200: {"description": "The picture", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
+    }
+    | errors(400, 404, 413, 422, 503),
+)
+async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
+    """Render a scene from any pose: a picture, or the depth of what is seen there."""
+    draw = partial(picture, parts.scenes.get(scene_id), wanted)
+    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type=PICTURE_TYPES[wanted.format])

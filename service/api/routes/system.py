@@ -1,0 +1,37 @@
+"""The service itself: what it can do, and whether it is well."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from service.api import documents
+from service.api.routes.parts import PartsOf, errors
+from service.api.schemas import Capabilities, Liveness, Readiness
+
+router = APIRouter()
+
+
+@router.get("/capabilities", tags=["service"], responses=errors())
+def get_capabilities(parts: PartsOf) -> Capabilities:
+    """Say which estimators, matchers, renderers and formats there are, and the estimators' options."""
+    return documents.capabilities(parts.settings)
+
+
+@router.get("/version", tags=["service"], responses=errors())
+def get_version() -> dict[str, str]:
+    """Return the versions of this service and of what its results depend on."""
+    return documents.versions()
+
+
+@router.get("/livez", tags=["service"], responses=errors())
+async def live() -> Liveness:
+    """Answer, as long as the process can."""
+    return Liveness()
+
+
+@router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
+async def ready(parts: PartsOf, response: Response) -> Readiness:
+    """Say whether photos can be localized at full speed: scenes loaded, kernels compiled, indexes made."""
+    readiness = parts.scenes.readiness()
+    response.status_code = 200 if readiness.ready else 503
+    return readiness
