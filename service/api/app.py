@@ -11,7 +11,6 @@ import asyncio
 import re
 from collections.abc import AsyncIterator, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import anyio
@@ -19,7 +18,6 @@ import yaml
 from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
-from fastapi.responses import FileResponse
 from pydantic.json_schema import models_json_schema
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
@@ -34,11 +32,11 @@ from service.api.routes.parts import Parts
 from service.api.scenes import Scenes
 from service.api.schemas import LocalizeIn, Problem, Record
 from service.api.settings import Settings
+from service.api.ui import add_pages
 from service.api.viewer_child import ViewerChild
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
 
-_START_PAGE = Path(__file__).parent / "start.html"
 _BODY_OVERHEAD = 1_000_000
 """Bytes that a body may have beyond the photo's limit: the other fields and the form's own lines."""
 
@@ -79,17 +77,13 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     )
     install(app)
     app.include_router(router)
-    app.add_api_route("/", _start_page, include_in_schema=False)
+    add_pages(app)
     if relay:
         app.include_router(relay.router)
     app.add_middleware(SizeLimit, limit=settings.max_upload_bytes + _BODY_OVERHEAD)
     app.add_middleware(SubPath, default=settings.root_path)
     app.openapi = lambda: openapi(app)
     return app
-
-
-async def _start_page() -> FileResponse:
-    return FileResponse(_START_PAGE, media_type="text/html")
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

@@ -1,0 +1,42 @@
+// The service as this page speaks with it: JSON, problem documents, server-sent events.
+
+export class Problem extends Error {
+  /** `body` is an RFC 9457 document, or null where the service did not answer with one. */
+  constructor(body, status) {
+    const parts = body ? [body.where && `${body.where}:`, body.detail, body.hint] : [`The service answered ${status}.`];
+    super(parts.filter(Boolean).join(" "));
+    this.body = body;
+    this.status = status;
+  }
+}
+
+export async function ask(path, init) {
+  let response;
+  try {
+    response = await fetch(path, init);
+  } catch {
+    throw new Problem({ detail: "The service can't be reached.", hint: "Is it running?" }, 0);
+  }
+  const body = await response.json().catch(() => null);
+  if (!response.ok) throw new Problem(body, response.status);
+  return body;
+}
+
+export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
+
+/** Follow a job: `onRecord` for each step, `onEnd` with the ended job once. Returns a function that stops it. */
+export function follow(job, { onRecord, onEnd, onTrouble }) {
+  const source = new EventSource(job.links.events);
+  source.addEventListener("record", event => onRecord(JSON.parse(event.data)));
+  for (const name of ["result", "error"]) {
+    source.addEventListener(name, event => {
+      if (event.data === undefined) {  // the connection's own error; the browser connects again unless refused
+        onTrouble(source.readyState === EventSource.CLOSED);
+        return;
+      }
+      source.close();
+      onEnd(JSON.parse(event.data));
+    });
+  }
+  return () => source.close();
+}

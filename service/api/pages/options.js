@@ -1,0 +1,129 @@
+// What may be sent beside the photo: intrinsics, prior, estimator and its options from the service's own schema.
+// Only what differs from the default is sent, so that the request stays as short as it can be.
+
+import { h, words } from "./dom.js";
+
+const NUMBERS = ["width", "height", "fx", "fy", "cx", "cy"];
+
+export class OptionsForm {
+  constructor(capabilities) {
+    this.estimators = capabilities.estimators.filter(estimator => estimator.available);
+    this.estimator = select(this.estimators.map(e => [e.name, e.default ? `${e.name} (default)` : e.name]),
+      this.estimators.find(e => e.default)?.name);
+    this.estimator.addEventListener("change", () => this.#listOptions());
+    this.seed = input({ type: "number", min: 0, step: 1, placeholder: "0" });
+    this.budget = input({ type: "number", min: 0, step: "any", placeholder: "none" });
+    this.numbers = Object.fromEntries(NUMBERS.map(name => [name, input({ type: "number", step: "any" })]));
+    this.model = input({ placeholder: "PINHOLE" });
+    this.distortion = input({ placeholder: "k1, k2, …" });
+    this.prior = h("textarea", { rows: 4, spellcheck: false, placeholder: "16 numbers of a 4x4 matrix, row by row" });
+    this.priorKind = select([
+      ["world_from_camera opencv", "world from camera, OpenCV axes"],
+      ["world_from_camera opengl", "world from camera, OpenGL axes (Blender, nerfstudio)"],
+      ["camera_from_world opencv", "camera from world, OpenCV axes (COLMAP)"],
+    ]);
+    this.options = h("div", { class: "grid" });
+    this.#listOptions();
+    this.element = h("div", { class: "options" },
+      group("Estimator", h("div", { class: "grid" }, field("Estimator", this.estimator), field("Seed", this.seed),
+        field("Time budget, seconds", this.budget)), this.options),
+      group("Intrinsics of the upright photo, in pixels",
+        h("div", { class: "grid" }, NUMBERS.map(name => field(name, this.numbers[name])),
+          field("Camera model (COLMAP's name)", this.model), field("Distortion", this.distortion)),
+        h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data, or guessed; "
+          + "with a guess the answer is at best uncertain.")),
+      group("Prior pose", h("div", { class: "grid" }, field("Given as", this.priorKind)),
+        field("Matrix", this.prior)));
+  }
+
+  used() {
+    return Object.keys(this.fields()).length > 0;
+  }
+
+  /** Return the form's fields as text, by name; what was left alone is left out. */
+  fields() {
+    const fields = {};
+    const chosen = this.estimators.find(e => e.name === this.estimator.value);
+    if (chosen && !chosen.default) fields.estimator = chosen.name;
+    const options = Object.fromEntries(this.readers.map(read => read()).filter(Boolean));
+    if (Object.keys(options).length) fields.options = JSON.stringify(options);
+    if (this.seed.value) fields.seed = this.seed.value;
+    if (this.budget.value) fields.budget_s = this.budget.value;
+    const intrinsics = Object.fromEntries(
+      NUMBERS.filter(name => this.numbers[name].value).map(name => [name, Number(this.numbers[name].value)]));
+    if (this.model.value.trim()) intrinsics.model = this.model.value.trim();
+    if (this.distortion.value.trim()) intrinsics.distortion = numbersIn(this.distortion.value);
+    if (Object.keys(intrinsics).length) fields.intrinsics = JSON.stringify(intrinsics);
+    if (this.prior.value.trim()) fields.prior = JSON.stringify(this.#prior());
+    return fields;
+  }
+
+  #prior() {
+    const [name, convention] = this.priorKind.value.split(" ");
+    const numbers = numbersIn(this.prior.value);
+    const rows = [];
+    while (numbers.length) rows.push(numbers.splice(0, 4));
+    return { [name]: rows, ...(convention === "opengl" ? { convention } : {}) };
+  }
+
+  #listOptions() {
+    const schema = this.estimators.find(e => e.name === this.estimator.value)?.options_schema;
+    this.readers = [];
+    this.options.replaceChildren(...Object.entries(schema?.properties ?? {}).map(([name, property]) => {
+      const [element, read] = control(property);
+      this.readers.push(() => {
+        const value = read();
+        return value === undefined || value === property.default ? null : [name, value];
+      });
+      return field(words(name), element, property.description);
+    }));
+  }
+}
+
+function control(property) {
+  if (property.enum) {
+    const element = select(property.enum.map(value => [value, words(value)]), property.default);
+    return [element, () => element.value];
+  }
+  if (property.type === "boolean") {
+    const element = h("input", { type: "checkbox", checked: property.default });
+    return [element, () => element.checked];
+  }
+  if (["integer", "number"].includes(property.type)) {
+    const element = input({ type: "number", step: property.type === "integer" ? 1 : "any", value: property.default ?? "" });
+    return [element, () => (element.value === "" ? undefined : Number(element.value))];
+  }
+  const element = input({ value: property.type === "string" ? property.default ?? "" : JSON.stringify(property.default) });
+  return [element, () => (property.type === "string" ? element.value : parsed(element.value))];
+}
+
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return text;  // the service tells what is wrong with it
+  }
+}
+
+function numbersIn(text) {
+  return (text.match(/[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?/gi) ?? []).map(Number);
+}
+
+function input(properties) {
+  return h("input", { autocomplete: "off", ...properties });
+}
+
+function select(pairs, value) {
+  const element = h("select", {}, pairs.map(([value, label]) => h("option", { value }, label)));
+  if (value !== undefined && value !== null) element.value = value;
+  return element;
+}
+
+function field(label, element, description) {
+  return h("label", { class: "field" }, h("span", {}, label), element,
+    description ? h("span", { class: "quiet" }, description) : null);
+}
+
+function group(legend, ...children) {
+  return h("fieldset", {}, h("legend", {}, legend), ...children);
+}

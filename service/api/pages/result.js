@@ -1,0 +1,115 @@
+// The answer of an ended job: photo and render blended, the pose in every convention, why, and what to take along.
+
+import { ask } from "./api.js";
+import { blend, blendSlider } from "./blend.js";
+import { badge, copyButton, degrees, facts, h, length, seconds, when, words } from "./dom.js";
+import { curlLine, fieldsOf, poseFormats } from "./formats.js";
+import { submit, told } from "./start.js";
+import { recalled } from "./sent.js";
+
+/** Return the elements that show an ended job; `scene` is its document, null if it is gone. */
+export function result(job, scene) {
+  const answer = job.result;
+  return [
+    h("h1", { class: "verdict" }, badge(answer?.status ?? job.state), " ", h("span", {}, job.photo.name || "photo")),
+    ...verdict(job),
+    h("div", { class: "columns" },
+      h("div", {},
+        ...(answer ? pictures(job) : [h("img", { class: "preview", alt: "The photo", src: job.links.photo })]),
+        numbers(job, scene)),
+      h("div", {}, ...(answer ? poses(job) : []), taking(job), h("h2", {}, "Next"), again(job))),
+  ];
+}
+
+function verdict({ result, error, state }) {
+  if (!result) return [h("p", { class: "lead" }, error ? `${error.detail} ${error.hint}` : `The job was ${state}.`)];
+  const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
+  return [
+    h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, words(result.reason)), ". ", lead)),
+    ...result.warnings.map(warning => h("p", { class: "warning" }, warning)),
+  ];
+}
+
+function pictures(job) {
+  const pair = blend(job.links.photo, job.links.render, "The scene rendered at the pose");
+  return [
+    pair.element, blendSlider([pair]),
+    h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "See how it was found"),
+      h("a", { class: "button", href: job.links.photo, download: "" }, "Photo"),
+      h("a", { class: "button", href: job.links.render, download: "" }, "Render")),
+  ];
+}
+
+function poses(job) {
+  const unsure = job.result.status !== "localized";
+  return [
+    h("h2", {}, "Pose"),
+    ...(unsure ? [h("p", { class: "warning" }, "The best guess. Don't rely on it.")] : []),
+    ...poseFormats(job).map(([name, text], index) => {
+      const details = h("details", { class: "pose", open: index === 0 }, h("summary", {}, name), h("pre", { tabIndex: 0 }, text));
+      return h("div", { class: "poserow" }, details, copyButton(() => text, name));
+    }),
+  ];
+}
+
+function numbers(job, scene) {
+  const { result } = job;
+  const took = job.finished && job.started ? (Date.parse(job.finished) - Date.parse(job.started)) / 1000 : null;
+  const scale = scene?.metres_per_unit;
+  const common = [["Scene", scene?.name ?? job.scene], ["Estimator", job.estimator], ["When", when(job.created)],
+    ["Took", seconds(took)], ["Steps", String(job.records)]];
+  if (!result) return h("section", {}, h("h2", {}, "Job"), facts(common));
+  const { covariance, intrinsics } = result;
+  return h("section", {}, h("h2", {}, "Evidence"), facts([
+    ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
+    ["Agreement", result.agreement.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
+    ["σ of rotation", covariance && degrees(covariance.sigma_deg)],
+    ["σ of position", covariance && length(covariance.sigma_units, scale)],
+    ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${result.intrinsics_source}`],
+    ...common,
+  ]), h("details", {}, h("summary", {}, "Time by stage"), facts(
+    result.timings.map(t => [words(t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
+}
+
+function taking(job) {
+  const file = (name, href) => h("a", { class: "button", href, download: "" }, name);
+  const sent = recalled(job.id);
+  const curl = curlLine(sent?.fields ?? fieldsOf(job), sent?.file.name || job.photo.name || "photo.jpg");
+  return h("section", {}, h("h2", {}, "Take along"),
+    h("p", { class: "buttons" }, file("JSON", job.links.self), file("Trace", job.links.trace),
+      ...exports(job).map(([name, format]) => file(name, `${job.links.export}/${format}`))),
+    h("h3", {}, "This very request"),
+    h("div", { class: "poserow" }, h("pre", { class: "curl", tabIndex: 0 }, curl), copyButton(() => curl, "the curl line")));
+}
+
+function exports({ result }) {
+  if (!result || result.status === "not_localized") return [];
+  const formats = [["COLMAP", "colmap"], ["nerfstudio", "nerfstudio"], ["TUM", "tum"]];
+  return result.geopose ? [...formats, ["GeoPose", "geopose"]] : formats;
+}
+
+function again(job) {
+  const place = h("p", { class: "buttons" });
+  const file = recalled(job.id)?.file;
+  if (file) {
+    const button = h("button", { type: "button" }, "Localize this photo again");
+    button.addEventListener("click", () => submit(file).catch(told));
+    place.append(button);
+  }
+  place.append(h("a", { class: "button", href: "#/" }, "Another photo"));
+  others(job).then(jobs => {
+    if (!jobs.length) return;
+    const list = h("select", { "aria-label": "Another job on the same photo" },
+      jobs.map(other => h("option", { value: other.id }, `${when(other.created)}, ${other.estimator}, ${words(other.status ?? other.state)}`)));
+    const go = h("button", { type: "button" }, "Compare with");
+    go.addEventListener("click", () => { location.hash = `#/compare/${job.id}/${list.value}`; });
+    place.append(h("span", { class: "joined" }, go, list));
+  });
+  return place;
+}
+
+/** Other jobs that have found a pose for the same photo. */
+async function others(job) {
+  const { jobs } = await ask(`jobs?photo=${job.photo.sha256}&limit=50`).catch(() => ({ jobs: [] }));
+  return jobs.filter(other => other.id !== job.id && other.status);
+}
