@@ -248,7 +248,7 @@ class FakeService:
             cameras=len(self.scene.cameras),
             memory_bytes=self.scene.nbytes,
             error=None,
-            links=SceneLinks(self="/", splats="/"),
+            links=SceneLinks(self="/", splats="/", thumbnail="/"),
             sha256=info.sha256,
             format=info.format,
             background_rgb=list(info.background_rgb),

@@ -444,6 +444,15 @@ def test_a_pose_is_exported_only_if_there_is_one(client, stepping):
     assert_problem(client.get(f"{held}/tum"), 409, "job_not_ready", "job")
 
 
+def test_a_thumbnail_shows_the_scene_small(shared):
+    answer = shared.get(shared.get("/scenes/room").json()["links"]["thumbnail"])
+    assert answer.headers["content-type"] == "image/jpeg"
+    picture = Image.open(io.BytesIO(answer.content))
+    assert picture.size == (PHOTO.width, PHOTO.height)  # of the only training camera, which is small enough
+    assert np.abs(np.asarray(picture, float) - 127.5).max() < 2
+    assert shared.get("/scenes/nowhere/thumbnail.jpg").json()["code"] == "scene_not_found"
+
+
 def test_splats_are_the_most_important_in_the_documented_layout(shared):
     data = shared.get("/scenes/room/splats", params={"max": 2}).content
     start = 4 + int.from_bytes(data[:4], "little")

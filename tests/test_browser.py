@@ -3,53 +3,29 @@
 from __future__ import annotations
 
 import io
-import shutil
-import threading
 import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import uvicorn
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
 from fake_service import FakeService, records
 from fastapi import FastAPI
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
 from service.api.relay import Relay
 from viewer.app import Viewer
 from viewer.client import Service
 
-CHROMIUM = shutil.which("chromium") or ""
-# WebGL in software, asked for explicitly; no services in the background.
-FLAGS = [
-    "--no-sandbox",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--ignore-gpu-blocklist",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-]
-PATIENCE_MS = 90_000
-"""Software rendering on a busy machine: 20 s were seen for a first picture."""
-
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(not CHROMIUM, reason="there is no chromium on this machine"),
-]
+pytestmark = NEEDS_CHROMIUM
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    with launched() as browser:
         yield browser
-        browser.close()
 
 
 @pytest.fixture
@@ -65,23 +41,9 @@ def url(fake: FakeService) -> Iterator[str]:
     relay_only = FastAPI()
     relay_only.include_router(relay.router)
     relay_only.router.add_event_handler("shutdown", relay.close)
-    config = uvicorn.Config(relay_only, port=0, log_level="critical", ws="websockets-sansio", ws_max_size=2**26)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run)
-    thread.start()
-    while not server.started:
-        time.sleep(0.01)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}/viewer"
-    server.should_exit = True
-    thread.join()
+    with served(relay_only) as url:
+        yield f"{url}/viewer"
     viewer.stop()
-
-
-def opened(browser: Browser, address: str) -> Page:
-    page = browser.new_page(viewport={"width": 1100, "height": 700})
-    page.set_default_timeout(PATIENCE_MS)
-    page.goto(address)
-    return page
 
 
 def step_shown(page: Page) -> str:

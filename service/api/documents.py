@@ -166,7 +166,7 @@ def _scene(entry: Entry, root: str) -> dict:
         "cameras": len(scene.cameras) if scene else None,
         "memory_bytes": scene and scene.nbytes,
         "error": entry.error and problem_of(entry.error, self),
-        "links": SceneLinks(self=self, splats=f"{self}/splats"),
+        "links": SceneLinks(self=self, splats=f"{self}/splats", thumbnail=f"{self}/thumbnail.jpg"),
     }
 
 

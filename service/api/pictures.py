@@ -7,6 +7,7 @@ import io
 import numpy as np
 
 from service.api.intake import checked_intrinsics, prior_from
+from service.api.scenes import overview
 from service.api.schemas import RenderIn
 from service.errors import InvalidIntrinsics
 from service.images import encode_image
@@ -16,6 +17,13 @@ from service.types import Camera, Intrinsics
 PICTURE_TYPES = {"png": "image/png", "jpeg": "image/jpeg", "depth": "application/x-npy"}
 MAX_RENDER_PIXELS = 8_000_000
 """A renderer's thread holds about 30 bytes for each."""
+THUMBNAIL_PX = 480
+"""The long side: a card of the start page on a fine display."""
+
+
+def thumbnail(loaded: LoadedScene) -> bytes:
+    """Return a small JPEG of the scene."""
+    return encode_image(loaded.rasterizer.render([overview(loaded, THUMBNAIL_PX)])[0].rgb)
 
 
 def picture(loaded: LoadedScene, wanted: RenderIn) -> bytes:

@@ -123,13 +123,18 @@ class Scenes:
 
 def warm_up(loaded: LoadedScene, estimator: str) -> None:
     """Localize a render of the scene, so that the first photo meets compiled code and loaded networks."""
-    cameras = loaded.scene.cameras
-    camera = cameras[len(cameras) // 2].camera if cameras else _outside(loaded)
-    camera = Camera(camera.intrinsics.with_long_side(512), camera.pose)
+    camera = overview(loaded, 512)
     frame = loaded.rasterizer.render([camera])[0]
     rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
     estimate = localize(Query(rgb, camera.intrinsics, "given", camera.intrinsics), loaded, Request(estimator))
     _log.info("scene %s: warmed up, %s", loaded.scene.info.id, estimate.verdict.status)
+
+
+def overview(loaded: LoadedScene, long_side: int) -> Camera:
+    """Return a camera that shows what the scene is: a training camera, else one outside."""
+    cameras = loaded.scene.cameras
+    camera = cameras[len(cameras) // 2].camera if cameras else _outside(loaded)
+    return Camera(camera.intrinsics.with_long_side(long_side), camera.pose)
 
 
 def _outside(loaded: LoadedScene) -> Camera:

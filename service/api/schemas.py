@@ -293,6 +293,7 @@ class JobList(Model):
 class SceneLinks(Model):
     self: str
     splats: str
+    thumbnail: str
 
 
 class SceneSummary(Model):

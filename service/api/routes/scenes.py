@@ -9,8 +9,8 @@ from anyio import to_thread
 from fastapi import APIRouter, Query, Response
 
 from service.api import documents, splats
-from service.api.pictures import PICTURE_TYPES, picture
-from service.api.routes.parts import PartsOf, RootOf, errors
+from service.api.pictures import PICTURE_TYPES, picture, thumbnail
+from service.api.routes.parts import JPEG, PartsOf, RootOf, errors
 from service.api.schemas import RenderIn, SceneList, SceneOut
 
 MAX_SPLATS = 2_000_000
@@ -28,6 +28,18 @@ async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Describe a scene, with its training cameras."""
     return documents.scene_document(parts.scenes.entry(scene_id), root)
+
+
+@router.get(
+    "/scenes/{scene_id}/thumbnail.jpg",
+    tags=["scenes"],
+    response_class=Response,
+    responses=JPEG | errors(404, 503),
+)
+async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
+    """Return a small picture of the scene, as its middle training camera sees it."""
+    draw = partial(thumbnail, parts.scenes.get(scene_id))
+    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type="image/jpeg")
 
 
 @router.get(

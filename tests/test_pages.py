@@ -1,0 +1,206 @@
+"""The start page in a real browser, with the demo scene: from a photo that is dropped to the pose that is read."""
+
+from __future__ import annotations
+
+import base64
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from browsing import NEEDS_CHROMIUM, free_port, launched, opened, served
+from playwright.sync_api import Browser, Page, expect
+
+from service.api.app import create_app
+from service.api.settings import Settings
+
+pytestmark = NEEDS_CHROMIUM
+STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
+PHOTO = STUDIO / "photos" / "photo_00.jpg"
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    port = free_port()
+    settings = Settings(scenes=[STUDIO], port=port, cache_dir=None)
+    with served(create_app(settings), port) as url:
+        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200)
+        yield url
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with launched() as browser:
+        yield browser
+
+
+@pytest.fixture
+def page(browser: Browser, url: str) -> Iterator[Page]:
+    page = opened(browser, f"{url}/", 1200, 900)
+    troubles: list[str] = []
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    yield page
+    page.close()
+    assert not troubles
+
+
+def until(condition, seconds: float = 90) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.05)
+
+
+def drop(page: Page, data: bytes, name: str) -> None:
+    """Drop a file on the page, as the mouse does."""
+    page.evaluate(
+        """([base64, name]) => {
+            const bytes = Uint8Array.from(atob(base64), letter => letter.charCodeAt(0));
+            const dataTransfer = new DataTransfer();
+            dataTransfer.items.add(new File([bytes], name, { type: "image/jpeg" }));
+            const over = type => new DragEvent(type, { dataTransfer, bubbles: true, cancelable: true });
+            document.querySelector("main").dispatchEvent(over("dragover"));
+            document.querySelector("main").dispatchEvent(over("drop"));
+        }""",
+        [base64.b64encode(data).decode(), name],
+    )
+
+
+def job_of(page: Page, url: str) -> dict:
+    return httpx.get(f"{url}/jobs/{page.url.rpartition('/')[2]}", trust_env=False).json()
+
+
+def written(page: Page, title: str) -> str:
+    """The text of one spelling of the pose."""
+    row = page.locator("details.pose").filter(has_text=title)
+    if row.get_attribute("open") is None:
+        row.locator("summary").click()
+    return row.locator("pre").inner_text()
+
+
+def numbers(text: str) -> np.ndarray:
+    return np.array(text.split(), np.float64)
+
+
+def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
+    page.get_by_role("radio").wait_for()
+    expect(page.locator(".card")).to_contain_text("Studio")
+    drop(page, PHOTO.read_bytes(), PHOTO.name)
+    page.locator(".badge.localized").wait_for()
+    job = job_of(page, url)
+    pose = job["result"]["pose"]
+    # Nine decimals are written.
+    there = numbers(written(page, "World from camera, OpenCV")).reshape(4, 4)
+    np.testing.assert_allclose(there, pose["world_from_camera"]["matrix"], atol=6e-10)
+    opengl = numbers(written(page, "World from camera, OpenGL")).reshape(4, 4)
+    np.testing.assert_allclose(opengl, pose["opengl"]["world_from_camera"]["matrix"], atol=6e-10)
+    back = numbers(written(page, "Camera from world")).reshape(4, 4)
+    np.testing.assert_allclose(back @ there, np.eye(4), atol=1e-7)
+    # Against the truth, not only against the API.
+    truth = next(t for t in json.loads((STUDIO / "truth.json").read_text()) if t["photo"] == PHOTO.name)
+    assert np.linalg.norm(there[:3, 3] - np.array(truth["world_from_camera"])[:3, 3]) < 0.05
+    # The lines for other programs say what the service's own files say.
+    for title, kind, line in (("COLMAP", "colmap", 2), ("TUM", "tum", 0)):
+        theirs = httpx.get(f"{url}{job['links']['export']}/{kind}", trust_env=False).text.splitlines()[line].split()
+        ours = written(page, title).split()
+        words = slice(0, -1) if kind == "colmap" else slice(0, None)
+        np.testing.assert_allclose(np.float64(ours[words]), np.float64(theirs[words]), atol=1e-6)
+        assert kind == "tum" or ours[-1] == theirs[-1] == PHOTO.name
+
+
+def test_photo_and_render_are_blended_under_the_slider(page: Page) -> None:
+    page.set_input_files("#photo", PHOTO)
+    slider = page.get_by_role("slider")
+    above = page.locator(".stack .above")
+    assert above.evaluate("image => image.decode().then(() => image.naturalWidth)") == 640
+    assert above.evaluate("image => getComputedStyle(image).opacity") == "0.5"
+    slider.press("End")
+    assert above.evaluate("image => getComputedStyle(image).opacity") == "1"
+    page.get_by_role("button", name="Photo", exact=True).click()
+    assert above.evaluate("image => getComputedStyle(image).opacity") == "0"
+
+
+def test_the_curl_line_sends_the_very_same_request(page: Page, url: str) -> None:
+    page.get_by_text("Intrinsics, prior, estimator").click()
+    page.get_by_label("candidates").fill("3")
+    page.get_by_label("Seed").fill("7")
+    page.get_by_label("fx").fill("5e2")
+    for name, value in (("fy", "500"), ("cx", "320"), ("cy", "240"), ("width", "640"), ("height", "480")):
+        page.get_by_label(name, exact=True).fill(value)
+    page.set_input_files("#photo", PHOTO)
+    page.locator(".verdict .badge").wait_for()
+    job = job_of(page, url)
+    assert (job["seed"], job["options"]) == (7, {"candidates": 3})
+    assert job["result"]["intrinsics"]["fx"] == 500
+    sent = page.locator("pre.curl").inner_text()
+    assert "-F 'seed=7'" in sent
+    assert """-F 'options={"candidates":3}'""" in sent
+    page.reload()  # what this tab remembers is gone: now it is told from the job
+    page.locator(".verdict .badge").wait_for()
+    told = page.locator("pre.curl").inner_text()
+    assert """'options={"candidates":3}'""" in told
+    assert '"fx":500' in told
+
+
+def test_what_is_no_photo_is_told_and_the_page_goes_on(page: Page) -> None:
+    page.get_by_role("radio").wait_for()
+    drop(page, b"not a photo", "notes.jpg")
+    expect(page.get_by_role("alert")).to_contain_text("photo")
+    drop(page, PHOTO.read_bytes(), PHOTO.name)
+    page.locator(".badge.localized").wait_for()
+
+
+def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
+    for seed in (1, 2):
+        with PHOTO.open("rb") as photo:
+            fields = {"seed": seed, "scene": "studio"}
+            answer = httpx.post(
+                f"{url}/localize",
+                files={"photo": photo},
+                data=fields,
+                headers={"Prefer": "wait=60"},
+                trust_env=False,
+                timeout=90,
+            )
+        assert answer.json()["status"] == "localized"
+    page.get_by_role("link", name="History").click()
+    rows = page.locator("tbody tr")
+    rows.nth(1).wait_for()
+    page.get_by_label("Outcome").select_option("cancelled")
+    page.get_by_text("No job fits").wait_for()
+    page.get_by_label("Outcome").select_option("localized")
+    for i in range(2):
+        rows.nth(i).get_by_role("checkbox").check()
+    page.get_by_role("button", name="Compare two").click()
+    page.get_by_role("heading", name="Comparison").wait_for()
+    # Another seed of the same method: next to nothing lies between the poses, and it is said in metres.
+    expect(page.get_by_text("apart.")).to_contain_text(" m apart")
+    expect(page.get_by_role("row", name="seed")).to_contain_text("2")
+    assert page.locator(".stack").count() == 2
+
+
+def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
+    page.goto(f"{url}/#/jobs/nothing")
+    expect(page.get_by_role("alert")).to_contain_text("no job 'nothing'")
+
+
+def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
+    page = opened(browser, f"{url}/", 360, 740)
+    page.get_by_role("radio").wait_for()
+    page.get_by_text("Intrinsics, prior, estimator").click()
+    page.get_by_label("Seed").wait_for()
+    assert _overflow(page) <= 0
+    page.set_input_files("#photo", PHOTO)
+    page.locator(".verdict .badge").wait_for()
+    assert _overflow(page) <= 0
+    page.goto(f"{url}/#/jobs")
+    page.locator("tbody tr").first.wait_for()
+    assert _overflow(page) <= 0
+    page.close()
+
+
+def _overflow(page: Page) -> int:
+    return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
