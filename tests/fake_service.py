@@ -18,7 +18,7 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from service.api.convert import intrinsics_out, named_camera_out, record_out, result_out
+from service.api.convert import intrinsics_out, named_camera_out, pose_out, record_out, result_out
 from service.api.schemas import JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
 from service.api.splats import packed_splats
 from service.geometry import look_at
@@ -119,6 +119,7 @@ class FakeJob:
     id: str
     records: list[IterationRecord] = field(default_factory=list)
     estimate: PoseEstimate | None = None
+    truth: Pose | None = None
     created: datetime = field(default_factory=lambda: datetime.now(UTC))
     changed: threading.Condition = field(default_factory=threading.Condition)
 
@@ -171,6 +172,7 @@ class FakeJob:
             budget_s=None,
             options={},
             prior=None,
+            truth=self.truth and pose_out(self.truth),
             result=result,
             error=None,
         )

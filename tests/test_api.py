@@ -226,6 +226,17 @@ def test_prefer_wait_answers_at_once_or_accepts(client, stepping):
     assert 0.9 < time.monotonic() - began < 5
 
 
+def test_the_truth_is_kept_with_the_job_and_reaches_no_estimator(shared):
+    truth = {"world_from_camera": np.eye(4).tolist(), "convention": "opengl"}
+    job = post(shared, truth=truth).json()
+    assert job["prior"] is None
+    told = np.array(job["truth"]["world_from_camera"]["matrix"])
+    assert np.allclose(told, np.diag([1.0, -1, -1, 1]), atol=1e-12)
+    # The stand-in answers with its prior, else with the scene's camera.
+    assert np.allclose(job["result"]["pose"]["world_from_camera"]["matrix"], TURNED, atol=1e-6)
+    assert post(shared).json()["truth"] is None
+
+
 def test_the_prior_reaches_the_estimator_in_every_spelling(shared):
     opengl = TURNED * [1, -1, -1, 1]
     spellings = [
@@ -584,6 +595,7 @@ BAD_FIELDS = [
     ({"prior": {"position": [0, 0, 0], "quaternion_wxyz": [2, 0, 0, 0]}}, 422, "invalid_prior", "prior.position"),
     ({"prior": {"position": [0, 0, 0]}}, 422, "invalid_prior", "prior"),
     ({"prior": {}}, 422, "invalid_prior", "prior"),
+    ({"truth": {"world_from_camera": SHEARED}}, 422, "invalid_prior", "truth.world_from_camera"),
     ({"prior": {"convention": "blender"}}, 422, "invalid_prior", "prior.convention"),
     ({"seed": "x"}, 400, "invalid_request", "seed"),
     ({"seed": "-1"}, 400, "invalid_request", "seed"),

@@ -81,6 +81,15 @@ def written(page: Page, title: str) -> str:
     return row.locator("pre").inner_text()
 
 
+def truth_of(photo: Path) -> np.ndarray:
+    truths = json.loads((STUDIO / "truth.json").read_text())
+    return np.array(next(t["world_from_camera"] for t in truths if t["photo"] == photo.name))
+
+
+def fact(page: Page, name: str) -> str:
+    return page.locator(".facts div").filter(has_text=name).locator("dd").inner_text()
+
+
 def numbers(text: str) -> np.ndarray:
     return np.array(text.split(), np.float64)
 
@@ -100,8 +109,7 @@ def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
     back = numbers(written(page, "Camera from world")).reshape(4, 4)
     np.testing.assert_allclose(back @ there, np.eye(4), atol=1e-7)
     # Against the truth, not only against the API.
-    truth = next(t for t in json.loads((STUDIO / "truth.json").read_text()) if t["photo"] == PHOTO.name)
-    assert np.linalg.norm(there[:3, 3] - np.array(truth["world_from_camera"])[:3, 3]) < 0.05
+    assert np.linalg.norm(there[:3, 3] - truth_of(PHOTO)[:3, 3]) < 0.05
     # The lines for other programs say what the service's own files say.
     for title, kind, line in (("COLMAP", "colmap", 2), ("TUM", "tum", 0)):
         theirs = httpx.get(f"{url}{job['links']['export']}/{kind}", trust_env=False).text.splitlines()[line].split()
@@ -130,9 +138,15 @@ def test_the_curl_line_sends_the_very_same_request(page: Page, url: str) -> None
     page.get_by_label("fx").fill("5e2")
     for name, value in (("fy", "500"), ("cx", "320"), ("cy", "240"), ("width", "640"), ("height", "480")):
         page.get_by_label(name, exact=True).fill(value)
+    truth = page.get_by_role("group", name="True pose")
+    truth.get_by_label("Matrix").fill(", ".join(map(str, np.array(truth_of(PHOTO)).flat)))
     page.set_input_files("#photo", PHOTO)
     page.locator(".verdict .badge").wait_for()
     job = job_of(page, url)
+    there = np.array(job["result"]["pose"]["position"])
+    error = np.linalg.norm(there - truth_of(PHOTO)[:3, 3])
+    # Three digits are written.
+    assert float(fact(page, "Error of position").split()[0]) == pytest.approx(error, rel=6e-3)
     assert (job["seed"], job["options"]) == (7, {"candidates": 3})
     assert job["result"]["intrinsics"]["fx"] == 500
     sent = page.locator("pre.curl").inner_text()

@@ -76,6 +76,7 @@ def job_document(job: Job, root: str) -> JobOut:
         budget_s=request.budget_s,
         options=job.task.options,
         prior=job.prior and pose_out(job.prior),
+        truth=job.task.truth and pose_out(job.task.truth),
         result=estimate and job_result(job, estimate),
         error=error and problem_of(error, self),
     )

@@ -37,7 +37,7 @@ from service.types import Intrinsics, Pose, Query, StageTiming
 
 _NESTED = ("options", "intrinsics", "prior")
 _FIELDS = frozenset(LocalizeIn.model_fields)
-_ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior}
+_ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior, "truth": InvalidPrior}
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +128,13 @@ def make_task(
     )
     intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
     prior = None if fields.prior is None else prior_from(fields.prior)
+    truth = None if fields.truth is None else prior_from(fields.truth, "truth")
     background = scene.scene.info.background_rgb
     wall, cpu = time.perf_counter(), time.thread_time()
     query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
     decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
     digest = hashlib.sha256(body.photo).hexdigest()
-    return Task(scene, request, fields.options, body.name, digest, decode), query
+    return Task(scene, request, fields.options, body.name, digest, decode, truth), query
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:

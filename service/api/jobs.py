@@ -21,7 +21,7 @@ from service.api.schemas import JobState
 from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound
 from service.images import encode_image
 from service.localize import Cancelled, LoadedScene, Request, localize
-from service.types import IterationRecord, PoseEstimate, Query, StageTiming
+from service.types import IterationRecord, Pose, PoseEstimate, Query, StageTiming
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +40,8 @@ class Task:
     photo_name: str
     photo_sha256: str
     decode: StageTiming
+    truth: Pose | None
+    """For measuring errors; neither the query nor the request has it."""
 
 
 @dataclass(frozen=True, slots=True)

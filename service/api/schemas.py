@@ -276,6 +276,8 @@ class JobOut(JobSummary):
     budget_s: float | None
     options: dict[str, Any]
     prior: PoseOut | None
+    truth: PoseOut | None
+    """As it was sent; no part of the search."""
     result: Result | None
     error: Problem | None
 
@@ -403,6 +405,8 @@ class LocalizeFields(Model):
     """Of the upright photo: `width, height, fx, fy, cx, cy`, and COLMAP's `model` and `distortion`. Left out:
     taken from the EXIF data, or guessed."""
     prior: PriorIn | None = None
+    truth: PriorIn | None = None
+    """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
     """Wall time after which the best pose so far is the answer."""
@@ -411,7 +415,7 @@ class LocalizeFields(Model):
 class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same names.
 
-    In a form, `options`, `intrinsics` and `prior` are JSON text and `photo` is a file.
+    In a form, `options`, `intrinsics`, `prior` and `truth` are JSON text and `photo` is a file.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})

@@ -46,6 +46,7 @@ export function fieldsOf(job) {
   if (job.seed) fields.seed = String(job.seed);
   if (job.budget_s) fields.budget_s = String(job.budget_s);
   if (job.prior) fields.prior = JSON.stringify({ world_from_camera: job.prior.world_from_camera.matrix });
+  if (job.truth) fields.truth = JSON.stringify({ world_from_camera: job.truth.world_from_camera.matrix });
   const { result } = job;
   if (result?.intrinsics_source === "given") fields.intrinsics = JSON.stringify(result.intrinsics);
   return fields;

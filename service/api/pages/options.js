@@ -16,12 +16,7 @@ export class OptionsForm {
     this.numbers = Object.fromEntries(NUMBERS.map(name => [name, input({ type: "number", step: "any" })]));
     this.model = input({ placeholder: "PINHOLE" });
     this.distortion = input({ placeholder: "k1, k2, …" });
-    this.prior = h("textarea", { rows: 4, spellcheck: false, placeholder: "16 numbers of a 4x4 matrix, row by row" });
-    this.priorKind = select([
-      ["world_from_camera opencv", "world from camera, OpenCV axes"],
-      ["world_from_camera opengl", "world from camera, OpenGL axes (Blender, nerfstudio)"],
-      ["camera_from_world opencv", "camera from world, OpenCV axes (COLMAP)"],
-    ]);
+    this.poses = { prior: new PoseField(), truth: new PoseField() };
     this.options = h("div", { class: "grid" });
     this.#listOptions();
     this.element = h("div", { class: "options" },
@@ -32,8 +27,8 @@ export class OptionsForm {
           field("Camera model (COLMAP's name)", this.model), field("Distortion", this.distortion)),
         h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data, or guessed; "
           + "with a guess the answer is at best uncertain.")),
-      group("Prior pose", h("div", { class: "grid" }, field("Given as", this.priorKind)),
-        field("Matrix", this.prior)));
+      group("Prior pose, a guess to start from", this.poses.prior.element),
+      group("True pose, to measure errors against: the search does not see it", this.poses.truth.element));
   }
 
   used() {
@@ -54,16 +49,10 @@ export class OptionsForm {
     if (this.model.value.trim()) intrinsics.model = this.model.value.trim();
     if (this.distortion.value.trim()) intrinsics.distortion = numbersIn(this.distortion.value);
     if (Object.keys(intrinsics).length) fields.intrinsics = JSON.stringify(intrinsics);
-    if (this.prior.value.trim()) fields.prior = JSON.stringify(this.#prior());
+    for (const [name, pose] of Object.entries(this.poses)) {
+      if (pose.matrix.value.trim()) fields[name] = JSON.stringify(pose.value());
+    }
     return fields;
-  }
-
-  #prior() {
-    const [name, convention] = this.priorKind.value.split(" ");
-    const numbers = numbersIn(this.prior.value);
-    const rows = [];
-    while (numbers.length) rows.push(numbers.splice(0, 4));
-    return { [name]: rows, ...(convention === "opengl" ? { convention } : {}) };
   }
 
   #listOptions() {
@@ -77,6 +66,26 @@ export class OptionsForm {
       });
       return field(words(name), element, property.description);
     }));
+  }
+}
+
+class PoseField {
+  constructor() {
+    this.matrix = h("textarea", { rows: 4, spellcheck: false, placeholder: "16 numbers of a 4x4 matrix, row by row" });
+    this.kind = select([
+      ["world_from_camera opencv", "world from camera, OpenCV axes"],
+      ["world_from_camera opengl", "world from camera, OpenGL axes (Blender, nerfstudio)"],
+      ["camera_from_world opencv", "camera from world, OpenCV axes (COLMAP)"],
+    ]);
+    this.element = h("div", {}, h("div", { class: "grid" }, field("Given as", this.kind)), field("Matrix", this.matrix));
+  }
+
+  value() {
+    const [name, convention] = this.kind.value.split(" ");
+    const numbers = numbersIn(this.matrix.value);
+    const rows = [];
+    while (numbers.length) rows.push(numbers.splice(0, 4));
+    return { [name]: rows, ...(convention === "opengl" ? { convention } : {}) };
   }
 }
 

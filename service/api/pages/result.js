@@ -3,7 +3,7 @@
 import { ask } from "./api.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, copyButton, degrees, facts, h, length, seconds, when, words } from "./dom.js";
-import { curlLine, fieldsOf, poseFormats } from "./formats.js";
+import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
 import { submit, told } from "./start.js";
 import { recalled } from "./sent.js";
 
@@ -60,11 +60,14 @@ function numbers(job, scene) {
     ["Took", seconds(took)], ["Steps", String(job.records)]];
   if (!result) return h("section", {}, h("h2", {}, "Job"), facts(common));
   const { covariance, intrinsics } = result;
+  const [angle, distance] = job.truth ? poseDistance(result.pose, job.truth) : [null, null];
   return h("section", {}, h("h2", {}, "Evidence"), facts([
     ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
     ["Agreement", result.agreement.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
     ["σ of rotation", covariance && degrees(covariance.sigma_deg)],
     ["σ of position", covariance && length(covariance.sigma_units, scale)],
+    ["Error of rotation", job.truth && degrees(angle)],
+    ["Error of position", job.truth && length(distance, scale)],
     ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${result.intrinsics_source}`],
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(

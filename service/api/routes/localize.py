@@ -21,8 +21,8 @@ def _form_schema() -> dict[str, Any]:
     """The multipart form: as the JSON body, but the photo is a file and the nested fields are JSON text."""
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
     schema.pop("$defs", None)
-    schema["description"] = "`options`, `intrinsics` and `prior` are JSON text."
-    for name in ("options", "intrinsics", "prior"):
+    schema["description"] = "`options`, `intrinsics`, `prior` and `truth` are JSON text."
+    for name in ("options", "intrinsics", "prior", "truth"):
         described = LocalizeFields.model_fields[name].description or "See the JSON body."
         schema["properties"][name] = {
             "type": "string",
