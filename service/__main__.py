@@ -74,9 +74,12 @@ def serve(
     import uvicorn
 
     from service.api.app import create_app
+    from service.api.settings import DATA_HOME
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer}
     settings = _settings({name: value for name, value in given.items() if value is not None})
+    if settings.data_dir is None and settings.port:  # on a random port nobody would come back to it
+        settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
     with _listener(settings.host, settings.port) as listener:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         application = create_app(settings)
@@ -217,7 +220,7 @@ def render(
     """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
     from service.api.intake import read_fields
     from service.api.pictures import picture
-    from service.api.schemas import RenderIn
+    from service.api.requests import RenderIn
 
     fields = read_fields({"prior": _json(pose, "prior")})
     if fields.prior is None:

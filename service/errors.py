@@ -9,6 +9,10 @@
       |     `-- SceneNotReady  (still loading; try again later)
       |-- JobNotFound, RecordNotFound, JobNotReady
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
+      |-- PhotoGone          deleted after the job
+      |-- IdempotencyConflict  a key was used for another request
+      |-- DeadlineExceeded, Interrupted  why a job ended without a result
+      |-- StorageFailed      the disk is full or broken; nothing was accepted
       |-- QueueFull          too much work is waiting; try again later
       |-- BackendMissing     a package or device that a plug-in needs is not here
       `-- EstimatorFault     an estimator broke its contract (our mistake)
@@ -103,6 +107,26 @@ class NoPose(SplatfixError):
 
 class NoGeoAnchor(SplatfixError):
     code = "no_geo_anchor"
+
+
+class PhotoGone(SplatfixError):
+    code = "photo_gone"
+
+
+class IdempotencyConflict(SplatfixError):
+    code = "idempotency_conflict"
+
+
+class DeadlineExceeded(SplatfixError):
+    code = "deadline_exceeded"
+
+
+class Interrupted(SplatfixError):
+    code = "interrupted"
+
+
+class StorageFailed(SplatfixError):
+    code = "storage_failed"
 
 
 class QueueFull(SplatfixError):

@@ -4,166 +4,38 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import importlib
 import io
 import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from pathlib import Path
-from types import ModuleType
 
-import httpx
 import numpy as np
 import pytest
-import uvicorn
 import yaml
-from fastapi import FastAPI
+from api_server import (
+    HALF,
+    ROOT,
+    TURNED,
+    BlindMatcher,
+    assert_problem,
+    events,
+    finished,
+    make_scene,
+    photo,
+    post,
+    serving,
+    settings,
+    until,
+)
 from PIL import Image
 
 import service.estimators
 from service.api.app import create_app
 from service.api.settings import Settings
-from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
-
-ROOT = Path(__file__).parents[1]
-PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
-HALF = 0.5**0.5
-TURNED = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
-"""A camera at (1, 2, 3), turned by 90 degrees about z."""
-
-
-class FlatRasterizer(Rasterizer):
-    """Every picture is mid-grey."""
-
-    name = "flat"
-
-    def render(self, cameras):
-        sizes = [(c.intrinsics.height, c.intrinsics.width) for c in cameras]
-        flat = [np.full(size, 0.5, np.float32) for size in sizes]
-        return [Frame(np.stack([f, f, f], 2), f, f, f) for f in flat]
-
-
-class BlindMatcher(Matcher):
-    """Sees nothing."""
-
-    name = "blind"
-
-    def extract(self, rgb, limit):
-        return Features(*(np.zeros(s, np.float32) for s in ((0, 2), (0,), (0, 64))))
-
-    def match(self, a, b):
-        return np.zeros((0, 2), np.int32)
-
-
-def make_scene(name: str = "room", count: int = 5) -> LoadedScene:
-    rng = np.random.default_rng(0)
-    camera = Camera(PHOTO, Pose(TURNED))
-    scene = GaussianScene(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=np.tile(np.array([[HALF, 0, 0, HALF]], np.float32), (count, 1)),
-        scales=np.tile(np.array([[0.3, 0.2, 0.1]], np.float32), (count, 1)),
-        opacities=np.linspace(0.1, 1.0, count, dtype=np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-        info=SceneInfo(name, name.title(), "ab" * 32, "ply"),
-        cameras=(NamedCamera("images/a.jpg", camera),),
-    )
-    return LoadedScene(scene, FlatRasterizer(), BlindMatcher())
-
-
-@contextmanager
-def serving(app: FastAPI) -> Iterator[httpx.Client]:
-    listener = socket.create_server(("127.0.0.1", 0))
-    config = uvicorn.Config(app, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=1)
-    server = uvicorn.Server(config)
-    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-    thread.start()
-    url = f"http://127.0.0.1:{listener.getsockname()[1]}"
-    try:
-        with httpx.Client(base_url=url, timeout=20, trust_env=False) as client:
-            until(lambda: server.started)
-            yield client
-    finally:
-        server.should_exit = True
-        thread.join()
-        listener.close()
-
-
-def until(condition) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline, "waited for too long"
-        time.sleep(0.005)
-
-
-@pytest.fixture(scope="module")
-def plugins() -> Iterator[ModuleType]:
-    """The estimators of tests/fake_estimators, registered as any: by lying in the package's folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        paths = [*service.estimators.__path__, str(ROOT / "tests" / "fake_estimators")]
-        patch.setattr(service.estimators, "__path__", paths)
-        yield importlib.import_module("service.estimators.stepping")
-
-
-@pytest.fixture
-def stepping(plugins) -> ModuleType:
-    plugins.GO_ON.clear()
-    return plugins
-
-
-def settings(**changes) -> Settings:
-    return Settings(**{"viewer": False, "estimator": "stepping", "workers": 1, "queue_size": 2, **changes})
-
-
-@pytest.fixture(scope="module")
-def shared(plugins) -> Iterator[httpx.Client]:
-    """A server for tests that leave nothing behind."""
-    with serving(create_app(settings(), {"room": make_scene()})) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
-        yield client
-
-
-@pytest.fixture
-def client(stepping) -> Iterator[httpx.Client]:
-    with serving(create_app(settings(), {"room": make_scene()})) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
-        yield client
-        stepping.GO_ON.set()
-
-
-def photo(kind: str = "jpeg", size: tuple[int, int] = (96, 64), **save) -> bytes:
-    pixels = np.random.default_rng(1).integers(0, 256, (*size[::-1], 3), np.uint8)
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, kind, **save)
-    return file.getvalue()
-
-
-def post(client: httpx.Client, data: bytes | None = None, prefer: str = "wait=20", **fields) -> httpx.Response:
-    """Send a form; fields that aren't text go as JSON."""
-    texts = {k: v if isinstance(v, str) else json.dumps(v) for k, v in fields.items()}
-    files = {"photo": ("p.jpg", photo() if data is None else data, "image/jpeg")}
-    return client.post("/localize", files=files, data=texts, headers={"Prefer": prefer} if prefer else {})
-
-
-def finished(client: httpx.Client, path: str) -> dict:
-    until(lambda: client.get(path).json()["finished"])
-    return client.get(path).json()
-
-
-def events(text: str) -> list[tuple[str, str, dict]]:
-    """(event, id, data) of a server-sent event stream."""
-    found = []
-    for block in text.split("\n\n"):
-        fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
-        if fields:
-            found.append((fields["event"], fields["id"], json.loads(fields["data"])))
-    return found
-
 
 # ------------------------------------------------------------------ the life of a job
 
@@ -258,16 +130,16 @@ def test_events_come_live_from_the_first_and_end_with_the_result(client, steppin
         assert stream.headers["content-type"].startswith("text/event-stream")
         chunks = stream.iter_text()
         first = events(next(chunks))
-        assert [(name, number) for name, number, _ in first] == [("record", "0")]
+        assert [(name, number) for name, number, _ in first] == [("record", "1.0")]
         assert client.get(path).json()["state"] == "running"
         stepping.GO_ON.set()
         seen = first + events("".join(chunks))
     assert [(name, number) for name, number, _ in seen] == [
-        ("record", "0"), ("record", "1"), ("record", "2"), ("result", "end"),
+        ("record", "1.0"), ("record", "1.1"), ("record", "1.2"), ("result", "end"),
     ]  # fmt: skip
     late = client.get(f"{path}/events")
     assert events(late.text) == seen
-    resumed = client.get(f"{path}/events", headers={"Last-Event-ID": "1"})
+    resumed = client.get(f"{path}/events", headers={"Last-Event-ID": "1.1"})
     assert events(resumed.text) == seen[2:]
     trace = client.get(f"{path}/trace").json()
     assert trace["records"] == [data for name, _, data in seen if name == "record"]
@@ -541,20 +413,6 @@ class HeldMatcher(BlindMatcher):
 
 
 # ------------------------------------------------------------------ errors
-
-PROBLEM = {"type", "title", "status", "detail", "instance", "code", "where", "hint"}
-
-
-def assert_problem(answer: httpx.Response, status: int, code: str, where: str | None = None) -> None:
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    problem = answer.json()
-    assert problem.keys() == PROBLEM
-    assert (problem["status"], problem["code"]) == (status, code), problem
-    assert problem["instance"] == answer.request.url.path
-    assert problem["detail"]
-    if where is not None:
-        assert problem["where"] == where, problem
 
 
 def bomb() -> bytes:

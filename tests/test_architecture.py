@@ -44,7 +44,7 @@ WRAPPED = {
     "fastapi": {"service/api"},
     "starlette": {"service/api"},
     "anyio": {"service/api"},
-    "annotated_types": {"service/api/schemas.py"},
+    "annotated_types": {"service/api/requests.py"},
     "pydantic": {"service/api", "service/__main__.py"},
     "pydantic_settings": {"service/api/settings.py"},
     "pyproj": {"service/api/geo.py"},

@@ -23,7 +23,7 @@ from service.types import (
     frozen,
 )
 
-FINISHED = frozenset({"succeeded", "failed", "cancelled"})
+FINISHED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 
 
 class ServiceTrouble(Exception):

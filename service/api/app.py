@@ -8,9 +8,12 @@ proxy strips the sub-path from what it hands on.
 from __future__ import annotations
 
 import asyncio
+import fcntl
 import re
-from collections.abc import AsyncIterator, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import anyio
@@ -27,13 +30,15 @@ from service import __version__
 from service.api.jobs import Jobs
 from service.api.problems import install, problem_response
 from service.api.relay import Relay
+from service.api.requests import LocalizeIn
 from service.api.routes import router
 from service.api.routes.parts import Parts
 from service.api.scenes import Scenes
-from service.api.schemas import LocalizeIn, Problem, Record
+from service.api.schemas import Problem, Record
 from service.api.settings import Settings
 from service.api.ui import add_pages
 from service.api.viewer_child import ViewerChild
+from service.errors import StorageFailed
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
 
@@ -58,8 +63,10 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
-            jobs = Jobs(settings.workers, settings.queue_size, settings.keep_jobs)
+            folder = stack.enter_context(data_folder(settings.data_dir))
+            jobs = Jobs(settings, known, folder)
             stack.push_async_callback(to_thread.run_sync, jobs.close)
+            await to_thread.run_sync(jobs.start)
             known.start()
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
@@ -84,6 +91,23 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     app.add_middleware(SubPath, default=settings.root_path)
     app.openapi = lambda: openapi(app)
     return app
+
+
+@contextmanager
+def data_folder(path: Path | None) -> Iterator[Path]:
+    """Hold a folder for this process alone; None: a temporary one. Raises StorageFailed."""
+    with ExitStack() as stack:
+        folder = path or Path(stack.enter_context(TemporaryDirectory(prefix="splatfix-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / "lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            told = "another process uses it" if isinstance(error, BlockingIOError) else error.strerror
+            raise StorageFailed(
+                f"{folder} can't be used: {told}.", where="data_dir", hint="Name another one: SPLATFIX_DATA_DIR."
+            ) from error
+        yield folder
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

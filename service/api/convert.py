@@ -128,6 +128,18 @@ def record_out(record: IterationRecord) -> Record:
     )
 
 
+def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> Camera:
+    """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
+    if of_matches and record.matches is not None:
+        camera = record.matches.render_camera
+        return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
+    return Camera(_intrinsics_in(photo), Pose(np.array(record.world_from_camera)))
+
+
+def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
+    return Intrinsics(**{**intrinsics.model_dump(), "distortion": tuple(intrinsics.distortion)})
+
+
 def covariance_out(matrix: np.ndarray) -> Covariance:
     """Spell out the covariance of a pose, with its two standard deviations."""
     return Covariance(

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import platform
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
 
 import numpy as np
 
-from service.api.convert import intrinsics_out, named_camera_out, pose_out, record_out, result_out, timing_out
-from service.api.intake import options_adapter
-from service.api.jobs import Job
+from service.api.convert import named_camera_out, pose_out
+from service.api.intake import options_adapter, prior_from
 from service.api.problems import problem_of
+from service.api.requests import LocalizeFields
 from service.api.scenes import Entry
 from service.api.schemas import (
     Capabilities,
@@ -22,6 +23,7 @@ from service.api.schemas import (
     JobOut,
     JobSummary,
     PhotoOut,
+    Problem,
     Result,
     SceneLinks,
     SceneOut,
@@ -29,6 +31,7 @@ from service.api.schemas import (
     Trace,
 )
 from service.api.settings import Settings
+from service.api.store import StoredJob
 from service.errors import JobNotReady, NoPose
 from service.estimators import ESTIMATORS
 from service.localize import DEFAULT_MATCHER, DEFAULT_RASTERIZER
@@ -36,7 +39,7 @@ from service.matchers import MATCHERS
 from service.plugins import PluginFolder
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
-from service.types import PoseEstimate, Status
+from service.types import Status
 
 _PACKAGES = (
     "splatfix",
@@ -59,61 +62,58 @@ def versions() -> dict[str, str]:
     return found
 
 
-def job_summary(job: Job, root: str) -> JobSummary:
+def job_summary(job: StoredJob, root: str) -> JobSummary:
     """Describe a job as in a list."""
     return JobSummary(**_summary(job, root))
 
 
-def job_document(job: Job, root: str) -> JobOut:
+def job_document(job: StoredJob, root: str) -> JobOut:
     """Describe a job in full, with its result or its error."""
-    # The state is read first: whatever belongs to an ended job is there before its state says so.
     summary = _summary(job, root)
-    request, self = job.task.request, summary["links"].self
-    estimate, error = (job.estimate, job.error) if job.done else (None, None)
+    fields = LocalizeFields.model_validate_json(job.fields)
+    error = Problem.model_validate_json(job.error) if job.error else None
     return JobOut(
         **summary,
-        seed=request.seed,
-        budget_s=request.budget_s,
-        options=job.task.options,
-        prior=job.prior and pose_out(job.prior),
-        truth=job.task.truth and pose_out(job.task.truth),
-        result=estimate and job_result(job, estimate),
-        error=error and problem_of(error, self),
+        seed=fields.seed,
+        budget_s=fields.budget_s,
+        deadline=_time(job.deadline) if job.deadline else None,
+        options=fields.options,
+        prior=pose_out(prior_from(fields.prior)) if fields.prior else None,
+        truth=pose_out(prior_from(fields.truth)) if fields.truth else None,
+        result=Result.model_validate_json(job.result) if job.result else None,
+        error=error and error.model_copy(update={"instance": summary["links"].self}),
     )
 
 
-def job_result(job: Job, estimate: PoseEstimate) -> Result:
-    """Describe the answer of a job."""
-    return result_out(estimate, timing_out(job.task.decode), versions(), job.task.scene.scene.info.geo_anchor)
-
-
-def answer(job: Job) -> tuple[str, datetime, Result]:
+def answer(job: StoredJob) -> tuple[str, datetime, Result]:
     """Return the photo's name, when it came, and the result. Raises JobNotReady, NoPose."""
-    if not job.done:
+    if not job.ended:
         raise JobNotReady(f"the job is {job.state}.", where="job")
-    if job.estimate is None or job.estimate.verdict.status is Status.NOT_LOCALIZED:
+    if job.result is None or job.status == Status.NOT_LOCALIZED:
         raise NoPose("the job found no pose that could be used.", where="job", hint="Its document says why.")
-    return job.task.photo_name, job.created, job_result(job, job.estimate)
+    return (
+        PhotoOut.model_validate_json(job.photo).name,
+        _time(job.created),
+        Result.model_validate_json(job.result),
+    )
 
 
-def _summary(job: Job, root: str) -> dict:
-    state, self, latest = job.state, f"{root}/jobs/{job.id}", job.records[-1:]
-    verdict = job.estimate.verdict if job.estimate else None
+def _summary(job: StoredJob, root: str) -> dict:
+    self = f"{root}/jobs/{job.id}"
     return {
         "id": job.id,
-        "state": state,
-        "scene": job.task.scene.scene.info.id,
-        "estimator": job.task.request.estimator,
-        "photo": PhotoOut(
-            name=job.task.photo_name, sha256=job.task.photo_sha256, intrinsics=intrinsics_out(job.intrinsics)
-        ),
-        "created": job.created,
-        "started": job.started,
-        "finished": job.finished,
-        "records": len(job.records),
-        "stage": latest[0].stage if latest else None,
-        "status": verdict and verdict.status,
-        "score": verdict and verdict.score,
+        "state": job.state,
+        "scene": job.scene,
+        "estimator": job.estimator,
+        "photo": PhotoOut.model_validate_json(job.photo),
+        "attempt": job.attempt,
+        "created": _time(job.created),
+        "started": job.started and _time(job.started),
+        "finished": job.finished and _time(job.finished),
+        "records": job.records,
+        "stage": job.stage,
+        "status": job.status,
+        "score": job.score,
         "links": JobLinks(
             self=self,
             events=f"{self}/events",
@@ -126,10 +126,15 @@ def _summary(job: Job, root: str) -> dict:
     }
 
 
-def job_trace(job: Job) -> Trace:
+def _time(seconds: float) -> datetime:
+    return datetime.fromtimestamp(seconds, UTC)
+
+
+def job_trace(job: StoredJob, records: list[str]) -> Trace:
     """Tell all that a job has told so far."""
-    state = job.state
-    return Trace(job=job.id, state=state, records=[record_out(r) for r in list(job.records)])
+    return Trace.model_validate(
+        {"job": job.id, "state": job.state, "attempt": job.attempt, "records": [json.loads(r) for r in records]}
+    )
 
 
 def scene_summary(entry: Entry, root: str) -> SceneSummary:

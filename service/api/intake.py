@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import hashlib
 import json
 import threading
 import time
@@ -20,9 +19,8 @@ from starlette.exceptions import HTTPException
 from starlette.requests import Request as HttpRequest
 
 from service.api.convert import OPENCV_FROM_OPENGL
-from service.api.jobs import Task
 from service.api.problems import described
-from service.api.schemas import LocalizeFields, LocalizeIn, PriorIn
+from service.api.requests import LocalizeFields, LocalizeIn, PriorIn
 from service.errors import (
     InvalidIntrinsics,
     InvalidOptions,
@@ -38,6 +36,14 @@ from service.types import Intrinsics, Pose, Query, StageTiming
 _NESTED = ("options", "intrinsics", "prior")
 _FIELDS = frozenset(LocalizeIn.model_fields)
 _ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior, "truth": InvalidPrior}
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a job has to do besides its photo; validated."""
+
+    request: Request
+    decode: StageTiming
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +134,13 @@ def make_task(
     )
     intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
     prior = None if fields.prior is None else prior_from(fields.prior)
-    truth = None if fields.truth is None else prior_from(fields.truth, "truth")
+    if fields.truth is not None:
+        prior_from(fields.truth, "truth")  # only checked: whoever measures errors reads it from the job
     background = scene.scene.info.background_rgb
     wall, cpu = time.perf_counter(), time.thread_time()
     query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
     decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
-    digest = hashlib.sha256(body.photo).hexdigest()
-    return Task(scene, request, fields.options, body.name, digest, decode, truth), query
+    return Task(request, decode), query
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:

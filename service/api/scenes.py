@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +31,8 @@ class Entry:
     state: SceneState = "loading"
     loaded: LoadedScene | None = None
     error: Exception | None = None
+    waiting: list[Callable[[], object]] = field(default_factory=list)
+    """To call when it is loaded, or failed to."""
 
 
 class Scenes:
@@ -44,6 +46,7 @@ class Scenes:
         self._estimator, self._cache_dir = estimator, cache_dir
         self._entries: dict[str, Entry] = {}
         self._stop = threading.Event()
+        self._settling = threading.Lock()
         self._thread = threading.Thread(target=self._load_all, name="scenes", daemon=True)
         for path in (scene for given in paths for scene in find_scenes(given)):
             scene_id = path.resolve().stem if path.is_file() else path.resolve().name
@@ -89,6 +92,15 @@ class Scenes:
             raise SceneNotReady(f"scene '{entry.id}' is still loading.", where="scene", hint="Try again later.")
         return entry.loaded
 
+    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+        """Call `do` as soon as the scene is in memory, or certain not to come there."""
+        entry = self._entries.get(scene_id)
+        with self._settling:
+            if entry is not None and entry.loaded is None and entry.error is None:
+                entry.waiting.append(do)
+                return
+        do()
+
     def readiness(self) -> Readiness:
         entries = self.entries()
         awaited = [f"scene {e.id}: {e.state}" for e in entries if e.state in ("loading", "preparing")]
@@ -110,10 +122,18 @@ class Scenes:
                     exc_info=not isinstance(error, SplatfixError),
                 )
                 entry.error, entry.state = error, "failed"
+                self._settled(entry)
+
+    def _settled(self, entry: Entry) -> None:
+        with self._settling:
+            waiting, entry.waiting = entry.waiting, []
+        for do in waiting:
+            do()
 
     def _load(self, entry: Entry) -> None:
         if entry.loaded is None and entry.path is not None:
             entry.loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir)
+            self._settled(entry)
         entry.state = "preparing"
         if entry.loaded is not None and not self._stop.is_set():
             entry.loaded.prepare(self._estimator)

@@ -1,4 +1,4 @@
-"""The JSON that the service speaks, as pydantic models.
+"""The JSON that the service answers with, as pydantic models; `requests` has what it is sent.
 
 Matrices are row-major nested lists. Every pose is in OpenCV camera axes (+x right, +y down, +z forward)
 unless its field says `opengl`. The world is the scene's own frame; lengths are scene units. The centre of
@@ -8,16 +8,14 @@ the top-left pixel is at (0.5, 0.5).
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from annotated_types import Len
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.types import Reason, Status
 
 Matrix = list[list[float]]
-Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
-JobState = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]
 SceneState = Literal["loading", "preparing", "ready", "failed"]
 
 
@@ -136,6 +134,8 @@ class Trace(Model):
 
     job: str
     state: JobState
+    attempt: int
+    """The one whose records these are."""
     records: list[Record]
 
 
@@ -256,6 +256,8 @@ class JobSummary(Model):
     scene: str
     estimator: str
     photo: PhotoOut
+    attempt: int
+    """How often it was started: again after a crash of the service."""
     created: datetime
     started: datetime | None
     finished: datetime | None
@@ -270,10 +272,12 @@ class JobSummary(Model):
 
 
 class JobOut(JobSummary):
-    """A job with its result (state `succeeded`) or its error (state `failed`)."""
+    """A job with its result (state `succeeded`), or the error for which it has none (`failed`, `interrupted`)."""
 
     seed: int
     budget_s: float | None
+    deadline: datetime | None
+    """When the answer was of no use any more, if that was said."""
     options: dict[str, Any]
     prior: PoseOut | None
     truth: PoseOut | None
@@ -360,63 +364,8 @@ class Readiness(Model):
     awaited: list[str]
     """What is not done yet; empty when ready."""
     failed: list[str]
-    """Scenes that could not be loaded, with the reason."""
+    """Scenes that could not be loaded, a disk that can't be written to, workers that are stuck; with the reason."""
 
 
 class Liveness(Model):
     alive: Literal[True] = True
-
-
-class PriorIn(Model):
-    """A pose, a guess or a wish: exactly one of the three spellings."""
-
-    convention: Literal["opencv", "opengl"] = "opencv"
-    """The camera axes of what is given."""
-    world_from_camera: Matrix4 | None = None
-    camera_from_world: Matrix4 | None = None
-    position: list[float] | None = Field(default=None, min_length=3, max_length=3)
-    """The camera's centre in the world; together with `quaternion_wxyz`."""
-    quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
-    """world_from_camera."""
-
-
-class RenderIn(Model):
-    """A picture of a scene."""
-
-    pose: PriorIn
-    intrinsics: dict[str, Any] | None = None
-    """Pinhole: `width, height, fx, fy, cx, cy`. Left out: those of the first training camera, or 640 x 480."""
-    format: Literal["png", "jpeg", "depth"] = "png"
-    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
-    quality: int = Field(default=90, ge=1, le=100)
-    """JPEG's."""
-
-
-class LocalizeFields(Model):
-    """What is sent beside the photo."""
-
-    scene: str | None = None
-    """May be left out when the service has exactly one scene."""
-    estimator: str | None = None
-    """See `/capabilities`; left out: the default one."""
-    options: dict[str, Any] = {}
-    """The estimator's options; `/capabilities` has their schema."""
-    intrinsics: dict[str, Any] | None = None
-    """Of the upright photo: `width, height, fx, fy, cx, cy`, and COLMAP's `model` and `distortion`. Left out:
-    taken from the EXIF data, or guessed."""
-    prior: PriorIn | None = None
-    truth: PriorIn | None = None
-    """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
-    seed: int = Field(default=0, ge=0, lt=2**63)
-    budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
-    """Wall time after which the best pose so far is the answer."""
-
-
-class LocalizeIn(LocalizeFields):
-    """A request to localize a photo, as a JSON body; a multipart form has the same names.
-
-    In a form, `options`, `intrinsics`, `prior` and `truth` are JSON text and `photo` is a file.
-    """
-
-    photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
-    """JPEG, PNG, WebP or HEIC."""

@@ -10,6 +10,9 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from service.localize import DEFAULT_ESTIMATOR
 
+DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
+"""Where `splatfix serve` keeps its jobs, a folder for each port."""
+
 
 def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -31,8 +34,26 @@ class Settings(BaseSettings):
     """Jobs that run at once; each has one thread."""
     queue_size: int = Field(default=32, ge=1)
     """Jobs that may wait; one more is refused with 503."""
-    keep_jobs: int = Field(default=200, ge=1)
-    """Finished jobs that are remembered."""
+    queue_bytes: int = Field(default=500_000_000, ge=1)
+    """Decoded photos that may wait in memory."""
+    max_job_s: float = Field(default=300.0, gt=0)
+    """The longest budget of a job; also of one that sets none."""
+    stuck_s: float = Field(default=120.0, gt=0)
+    """A job that tells nothing for so long is given up, and its worker replaced."""
+    shutdown_s: float = Field(default=10.0, ge=0)
+    """What running jobs get to finish after SIGTERM; what doesn't is run again after the restart."""
+    data_dir: Path | None = None
+    """Where jobs are kept; None: in a temporary folder that goes with the process. `splatfix serve` names one."""
+    keep_jobs: int = Field(default=10_000, ge=1)
+    """Ended jobs that are remembered."""
+    keep_days: float = Field(default=30.0, gt=0)
+    """How long ended jobs are remembered."""
+    keep_bytes: int = Field(default=2_000_000_000, ge=0)
+    """What ended jobs may take on disk, with their records and photos."""
+    photo_grace_s: float = Field(default=900.0, ge=0)
+    """How long after its job a photo can be looked at, unless the request says `keep_photo`; 0: not at all."""
+    crashes: int = Field(default=3, ge=1)
+    """A job that was running in so many crashes is not run again."""
     max_upload_bytes: int = Field(default=100_000_000, ge=1)
     max_wait_s: float = Field(default=60.0, gt=0)
     """The longest `Prefer: wait=N` that is honoured."""

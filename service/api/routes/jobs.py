@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated, Literal
@@ -13,19 +14,20 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
 
 from service.api import documents
-from service.api.convert import record_out
+from service.api.convert import record_camera
 from service.api.exports import EXPORT_TYPES, ExportFormat, exported
-from service.api.jobs import Job, JobFilter
 from service.api.routes.parts import JPEG, JobOf, PartsOf, RootOf, errors
-from service.api.schemas import JobList, JobOut, JobState, Trace
+from service.api.schemas import JobList, JobOut, JobState, PhotoOut, Record, Trace
+from service.api.store import JobFilter
 from service.images import encode_image
+from service.localize import LoadedScene
 from service.types import Camera, Status
 
 router = APIRouter()
 
 
 @router.get("/jobs", tags=["jobs"], responses=errors())
-async def list_jobs(
+def list_jobs(
     parts: PartsOf,
     root: RootOf,
     scene: str | None = None,
@@ -51,16 +53,16 @@ async def list_jobs(
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], responses=errors(404))
-async def get_job(job: JobOf, root: RootOf) -> JobOut:
+def get_job(job: JobOf, root: RootOf) -> JobOut:
     """Say how a job stands; with its result or its error when it has ended."""
     return documents.job_document(job, root)
 
 
 @router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors(404))
-async def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
+def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     """Cancel: at once if the job waits, after its current step if it runs, without effect if it has ended."""
     parts.jobs.cancel(job)
-    return documents.job_document(job, root)
+    return documents.job_document(parts.jobs.get(job.id), root)
 
 
 @router.get(
@@ -70,36 +72,50 @@ async def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     responses=errors(404),
 )
 async def job_events(
-    job: JobOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
+    job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
 ) -> AsyncIterator[ServerSentEvent]:
     """Follow a job: an event `record` for each step from the first on, then `result` or `error`.
 
-    A `record` has the record's index as id and a `Record` as data. The last event has the id `end` and a
-    `JobOut` as data: `result` if the job succeeded, `error` if it failed or was cancelled. `Last-Event-ID`
-    resumes.
+    A `record` has `attempt.index` as id and a `Record` as data; after a crash of the service another attempt
+    starts again at index 0. The last event has the id `end` and a `JobOut` as data: `result` if the job succeeded,
+    else `error`. `Last-Event-ID` resumes, also after a restart of the service.
     """
-    sent = int(last_event_id) + 1 if last_event_id.isdecimal() and len(last_event_id) < 10 else 0
-    async for done in job.changes():
-        for record in job.records[sent:]:
-            data = record_out(record).model_dump_json()
-            yield ServerSentEvent(event="record", id=str(record.index), raw_data=data)
-            sent += 1
-        if done:
-            data = documents.job_document(job, root).model_dump_json()
-            event = "result" if job.state == "succeeded" else "error"
-            yield ServerSentEvent(event=event, id="end", raw_data=data)
+    attempt, sent = _resumed(last_event_id)
+    if live := parts.jobs.live(job.id):
+        async for _ in live.changes():
+            if live.attempt != attempt:
+                attempt, sent = live.attempt, 0
+            for record in live.records[sent:]:
+                yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
+                sent += 1
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    if job.attempt != attempt:
+        attempt, sent = job.attempt, 0
+    for record in await to_thread.run_sync(parts.jobs.records, job, sent):
+        yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
+        sent += 1
+    if job.ended:  # else the service ends: the client comes again
+        data = documents.job_document(job, root).model_dump_json()
+        yield ServerSentEvent(event="result" if job.result else "error", id="end", raw_data=data)
+
+
+def _resumed(last_event_id: str) -> tuple[int, int]:
+    """Return the attempt that a client knows, and how many of its records."""
+    found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
+    return (int(found[1]), int(found[2]) + 1) if found else (0, 0)
 
 
 @router.get("/jobs/{job_id}/photo", tags=["jobs"], response_class=Response, responses=JPEG | errors(404))
 async def job_photo(job: JobOf, parts: PartsOf) -> Response:
-    """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced."""
-    return Response(await to_thread.run_sync(job.jpeg, limiter=parts.rendering), media_type="image/jpeg")
+    """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced. For a while, or if kept."""
+    photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
+    return Response(photo, media_type="image/jpeg")
 
 
 @router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors(404))
-async def job_trace(job: JobOf) -> Trace:
-    """Return all records so far."""
-    return documents.job_trace(job)
+def job_trace(job: JobOf, parts: PartsOf) -> Trace:
+    """Return all records so far, of the latest attempt."""
+    return documents.job_trace(job, parts.jobs.records(job))
 
 
 @router.get(
@@ -120,16 +136,16 @@ async def job_render(
     ] = "pose",
 ) -> Response:
     """Render the scene as a record's camera sees it."""
-    record = job.record(None if index == "last" else index)
-    seen_by = Camera(job.intrinsics, record.pose)
-    if camera == "matches" and record.matches is not None:
-        seen_by = record.matches.render_camera
-    render = partial(_rendered_jpeg, job, seen_by)
+    text = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
+    photo = PhotoOut.model_validate_json(job.photo)
+    seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
+    loaded = parts.scenes.get(job.scene)
+    render = partial(_rendered_jpeg, loaded, seen_by)
     return Response(await to_thread.run_sync(render, limiter=parts.rendering), media_type="image/jpeg")
 
 
-def _rendered_jpeg(job: Job, camera: Camera) -> bytes:
-    return encode_image(job.task.scene.rasterizer.render([camera])[0].rgb)
+def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
+    return encode_image(loaded.rasterizer.render([camera])[0].rgb)
 
 
 @router.get(
@@ -144,7 +160,7 @@ def _rendered_jpeg(job: Job, camera: Camera) -> bytes:
     }
     | errors(404, 409),
 )
-async def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
+def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
     """Return the pose as other programs read it; not of a job that found none.
 
     `colmap`: an entry of `images.txt`, its camera in a comment. `nerfstudio`: an entry of `frames` in

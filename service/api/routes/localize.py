@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
-from functools import partial
 from typing import Annotated, Any
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request, Response
 
 from service.api import documents
-from service.api.intake import make_task, read_body, read_fields
+from service.api.intake import read_body, read_fields
+from service.api.jobs import Order
+from service.api.requests import LocalizeFields, LocalizeIn
 from service.api.routes.parts import PartsOf, RootOf, errors
-from service.api.schemas import JobOut, LocalizeFields, LocalizeIn
+from service.api.schemas import JobOut
 
 router = APIRouter()
 
@@ -69,20 +71,31 @@ async def localize_photo(
     parts: PartsOf,
     root: RootOf,
     prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
+    idempotency_key: Annotated[
+        str | None,
+        Header(max_length=200, description="Send a request again with the same key: it is the same job, not a second"),
+    ] = None,
 ) -> JobOut:
     """Find where a photo was taken. What is wrong with the request is told at once; the search is a job."""
     body = await read_body(request)
     fields = read_fields(body.fields)
     scene = parts.scenes.get(fields.scene)
-    prepare = partial(make_task, body, fields, scene, parts.settings.estimator)
-    job = parts.jobs.submit(*await to_thread.run_sync(prepare, limiter=parts.decoding))
+    digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
+    order = Order(body, fields, _client(request), idempotency_key, digest)
+    job = await to_thread.run_sync(parts.jobs.accept, order, scene, limiter=parts.decoding)
     wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
     if wait_s:
-        await job.wait(wait_s)
+        if live := parts.jobs.live(job.id):
+            await live.wait(wait_s)
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
     response.headers["Location"] = f"{root}/jobs/{job.id}"
-    response.status_code = 200 if job.done else 202
+    response.status_code = 200 if job.ended else 202
     return documents.job_document(job, root)
+
+
+def _client(request: Request) -> str:
+    return request.client.host if request.client else ""
 
 
 def wait_preference(header: str) -> float:

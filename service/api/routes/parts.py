@@ -8,10 +8,11 @@ from typing import Annotated, Any
 import anyio
 from fastapi import Depends, Path, Request
 
-from service.api.jobs import Job, Jobs
+from service.api.jobs import Jobs
 from service.api.problems import MEDIA_TYPE
 from service.api.scenes import Scenes
 from service.api.settings import Settings
+from service.api.store import StoredJob
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,13 +36,13 @@ def _root(request: Request) -> str:
     return request.scope.get("root_path", "")
 
 
-def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id.")]) -> Job:
-    return parts.jobs.get(job_id)
+def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id.")]) -> StoredJob:
+    return parts.jobs.get(job_id)  # not async: reads the disk
 
 
 PartsOf = Annotated[Parts, Depends(_parts)]
 RootOf = Annotated[str, Depends(_root)]
-JobOf = Annotated[Job, Depends(_job)]
+JobOf = Annotated[StoredJob, Depends(_job)]
 
 
 def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:

@@ -10,8 +10,9 @@ from fastapi import APIRouter, Query, Response
 
 from service.api import documents, splats
 from service.api.pictures import PICTURE_TYPES, picture, thumbnail
+from service.api.requests import RenderIn
 from service.api.routes.parts import JPEG, PartsOf, RootOf, errors
-from service.api.schemas import RenderIn, SceneList, SceneOut
+from service.api.schemas import SceneList, SceneOut
 
 MAX_SPLATS = 2_000_000
 

@@ -31,7 +31,9 @@ async def live() -> Liveness:
 
 @router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
 async def ready(parts: PartsOf, response: Response) -> Readiness:
-    """Say whether photos can be localized at full speed: scenes loaded, kernels compiled, indexes made."""
+    """Say whether photos can be localized at full speed: scenes loaded and ready, workers and disk at work."""
     readiness = parts.scenes.readiness()
+    ill = parts.jobs.ailments()
+    readiness = readiness.model_copy(update={"ready": readiness.ready and not ill, "failed": readiness.failed + ill})
     response.status_code = 200 if readiness.ready else 503
     return readiness

@@ -1,0 +1,80 @@
+"""The photos of jobs as files: as sent until the job has ended, then as the upright JPEG that people look at.
+
+No name comes from outside: a file is called after its job, whose id we made. What was sent, with its EXIF data, is gone
+when the job has ended.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+
+from service.errors import PhotoGone, StorageFailed
+
+
+class Photos:
+    """One folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def accept(self, job_id: str, data: bytes) -> None:
+        """Write a photo so that it survives a power loss. Raises StorageFailed."""
+        path = self._folder / f"{job_id}.upload"
+        try:
+            write_durably(path, data)
+        except OSError as error:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+            raise StorageFailed(f"the service can't write the photo to disk: {error.strerror}.") from error
+
+    def original(self, job_id: str) -> bytes:
+        """Return what was sent. Raises PhotoGone."""
+        return self._read(f"{job_id}.upload")
+
+    def settle(self, job_id: str, jpeg: bytes | None) -> None:
+        """Replace what was sent by a JPEG for looking at, or by nothing."""
+        if jpeg is not None:
+            with suppress(OSError):  # a full disk: the photo isn't kept
+                (self._folder / f"{job_id}.jpg").write_bytes(jpeg)
+        (self._folder / f"{job_id}.upload").unlink(missing_ok=True)
+
+    def kept(self, job_id: str) -> bytes:
+        """Return the JPEG. Raises PhotoGone."""
+        return self._read(f"{job_id}.jpg")
+
+    def delete(self, job_id: str) -> None:
+        for suffix in ("upload", "jpg"):
+            (self._folder / f"{job_id}.{suffix}").unlink(missing_ok=True)
+
+    def unsettled(self) -> set[str]:
+        """Return the ids of the jobs whose photo is there as it was sent."""
+        return {path.stem for path in self._folder.glob("*.upload")}
+
+    def ids(self) -> set[str]:
+        return {path.stem for path in self._folder.iterdir()}
+
+    def _read(self, name: str) -> bytes:
+        try:
+            return (self._folder / name).read_bytes()
+        except FileNotFoundError:
+            raise PhotoGone(
+                "the photo was deleted after the job.",
+                where="photo",
+                hint="Send keep_photo=true to have it kept as long as the job.",
+            ) from None
+
+
+def write_durably(path: Path, data: bytes) -> None:
+    """Write a file and wait until it and its name are on disk. Raises OSError."""
+    with path.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

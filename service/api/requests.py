@@ -1,0 +1,71 @@
+"""What callers send, as pydantic models."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from annotated_types import Len
+from pydantic import Field
+
+from service.api.schemas import Model
+
+Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
+
+
+class PriorIn(Model):
+    """A pose, a guess or a wish: exactly one of the three spellings."""
+
+    convention: Literal["opencv", "opengl"] = "opencv"
+    """The camera axes of what is given."""
+    world_from_camera: Matrix4 | None = None
+    camera_from_world: Matrix4 | None = None
+    position: list[float] | None = Field(default=None, min_length=3, max_length=3)
+    """The camera's centre in the world; together with `quaternion_wxyz`."""
+    quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
+    """world_from_camera."""
+
+
+class RenderIn(Model):
+    """A picture of a scene."""
+
+    pose: PriorIn
+    intrinsics: dict[str, Any] | None = None
+    """Pinhole: `width, height, fx, fy, cx, cy`. Left out: those of the first training camera, or 640 x 480."""
+    format: Literal["png", "jpeg", "depth"] = "png"
+    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
+    quality: int = Field(default=90, ge=1, le=100)
+    """JPEG's."""
+
+
+class LocalizeFields(Model):
+    """What is sent beside the photo."""
+
+    scene: str | None = None
+    """May be left out when the service has exactly one scene."""
+    estimator: str | None = None
+    """See `/capabilities`; left out: the default one."""
+    options: dict[str, Any] = Field(default_factory=dict)
+    """The estimator's options; `/capabilities` has their schema."""
+    intrinsics: dict[str, Any] | None = None
+    """Of the upright photo: `width, height, fx, fy, cx, cy`, and COLMAP's `model` and `distortion`. Left out:
+    taken from the EXIF data, or guessed."""
+    prior: PriorIn | None = None
+    truth: PriorIn | None = None
+    """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
+    seed: int = Field(default=0, ge=0, lt=2**63)
+    budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
+    """Wall time after which the best pose so far is the answer."""
+    deadline_s: float | None = Field(default=None, gt=0, le=86_400, allow_inf_nan=False)
+    """Seconds from now after which an answer is of no use: a job that hasn't started by then fails."""
+    keep_photo: bool = False
+    """Keep the photo, upright and without EXIF data, as long as the job; else it is deleted after the job."""
+
+
+class LocalizeIn(LocalizeFields):
+    """A request to localize a photo, as a JSON body; a multipart form has the same names.
+
+    In a form, `options`, `intrinsics`, `prior` and `truth` are JSON text and `photo` is a file.
+    """
+
+    photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
+    """JPEG, PNG, WebP or HEIC."""

@@ -1,0 +1,335 @@
+"""What is accepted is never lost and never done twice: restarts, full disks, stuck workers, repeated requests."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import threading
+import time
+from pathlib import Path
+from types import ModuleType
+
+import httpx
+import pytest
+from api_server import assert_problem, events, finished, make_scene, photo, post, serving, settings, until
+
+import service.api.app
+import service.api.photos
+from service.api.app import create_app
+from service.api.store import Batch, Ending, JobFilter, JobStore, NewJob, Retention
+from service.errors import IdempotencyConflict, StorageFailed
+
+
+def app(folder: Path, **changes):
+    return create_app(settings(data_dir=folder, **changes), {"room": make_scene()})
+
+
+def ready(client: httpx.Client) -> None:
+    until(lambda: client.get("/readyz").status_code == 200)
+
+
+# ------------------------------------------------------------------ restarts
+
+
+@pytest.fixture
+def crashed(stepping: ModuleType, tmp_path: Path) -> tuple[Path, list[str]]:
+    """The folder of a service that was killed with one job running and two waiting, one of these cancelled."""
+    with serving(app(tmp_path / "first", photo_grace_s=0)) as client:
+        ready(client)
+        running = post(client, prefer="", options={"hold": True}, seed="1").json()["id"]
+        until(lambda: client.get(f"/jobs/{running}").json()["records"] == 1)
+        stopping = post(client, prefer="", options={"hold": True}, seed="2").json()["id"]
+        waiting = post(client, prefer="", seed="3", keep_photo="true").json()["id"]
+        # As a power loss finds it: nothing is closed or flushed.
+        shutil.copytree(tmp_path / "first", tmp_path / "copy")
+        client.delete(f"/jobs/{stopping}")
+        stepping.GO_ON.set()
+    return tmp_path / "copy", [running, stopping, waiting]
+
+
+def test_after_a_crash_every_job_is_done_once(crashed):
+    folder, ids = crashed
+    with serving(app(folder)) as client:
+        jobs = [finished(client, f"/jobs/{job_id}") for job_id in ids]
+        assert [job["state"] for job in jobs] == ["succeeded"] * 3
+        # The one that ran starts again; the ones that waited start for the first time.
+        assert [job["attempt"] for job in jobs] == [2, 1, 1]
+        assert [job["result"]["seed"] for job in jobs] == [1, 2, 3]
+        assert [job["id"] for job in client.get("/jobs").json()["jobs"]] == ids[::-1]
+        trace = client.get(f"/jobs/{ids[0]}/trace").json()
+        assert [record["index"] for record in trace["records"]] == [0, 1, 2]
+
+
+def test_a_stream_goes_on_after_a_restart(crashed):
+    folder, (running, *_) = crashed
+    with serving(app(folder)) as client:
+        finished(client, f"/jobs/{running}")
+        resumed = events(client.get(f"/jobs/{running}/events", headers={"Last-Event-ID": "1.0"}).text)
+        assert [number for _, number, _ in resumed] == ["2.0", "2.1", "2.2", "end"]
+        resumed = events(client.get(f"/jobs/{running}/events", headers={"Last-Event-ID": "2.1"}).text)
+        assert [number for _, number, _ in resumed] == ["2.2", "end"]
+
+
+def test_a_cancelled_job_stays_cancelled_over_a_crash(stepping, tmp_path):
+    with serving(app(tmp_path / "first")) as client:
+        ready(client)
+        path = post(client, prefer="", options={"hold": True}).headers["location"]
+        until(lambda: client.get(path).json()["records"] == 1)
+        assert client.delete(path).json()["state"] == "running"
+        shutil.copytree(tmp_path / "first", tmp_path / "copy")
+        stepping.GO_ON.set()
+    with serving(app(tmp_path / "copy")) as client:
+        assert client.get(path).json()["state"] == "cancelled"
+
+
+def test_a_job_that_was_there_in_every_crash_is_given_up(crashed):
+    folder, (running, *_) = crashed
+    with serving(app(folder, crashes=1)) as client:
+        job = client.get(f"/jobs/{running}").json()
+        assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
+        assert job["error"]["instance"] == f"/jobs/{running}"
+        told = events(client.get(f"/jobs/{running}/events").text)
+        # The record that was stored before the crash is not lost either.
+        assert [(name, number) for name, number, _ in told] == [("record", "1.0"), ("error", "end")]
+
+
+def test_a_job_whose_scene_is_gone_is_interrupted_with_the_reason(crashed):
+    folder, ids = crashed
+    with serving(create_app(settings(data_dir=folder), {"attic": make_scene("attic")})) as client:
+        job = finished(client, f"/jobs/{ids[2]}")
+        assert (job["state"], job["error"]["code"]) == ("interrupted", "scene_not_found")
+
+
+def test_a_stopped_service_finishes_or_puts_back_what_runs(stepping, tmp_path):
+    with serving(app(tmp_path, shutdown_s=0.2)) as client:
+        ready(client)
+        held = post(client, prefer="", options={"hold": True}).headers["location"]
+        until(lambda: client.get(held).json()["records"] == 1)
+        waiting = post(client, prefer="").headers["location"]
+        threading.Timer(0.5, stepping.GO_ON.set).start()
+    with serving(app(tmp_path)) as client:
+        for path, attempt in ((held, 2), (waiting, 1)):
+            job = finished(client, path)
+            assert (job["state"], job["attempt"]) == ("succeeded", attempt)
+
+
+def test_a_folder_has_one_service(stepping, tmp_path):
+    used = pytest.raises(StorageFailed, match="another process uses it")
+    with serving(app(tmp_path)), used, service.api.app.data_folder(tmp_path):
+        pass
+
+
+# ------------------------------------------------------------------ repeated requests
+
+
+def keyed(client: httpx.Client, key: str, **fields) -> httpx.Response:
+    headers = {"Idempotency-Key": key}
+    return client.post("/localize", files={"photo": ("p.jpg", photo())}, data=fields, headers=headers)
+
+
+def test_a_repeated_request_is_the_same_job(client, stepping):
+    first, again = keyed(client, "a", seed="1"), keyed(client, "a", seed="1")
+    assert first.json()["id"] == again.json()["id"]
+    assert keyed(client, "b", seed="1").json()["id"] != first.json()["id"]
+    assert_problem(keyed(client, "a", seed="2"), 422, "idempotency_conflict", "header.idempotency-key")
+    finished(client, first.headers["location"])
+    assert keyed(client, "a", seed="1").json()["state"] == "succeeded"
+    assert len(client.get("/jobs").json()["jobs"]) == 2
+
+
+def test_a_repeated_request_is_answered_by_a_full_service_too(client, stepping):
+    held = post(client, prefer="", options={"hold": True}).headers["location"]
+    until(lambda: client.get(held).json()["state"] == "running")
+    kept = keyed(client, "a")
+    assert keyed(client, "b").status_code == 202
+    assert keyed(client, "c").status_code == 503
+    assert keyed(client, "a").json()["id"] == kept.json()["id"]
+
+
+# ------------------------------------------------------------------ the disk
+
+
+def test_a_photo_that_cannot_be_written_is_not_accepted(stepping, tmp_path, monkeypatch):
+    def full(path, data):
+        path.write_bytes(data[:10])
+        raise OSError(28, "No space left on device")
+
+    with serving(app(tmp_path)) as client:
+        ready(client)
+        with monkeypatch.context() as patch:
+            patch.setattr(service.api.photos, "write_durably", full)
+            refused = post(client)
+            assert_problem(refused, 503, "storage_failed")
+            assert int(refused.headers["retry-after"]) > 0
+            told = client.get("/readyz")
+            assert told.status_code == 503
+            assert "No space left" in told.json()["failed"][0]
+        assert client.get("/jobs").json()["jobs"] == []
+        assert list((tmp_path / "photos").iterdir()) == []
+        until(lambda: client.get("/readyz").status_code == 200)
+        assert post(client).json()["state"] == "succeeded"
+
+
+def test_a_result_waits_until_the_disk_has_room(stepping, tmp_path):
+    """SQLite's own limit of pages makes it say that the disk is full."""
+    service_app = app(tmp_path)
+    with serving(service_app) as client:
+        ready(client)
+        path = post(client, prefer="", options={"hold": True, "steps": 60}).headers["location"]
+        until(lambda: client.get(path).json()["records"] == 1)
+        writer = service_app.state.parts.jobs._store._writer
+        (pages,) = writer.execute("PRAGMA page_count").fetchone()
+        writer.execute(f"PRAGMA max_page_count = {pages}")
+        stepping.GO_ON.set()
+        until(lambda: client.get("/readyz").status_code == 503)
+        assert "full" in client.get("/readyz").json()["failed"][0]
+        assert client.get(path).json()["state"] == "running"
+        writer.execute("PRAGMA max_page_count = 100000")
+        job = finished(client, path)
+        assert (job["state"], job["records"]) == ("succeeded", 60)
+        assert len(client.get(f"{path}/trace").json()["records"]) == 60
+
+
+def test_photos_go_with_their_job_unless_kept(stepping, tmp_path):
+    with serving(app(tmp_path, photo_grace_s=0)) as client:
+        ready(client)
+        gone, kept = post(client).json(), post(client, keep_photo="true").json()
+        assert_problem(client.get(gone["links"]["photo"]), 404, "photo_gone")
+        assert client.get(kept["links"]["photo"]).status_code == 200
+        until(lambda: [path.name for path in (tmp_path / "photos").iterdir()] == [f"{kept['id']}.jpg"])
+
+
+def test_a_photo_can_be_looked_at_for_a_while(stepping, tmp_path):
+    with serving(app(tmp_path, photo_grace_s=0.5)) as client:
+        ready(client)
+        link = post(client).json()["links"]["photo"]
+        assert client.get(link).status_code == 200
+        until(lambda: client.get(link).status_code == 404)
+        assert not list((tmp_path / "photos").iterdir())
+
+
+# ------------------------------------------------------------------ workers and deadlines
+
+
+def test_a_stuck_worker_is_replaced_and_two_are_told(stepping, tmp_path):
+    with serving(app(tmp_path, stuck_s=0.3)) as client:
+        ready(client)
+        for _ in range(2):
+            job = finished(client, post(client, prefer="", options={"hold": True}).headers["location"])
+            assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
+            assert post(client).json()["state"] == "succeeded"
+        told = client.get("/readyz")
+        assert (told.status_code, told.json()["failed"]) == (503, ["2 workers are stuck"])
+        stepping.GO_ON.set()
+        time.sleep(0.2)  # the abandoned threads come back, too late
+        assert {job["state"] for job in client.get("/jobs").json()["jobs"]} == {"interrupted", "succeeded"}
+
+
+def test_a_job_past_its_deadline_does_not_start(client, stepping):
+    post(client, prefer="", options={"hold": True})
+    late = post(client, prefer="", deadline_s=0.1).headers["location"]
+    in_time = post(client, prefer="", deadline_s=60).headers["location"]
+    time.sleep(0.2)
+    stepping.GO_ON.set()
+    job = finished(client, late)
+    assert (job["state"], job["error"]["code"], job["error"]["status"]) == ("failed", "deadline_exceeded", 504)
+    assert finished(client, in_time)["state"] == "succeeded"
+
+
+# ------------------------------------------------------------------ the store
+
+
+def new_job(name: str, **changes) -> NewJob:
+    values = {
+        **{"id": name, "client": "c", "idempotency_key": None, "digest": "d", "created": time.time()},
+        **{"deadline": None, "scene": "s", "estimator": "e", "fields": "{}", "photo": "{}", "photo_sha256": "0"},
+        **{"photo_bytes": 10, "keep_photo": False},
+    }
+    return NewJob(**(values | changes))
+
+
+NONE = Batch(0, (), None)
+
+
+def test_a_job_is_claimed_once_and_ends_once(tmp_path):
+    store = JobStore(tmp_path / "jobs.sqlite")
+    job = store.accept(new_job("a"))
+    assert store.claim(job) == 1
+    assert store.claim(job) is None
+    assert store.append("a", 1, Batch(0, ["one", "two"], "x"))
+    assert not store.append("a", 2, Batch(2, ["three"], "x"))
+    assert store.finish("a", 1, Batch(2, ["three"], "y"), Ending("succeeded", result="{}"), None)
+    assert not store.finish("a", 1, NONE, Ending("failed"), None)
+    assert not store.requeue("a", 1)
+    ended = store.get("a")
+    assert (ended.state, ended.records, ended.stage) == ("succeeded", 3, "y")
+    assert store.records("a", 1) == ["two", "three"]
+    store.close()
+
+
+def test_many_threads_agree_on_one_winner(tmp_path):
+    store = JobStore(tmp_path / "jobs.sqlite")
+    job = store.accept(new_job("a"))
+    won: list[int] = []
+    barrier = threading.Barrier(8)
+
+    def compete() -> None:
+        barrier.wait()
+        attempt = store.claim(job)
+        if attempt:
+            won.append(attempt)
+
+    threads = [threading.Thread(target=compete) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert won == [1]
+    store.close()
+
+
+def test_keys_belong_to_their_client(tmp_path):
+    store = JobStore(tmp_path / "jobs.sqlite")
+    store.accept(new_job("a", idempotency_key="k"))
+    assert store.accept(new_job("b", idempotency_key="k")).id == "a"
+    assert store.accept(new_job("c", idempotency_key="k", client="other")).id == "c"
+    with pytest.raises(IdempotencyConflict):
+        store.accept(new_job("d", idempotency_key="k", digest="e"))
+    store.close()
+
+
+@pytest.mark.parametrize(
+    ("kept", "left"),
+    [
+        (Retention(2, 1e9, 10**9), ["running", "c", "b"]),
+        (Retention(9, 1e9, 250), ["running", "c", "b"]),
+        (Retention(9, 3600, 10**9), ["running", "c"]),
+    ],
+)
+def test_the_oldest_ended_jobs_are_forgotten(tmp_path, kept, left, monkeypatch):
+    store = JobStore(tmp_path / "jobs.sqlite")
+    now = time.time()
+    for age, name in ((9000, "a"), (8000, "b"), (10, "c")):
+        job = store.accept(new_job(name, photo_bytes=0))
+        store.claim(job)
+        monkeypatch.setattr(time, "time", lambda age=age: now - age)
+        store.finish(name, 1, NONE, Ending("succeeded", result="x" * 100), None)
+        monkeypatch.undo()
+    store.claim(store.accept(new_job("running")))
+    store.forget(kept)
+    assert [job.id for job in store.page(JobFilter(), 9)] == left
+    store.close()
+
+
+def test_a_file_of_a_newer_program_is_refused(tmp_path):
+    with sqlite3.connect(tmp_path / "jobs.sqlite") as connection:
+        connection.execute("PRAGMA user_version = 99")
+    connection.close()
+    with pytest.raises(StorageFailed, match="version 99"):
+        JobStore(tmp_path / "jobs.sqlite")
+
+
+def test_a_file_that_is_no_database_is_told(tmp_path):
+    (tmp_path / "jobs.sqlite").write_bytes(b"not a database" * 100)
+    with pytest.raises(StorageFailed, match="not a database"):
+        JobStore(tmp_path / "jobs.sqlite")
