@@ -38,6 +38,8 @@ class FakeBrowser:
         """Scene nodes by name, as they are now."""
         self.widgets: dict[str, dict[str, Any]] = {}
         """GUI elements by uuid, as they are now; input elements have a `value`."""
+        self.background: dict[str, Any] = {}
+        """What lies behind the scene."""
         self.types: set[str] = set()
         """Of all messages so far."""
         self._changed = threading.Condition()
@@ -103,6 +105,8 @@ class FakeBrowser:
         if kind.startswith("Gui") and "props" in message:
             extra = {"value": message["value"]} if "value" in message else {}
             self.widgets[message["uuid"]] = {**message["props"], **extra, "uuid": message["uuid"], "type": kind}
+        elif kind == "BackgroundImageMessage":
+            self.background = message
         elif kind == "GuiUpdateMessage" and message["uuid"] in self.widgets:
             self.widgets[message["uuid"]].update(message["updates"])
         elif kind == "RemoveSceneNodeMessage":

@@ -7,6 +7,7 @@ decides what has happened when.
 from __future__ import annotations
 
 import io
+import json
 import re
 import threading
 import time
@@ -39,6 +40,10 @@ from service.types import (
 )
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
+
+
+EXACT_RGB = (180, 60, 160)
+"""Of a scene rendered on request."""
 
 
 def jpeg(rgb: tuple[int, int, int], width: int = PHOTO.width, height: int = PHOTO.height) -> bytes:
@@ -201,8 +206,12 @@ class FakeService:
     def __init__(self, gaussians: GaussianScene | None = None) -> None:
         self.scene = gaussians or scene()
         self.jobs: list[FakeJob] = []
+        self.scenes = ["ball"]
+        """Ids; all have the same content."""
         self.asked: list[str] = []
         """Paths, in order."""
+        self.renders: list[dict] = []
+        """What was to be rendered on request."""
         self.transport = httpx.MockTransport(self._answer)
 
     def job(self, job_id: str, steps: int = 0, *, finished: bool = False) -> FakeJob:
@@ -221,14 +230,28 @@ class FakeService:
         if path == "/jobs":
             return httpx.Response(200, json={"jobs": [j.out().model_dump(mode="json") for j in self.jobs]})
         if path == "/scenes":
-            return httpx.Response(200, json={"scenes": [self._scene_out().model_dump(mode="json")]})
-        if path == "/scenes/ball":
-            return httpx.Response(200, json=self._scene_out().model_dump(mode="json"))
-        if path == "/scenes/ball/splats":
+            scenes = [self._scene_out(name).model_dump(mode="json") for name in self.scenes]
+            return httpx.Response(200, json={"scenes": scenes})
+        _, kind, name, *rest = path.split("/", 3)
+        if kind == "scenes" and not rest:
+            return httpx.Response(200, json=self._scene_out(name).model_dump(mode="json"))
+        if kind == "scenes" and rest == ["render"]:
+            return self._render(json.loads(request.content))
+        if kind == "scenes" and rest == ["splats"]:
             return httpx.Response(200, content=packed_splats(self.scene, int(request.url.params["max"])))
         match = re.fullmatch(r"/jobs/(\w+)(/.*)?", path)
         job = next((j for j in self.jobs if match and j.id == match[1]), None)
         return self._answer_of(job, (match and match[2]) or "", request) if job else httpx.Response(404)
+
+    def _render(self, wanted: dict) -> httpx.Response:
+        """Depth is 3 everywhere, a picture is one colour."""
+        self.renders.append(wanted)
+        width, height = wanted["intrinsics"]["width"], wanted["intrinsics"]["height"]
+        if wanted["format"] == "depth":
+            file = io.BytesIO()
+            np.save(file, np.full((height, width), 3, np.float32))
+            return httpx.Response(200, content=file.getvalue())
+        return httpx.Response(200, content=jpeg(EXACT_RGB, width, height))
 
     def _answer_of(self, job: FakeJob, rest: str, request: httpx.Request) -> httpx.Response:
         if rest == "":
@@ -241,10 +264,10 @@ class FakeService:
         matched = request.url.params.get("camera") == "matches"
         return httpx.Response(200, content=jpeg(render_rgb(index, matched=matched)))
 
-    def _scene_out(self) -> SceneOut:
+    def _scene_out(self, name: str) -> SceneOut:
         info = self.scene.info
         return SceneOut(
-            id=info.id,
+            id=name,
             name=info.name,
             state="ready",
             gaussians=self.scene.count,

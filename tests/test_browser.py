@@ -13,7 +13,7 @@ from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
 from fake_service import FakeService, records
 from fastapi import FastAPI
 from PIL import Image
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 
 from service.api.relay import Relay
 from viewer.app import Viewer
@@ -102,12 +102,16 @@ def test_an_old_job_opens_by_its_address_and_can_be_stepped_through(
     page.get_by_role("button", name="difference").click()
     page.get_by_text("doubled").wait_for()
     wait_for_other_picture(page, second)
+    page.get_by_role("button", name="flicker").click()
+    above = page.locator(".splatfix-flicker img").last
+    for opacity in ("1", "0", "1"):
+        expect(above).to_have_css("opacity", opacity)
     page.close()
 
 
 def test_a_new_job_is_followed_while_it_runs(browser: Browser, fake: FakeService, url: str) -> None:
     page = opened(browser, f"{url}/")
-    page.get_by_text("first job").wait_for()
+    page.get_by_text("no job", exact=True).wait_for()
     job = fake.job("live", 1)
     page.get_by_text("running", exact=True).wait_for()
     for record in records(6)[1:]:

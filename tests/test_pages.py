@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from browsing import NEEDS_CHROMIUM, free_port, launched, opened, served
 from playwright.sync_api import Browser, Page, expect
+from small_room import INTRINSICS, pose_at, write_room
 
 from service.api.app import create_app
 from service.api.settings import Settings
@@ -23,9 +24,10 @@ PHOTO = STUDIO / "photos" / "photo_00.jpg"
 
 
 @pytest.fixture(scope="module")
-def url() -> Iterator[str]:
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     port = free_port()
-    settings = Settings(scenes=[STUDIO], port=port, cache_dir=None)
+    room = write_room(tmp_path_factory.mktemp("scenes") / "room")
+    settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=None)
     with served(create_app(settings), port) as url:
         until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200)
         yield url
@@ -69,6 +71,15 @@ def drop(page: Page, data: bytes, name: str) -> None:
     )
 
 
+def posted(url: str, photo: bytes, fields: dict) -> dict:
+    """Localize a photo by the API alone."""
+    wait = {"Prefer": "wait=60"}
+    answer = httpx.post(
+        f"{url}/localize", files={"photo": photo}, data=fields, headers=wait, trust_env=False, timeout=90
+    )
+    return answer.json()
+
+
 def job_of(page: Page, url: str) -> dict:
     return httpx.get(f"{url}/jobs/{page.url.rpartition('/')[2]}", trust_env=False).json()
 
@@ -95,8 +106,8 @@ def numbers(text: str) -> np.ndarray:
 
 
 def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
-    page.get_by_role("radio").wait_for()
-    expect(page.locator(".card")).to_contain_text("Studio")
+    page.get_by_role("radio").first.wait_for()
+    expect(page.locator(".card:has(:checked)")).to_contain_text("Studio")
     drop(page, PHOTO.read_bytes(), PHOTO.name)
     page.locator(".badge.localized").wait_for()
     job = job_of(page, url)
@@ -117,6 +128,41 @@ def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
         words = slice(0, -1) if kind == "colmap" else slice(0, None)
         np.testing.assert_allclose(np.float64(ours[words]), np.float64(theirs[words]), atol=1e-6)
         assert kind == "tum" or ours[-1] == theirs[-1] == PHOTO.name
+
+
+def test_the_viewer_shows_how_the_pose_was_found(page: Page, url: str) -> None:
+    # In a small scene: software GL draws the studio in seconds a frame.
+    page.set_viewport_size({"width": 900, "height": 620})
+    pose = {"world_from_camera": pose_at(0.3, 0.1).world_from_camera.tolist()}
+    wanted = {"pose": pose, "intrinsics": INTRINSICS, "format": "png"}
+    photo = httpx.post(f"{url}/scenes/room/render", json=wanted, trust_env=False).content
+    fields = {"scene": "room", "intrinsics": json.dumps(INTRINSICS), "truth": json.dumps(pose)}
+    job = posted(url, photo, fields)
+    page.goto(f"{url}/#/jobs/{job['id']}")
+    page.get_by_role("link", name="See how it was found").click()
+    page.get_by_text("localized", exact=True).wait_for()
+    page.get_by_text("agree").first.wait_for()
+    # The last step is the gate's; its matches come from the step that made them.
+    page.get_by_text("with the matches of step").wait_for()
+    step = page.get_by_role("slider").first
+    last = int(step.get_attribute("aria-valuenow") or "")
+    picture = page.locator("img[src^='blob:']").first
+    seen = {picture.get_attribute("src")}
+    page.get_by_role("tab", name="match vectors").click()
+    figures = [page.locator("figcaption").first.inner_text()]
+    page.get_by_role("tab", name="curves").click()
+    page.get_by_text("error of position").wait_for()
+    marks = [page.locator("svg[aria-label='loss by step'] path[stroke='#fff']").get_attribute("d")]
+    page.keyboard.press("p")
+    page.keyboard.press("p")
+    page.keyboard.press("p")
+    expect(step).to_have_attribute("aria-valuenow", str(last - 3))
+    mark = page.locator("svg[aria-label='loss by step'] path[stroke='#fff']")
+    expect(mark).not_to_have_attribute("d", marks[0] or "")
+    page.get_by_role("tab", name="match vectors").click()
+    expect(page.locator("figcaption").first).not_to_have_text(figures[0])
+    page.get_by_role("tab", name="photo and render").click()
+    until(lambda: picture.get_attribute("src") not in seen)
 
 
 def test_photo_and_render_are_blended_under_the_slider(page: Page) -> None:
@@ -160,7 +206,7 @@ def test_the_curl_line_sends_the_very_same_request(page: Page, url: str) -> None
 
 
 def test_what_is_no_photo_is_told_and_the_page_goes_on(page: Page) -> None:
-    page.get_by_role("radio").wait_for()
+    page.get_by_role("radio").first.wait_for()
     drop(page, b"not a photo", "notes.jpg")
     expect(page.get_by_role("alert")).to_contain_text("photo")
     drop(page, PHOTO.read_bytes(), PHOTO.name)
@@ -169,17 +215,7 @@ def test_what_is_no_photo_is_told_and_the_page_goes_on(page: Page) -> None:
 
 def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
     for seed in (1, 2):
-        with PHOTO.open("rb") as photo:
-            fields = {"seed": seed, "scene": "studio"}
-            answer = httpx.post(
-                f"{url}/localize",
-                files={"photo": photo},
-                data=fields,
-                headers={"Prefer": "wait=60"},
-                trust_env=False,
-                timeout=90,
-            )
-        assert answer.json()["status"] == "localized"
+        assert posted(url, PHOTO.read_bytes(), {"seed": seed, "scene": "studio"})["status"] == "localized"
     page.get_by_role("link", name="History").click()
     rows = page.locator("tbody tr")
     rows.nth(1).wait_for()
@@ -203,7 +239,7 @@ def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
     page = opened(browser, f"{url}/", 360, 740)
-    page.get_by_role("radio").wait_for()
+    page.get_by_role("radio").first.wait_for()
     page.get_by_text("Intrinsics, prior, estimator").click()
     page.get_by_label("Seed").wait_for()
     assert _overflow(page) <= 0

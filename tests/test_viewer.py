@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -18,7 +20,7 @@ from service.api.convert import record_out
 from service.api.splats import importance, packed_splats
 from service.geometry import look_at, project, transformed
 from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Reason, Status
-from viewer import draw, shapes
+from viewer import charts, draw, measure, shapes
 from viewer.client import Answer, JobView, Service, ServiceTrouble, parsed_record, parsed_splats, sse_events
 from viewer.feed import JobFeed, Library
 from viewer.playback import Playback, headline_html, record_html, scene_html
@@ -203,9 +205,9 @@ def test_match_lines_end_where_the_matches_are(width: int, height: int) -> None:
     render[at_render[1], at_render[0]] = 255
     camera = Camera(Intrinsics(width // 2, height // 2, 100, 100, width / 4, height / 4), orbit(0))
     pixels = [np.float32([p]) + np.float32(0.5) for p in (at_photo, at_render)]
-    spots = [_centre(draw.side_by_side(photo * a, render * (1 - a)), 30) for a in (1, 0)]
-    plain = draw.side_by_side(photo * 0, render * 0)
-    lined = draw.side_by_side(photo * 0, render * 0, MatchVectors(*pixels, np.array([True]), camera))
+    spots = [_centre(draw.beside(photo * a, render * (1 - a)), 30) for a in (1, 0)]
+    plain = draw.beside(photo * 0, render * 0)
+    lined = draw.beside(photo * 0, render * 0, match_view(*pixels, camera), np.uint8([draw.INLIER]))
     drawn = np.abs(lined.astype(int) - plain).max(-1) > 100
     rows, columns = np.nonzero(drawn)
     for x, y in spots:
@@ -231,13 +233,26 @@ def _centre(picture: np.ndarray, above: int) -> np.ndarray:
     )
 
 
-def test_inliers_and_outliers_differ_in_colour() -> None:
-    grey, camera = np.full((60, 80, 3), 90, np.uint8), Camera(Intrinsics(80, 60, 80, 80, 40, 30), orbit(0))
-    px = np.float32([[40, 30]])
-    green, red = (draw.side_by_side(grey, grey, MatchVectors(px, px, np.array([ok]), camera)) for ok in (True, False))
-    spot = np.unravel_index(np.abs(green.astype(int) - red).sum(-1).argmax(), green.shape[:2])
-    assert green[spot][1] > green[spot][0] + 50
-    assert red[spot][0] > red[spot][1] + 50
+def match_view(photo_px: np.ndarray, render_px: np.ndarray, camera: Camera) -> measure.MatchView:
+    """Matches that all agree, as they are seen by the camera that they refer to."""
+    found = MatchVectors(photo_px, render_px, np.ones(len(photo_px), bool), camera)
+    depth = np.ones((camera.intrinsics.height, camera.intrinsics.width), np.float32)
+    return measure.seen(measure.lifted(found, depth, 0), camera.pose, camera.intrinsics, 0)
+
+
+def test_colours_tell_inliers_and_residuals() -> None:
+    camera = Camera(Intrinsics(800, 600, 800, 800, 400, 300), orbit(0))
+    px = np.float32([[400, 300]] * 4)
+    view = match_view(px, px + np.float32([[0.1, 0], [5, 0], [300, 0], [9999, 0]]), camera)
+    view = replace(view, inlier=np.array([True, False, True, True]))
+    (green, red, *_), by_residual = draw.match_colours(view, "inlier"), draw.match_colours(view, "residual")
+    assert green.tolist() == list(draw.INLIER)
+    assert red.tolist() == list(draw.OUTLIER)
+    assert by_residual[0].tolist() == list(draw.INLIER)  # below half a pixel
+    assert by_residual[2].tolist() == list(draw.OUTLIER)  # beyond 50
+    assert by_residual[1][0] > 200  # 5 px: in the middle, yellow
+    assert by_residual[1][1] > 200
+    assert draw.match_colours(replace(view, residual_px=np.full(4, np.nan)), "residual")[0].tolist() == [150] * 3
 
 
 def test_overlays_compare_pixel_by_pixel() -> None:
@@ -247,6 +262,11 @@ def test_overlays_compare_pixel_by_pixel() -> None:
     assert draw.overlaid("difference", photo, render)[inside].tolist() == [160, 160, 160]
     assert draw.overlaid("difference", photo, photo)[inside].max() == 0
     assert draw.overlaid("difference", photo * 0, render + 70)[inside].max() == 255  # doubled, not wrapped round
+    tiles = draw.overlaid("checker", photo, render)[40::80, 40::80, 0]  # one pixel of each of 10 x 7 tiles
+    expected = np.where(np.indices(tiles.shape).sum(0) % 2 == 0, 100, 180)
+    np.testing.assert_array_equal(tiles, expected)
+    both = re.findall(r"base64,([^']+)", draw.flicker_html(photo, render))
+    assert [draw.decode(base64.b64decode(data))[5, 5, 0] for data in both] == [100, 180]
 
 
 def test_decoding_and_scaling() -> None:
@@ -268,7 +288,7 @@ def test_better_scores_are_brighter() -> None:
 
 def test_texts_escape_what_others_wrote() -> None:
     answer = Answer("not_localized", "few_features", "Take it <sharper>.", 0.1, 3)
-    job = JobView("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, answer)
+    job = JobView("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
     text = headline_html(job, 4, "")
     assert "not localized" in text
     assert "few features, score 0.10, 3 inliers" in text
@@ -276,6 +296,91 @@ def test_texts_escape_what_others_wrote() -> None:
     for html in (text, headline_html(job, 0, "<i>"), scene_html("<b>", 1, 2, 3)):
         assert not {"<b>", "<s>", "<i>", "<sharper>"} & {html[m:n] for m in range(len(html)) for n in (m + 3, m + 9)}
     assert "–" in record_html(replace(records(1)[0], loss=None))
+
+
+# ---------------------------------------------------------------- what matches say
+
+
+@given(st.floats(0, 1), st.floats(0.5, 9), st.floats(0.2, 0.4))
+def test_lifted_matches_come_back_to_their_pixels(share: float, depth: float, turn: float) -> None:
+    camera = Camera(Intrinsics(200, 100, 150.0, 160.0, 90.0, 55.0), orbit(share))
+    px = np.random.default_rng(0).uniform([1, 1], [199, 99], (50, 2)).astype(np.float32)
+    z = np.full((100, 200), depth, np.float32)
+    z[:, :50] = 0  # nothing opaque there
+    found = measure.lifted(MatchVectors(px, px, np.ones(50, bool), camera), z, 3)
+    known = px[:, 0] >= 50
+    assert np.array_equal(np.isfinite(found.points_in_world).all(1), known)
+    in_camera = transformed(camera.pose.camera_from_world, found.points_in_world[known])
+    np.testing.assert_allclose(in_camera[:, 2], depth, rtol=1e-6)
+    np.testing.assert_allclose(project(in_camera, camera.intrinsics), px[known], atol=1e-3)
+    # Seen from another pose by another step, residuals are what the renderer's own projection says.
+    other = orbit(share + turn)
+    view = measure.seen(found, other, PHOTO, 7)
+    assert view.carried_from == 3
+    there = transformed(other.camera_from_world, found.points_in_world[known])
+    before = there[:, 2] > 0
+    expected = np.linalg.norm(project(there[before], PHOTO) - px[known][before], axis=1)
+    np.testing.assert_allclose(view.residual_px[known][before], expected, rtol=1e-6, atol=1e-6)
+    assert np.isnan(view.residual_px[~known]).all()
+    # The line in 3D ends where the photo has the point, at the point's depth.
+    ends = transformed(other.camera_from_world, view.segments[:, 1].astype(np.float64))
+    np.testing.assert_allclose(project(ends, PHOTO), px[view.drawn], atol=0.05)  # float32: 5e-3 seen
+    np.testing.assert_allclose(ends[:, 2], there[before][:, 2], rtol=1e-4)
+
+
+def test_vectors_of_a_shift_are_parallel_and_of_a_roll_interwoven() -> None:
+    camera = Camera(PHOTO, orbit(0))
+    grid = np.stack(np.meshgrid(np.linspace(8, 88, 9), np.linspace(8, 56, 7)), -1).reshape(-1, 2).astype(np.float32)
+    middle = np.float32([PHOTO.cx, PHOTO.cy])
+    rolled = (grid - middle) @ np.float32([[0.9, -0.3], [0.3, 0.9]]) + middle
+    for photo_px, angle in ((grid + np.float32([7, -3]), 0.0), (rolled, 90.0)):
+        view = match_view(photo_px, grid, camera)
+        found = measure.mean_angle_deg(view.vectors_px)
+        assert found == pytest.approx(angle, abs=4)  # the grid is wider than high: 88 seen
+    view = match_view(grid + np.float32([7, -3]), grid, camera)
+    np.testing.assert_allclose(view.vectors_px, np.tile([7, -3], (63, 1)), atol=1e-4)
+    counts = measure.angle_counts(view.vectors_px, 24)
+    assert counts[round(np.degrees(np.arctan2(-3, 7)) / 15) % 24] == 63
+    assert measure.mean_angle_deg(np.zeros((5, 2))) is None
+
+
+def test_pose_errors_are_those_of_a_known_motion() -> None:
+    turn = np.radians(0.001)
+    motion = np.eye(4)
+    motion[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    motion[:3, 3] = [0.3, 0, 0.4]
+    pose = orbit(0.3)
+    moved = replace(pose, world_from_camera=pose.world_from_camera @ motion)
+    assert measure.pose_error(moved, pose) == pytest.approx((0.001, 0.5), rel=1e-6)
+    half = replace(pose, world_from_camera=pose.world_from_camera @ np.diag([-1.0, 1, -1, 1]))
+    assert measure.pose_error(half, pose)[0] == pytest.approx(180)
+
+
+def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
+    told = [replace(r, loss=None if r.index == 3 else r.loss, num_matches=None) for r in records(6)]
+    drawn = charts.curves_html(told, told[-1].pose, 2)
+    titles = ("loss", "turned by the step", "moved by the step", "matches and inliers", "error of rotation")
+    assert all(title in drawn for title in titles)
+    loss = drawn.split("</svg>")[0]
+    # Stage `retrieve` has one value, `align` those of the steps 1, 2, 4 and 5: a line begins anew after the gap.
+    assert re.findall(r"<path d='(M[^']*)' fill='none'", loss)[1].count("M") == 2
+    assert loss.count("<title>retrieve</title>") == loss.count("<title>align</title>") == 1
+    assert re.findall(r"<title>step (\d): ([^<]*)</title>", loss) == [
+        (str(k), f"{1 / (k + 1):.4g}") for k in (0, 1, 2, 4, 5)
+    ]
+    assert "nan" not in drawn + charts.stages_html(told, 2)
+    assert "nothing to plot" in charts.curves_html([], None, 0)
+    assert "no matches" in charts.vectors_html(None)
+
+
+def test_a_click_takes_the_nearest_frustum_on_its_ray() -> None:
+    poses = shapes.stacked([orbit(0.0), orbit(0.5), orbit(0.25)])
+    eye = np.array([10.0, 0.0, 1.0])
+    hit = shapes.nearest_to_ray(eye, np.array([-2.0, 0, 0]), poses, 0.3)
+    assert hit == 0  # the one at the other side is on the ray, too, but farther
+    assert shapes.nearest_to_ray(eye, np.array([1.0, 0, 0]), poses, 0.3) is None  # behind
+    assert shapes.nearest_to_ray(eye, np.array([0.0, 1, 0]), poses, 0.3) is None
+    assert shapes.nearest_to_ray(eye, np.array([-2.0, 0, 0]), poses[:0], 0.3) is None
 
 
 # ---------------------------------------------------------------- following jobs

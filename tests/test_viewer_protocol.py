@@ -7,8 +7,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,8 +18,8 @@ import httpx
 import numpy as np
 import pytest
 import viser
-from fake_browser import FakeBrowser
-from fake_service import FakeService, records, render_rgb, threads, until
+from fake_browser import CAMERA, FakeBrowser
+from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
 from service.types import Reason, Status
 from viewer import app, draw, shapes
@@ -52,7 +54,7 @@ def test_a_finished_job_is_shown_by_its_address(fake: FakeService, viewer: Viewe
         names = (
             {"/splats/splats", "/training cameras/cameras"}
             | {f"/trajectory/{n}" for n in ("path", "steps", "initial", "current", "final")}
-            | {"/candidates/candidates"}
+            | {"/candidates/candidates", "/candidates/cloud", "/match vectors/vectors", "/match vectors/points"}
         )
         browser.wait(lambda: names <= set(browser.nodes), "the nodes")
         assert browser.nodes["/trajectory/final"]["props"]["color"] == [60, 180, 90]
@@ -64,7 +66,7 @@ def test_a_finished_job_is_shown_by_its_address(fake: FakeService, viewer: Viewe
 
 def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: FakeService, viewer: Viewer) -> None:
     with _browser(viewer) as browser:
-        browser.wait(lambda: "/splats/splats" in browser.nodes and "first job" in browser.text(), "the empty scene")
+        browser.wait(lambda: "/splats/splats" in browser.nodes and "no job" in browser.text(), "the empty scene")
         job = fake.job("first", 1)
         browser.wait(lambda: "/trajectory/current" in browser.nodes, "the new job")
         assert "running" in browser.text()
@@ -102,11 +104,15 @@ def test_steps_change_picture_pose_and_numbers(fake: FakeService, viewer: Viewer
             assert browser.widget("step")["value"] == index
             position = browser.nodes["/trajectory/current"]["position"]
             np.testing.assert_allclose(position, records(5)[index].pose.position_in_world, atol=1e-6)
-        browser.set("match vectors", False)
+        browser.set("match lines", False)
         browser.wait(lambda: shows(render_rgb(0, matched=False)), "the render at the pose")
         browser.set("compare", "difference")
         browser.wait(lambda: "doubled" in browser.text(), "the difference")
-        assert browser.widget("match vectors")["visible"] is False
+        browser.set("compare", "checker")
+        browser.wait(lambda: "tile to tile" in browser.text(), "the checkerboard")
+        browser.set("compare", "flicker")
+        browser.wait(lambda: browser.text().count("data:image/jpeg") == 2, "both pictures in turn")
+        assert browser.widget("match lines")["visible"] is False
         browser.set("compare", "blend")
         browser.wait(lambda: browser.widget("render's share")["visible"], "the blend")
         browser.set("render's share", 1.0)
@@ -195,6 +201,108 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
         browser.wait(lambda: np.allclose(client.camera.look_at, goal.look_at, atol=1e-4), "looking there")
 
 
+def _click(browser: FakeBrowser, origin: np.ndarray, direction: np.ndarray) -> None:
+    browser.send(
+        type="ScenePointerMessage",
+        event_type="click",
+        ray_origin=list(map(float, origin)),
+        ray_direction=list(map(float, direction)),
+        screen_pos=[[0.5, 0.5]],
+        modifier=None,
+    )
+
+
+def test_a_click_on_a_frustum_jumps_there(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 5, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: browser.widget("step")["value"] == 4 and "agree" in browser.text(), "the last step")
+        pose = records(5)[0].pose
+        _click(browser, pose.position_in_world - 2 * pose.axis_in_world, pose.axis_in_world)
+        browser.wait(lambda: browser.widget("step")["value"] == 0, "the clicked step")
+        (client,) = viewer.server.get_clients().values()
+        browser.set("trajectory", False)
+        camera = fake.scene.cameras[6].camera.pose
+        _click(browser, camera.position_in_world - camera.axis_in_world, camera.axis_in_world)
+        there = camera.position_in_world
+        browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "the clicked training camera")
+
+
+def test_matches_can_be_coloured_by_residual_and_are_carried_on(fake: FakeService, viewer: Viewer) -> None:
+    job = fake.job("j", 2)
+    job.add(replace(records(3)[2], matches=None))
+    job.finish()
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: "with the matches of step 1" in browser.text(), "matches at a step that has none")
+        browser.set("colour matches by", "residual")
+        browser.wait(lambda: "off by" in browser.text() and "median" in browser.text(), "residuals")
+        browser.wait(lambda: "between two, on average" in browser.text(), "the angles")
+        assert "lengths:" in browser.text()
+
+
+def test_errors_are_shown_where_the_truth_is_known(fake: FakeService, viewer: Viewer) -> None:
+    job = fake.job("j", 3)
+    job.truth = records(3)[2].pose
+    job.finish()
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: "error of position" in browser.text(), "the curve")
+        browser.wait(lambda: "/trajectory/truth" in browser.nodes, "the true camera")
+        browser.wait(lambda: "turned off" in browser.text(), "the numbers")
+
+
+def test_the_view_at_rest_is_rendered_by_the_service(fake: FakeService, viewer: Viewer) -> None:
+    with _browser(viewer) as browser:
+        browser.wait(lambda: _background(browser) == "exact", "the exact picture")
+        (client,) = viewer.server.get_clients().values()
+        splats = client.scene._handle_from_node_name["/splats/splats"]
+        assert not splats.visible
+        asked = fake.renders[-1]
+        width, focal = asked["intrinsics"]["width"], asked["intrinsics"]["fy"]
+        assert (width, asked["intrinsics"]["height"]) == (800, 600)
+        assert focal == pytest.approx(300 / np.tan(0.5 * client.camera.fov))
+        there = np.array(asked["pose"]["world_from_camera"])[:3, 3]
+        np.testing.assert_allclose(there, client.camera.position, atol=1e-9)
+        browser.send(**{**CAMERA, "position": [5.0, 0.0, 0.0]})
+        browser.wait(lambda: splats.visible, "the splats while it moves")
+        browser.wait(lambda: not splats.visible and np.allclose(_rendered_from(fake), [5, 0, 0]), "the next picture")
+        browser.set("exact render at rest", False)
+        browser.wait(lambda: splats.visible and _background(browser) == "ground", "the splats")
+
+
+def _rendered_from(fake: FakeService) -> np.ndarray:
+    return np.array(fake.renders[-1]["pose"]["world_from_camera"])[:3, 3]
+
+
+def _background(browser: FakeBrowser) -> str:
+    """What lies behind the scene."""
+    data = browser.background["rgb_data"]
+    picture = draw.decode(bytes(data)) if data else np.zeros((1, 1, 3))
+    return "exact" if np.abs(picture.mean((0, 1)) - EXACT_RGB).max() < 4 else "ground"
+
+
+def test_a_scene_can_be_looked_at_without_a_job(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 3, finished=True)
+    fake.scenes = ["ball", "copy"]
+    with _browser(viewer) as browser:
+        browser.wait(lambda: "/trajectory/final" in browser.nodes, "the newest job")
+        browser.wait(lambda: browser.widget("scene")["options"] == ["ball", "copy"], "the scenes")
+        browser.set("scene", "copy")
+        browser.wait(lambda: "no job" in browser.text() and "/trajectory/final" not in browser.nodes, "the bare scene")
+        assert browser.widget("step")["disabled"]
+        assert browser.widget("follow newest")["value"] is False
+
+
+def test_play_goes_as_fast_as_it_is_told(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 8, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: browser.widget("step")["value"] == 7 and "agree" in browser.text(), "the job")
+        browser.set("steps per second", "20")
+        began = time.monotonic()
+        browser.set("", "play / pause")
+        browser.wait(lambda: browser.widget("step")["value"] < 7, "the start")
+        browser.wait(lambda: browser.widget("step")["value"] == 7, "the end")
+        assert 0.2 < time.monotonic() - began < 3  # 7 steps in 0.35 s, drawing aside; at 2 a second it would be 3.5 s
+
+
 def test_an_unknown_job_is_told(viewer: Viewer) -> None:
     with _browser(viewer, "/jobs/unknown") as browser:
         browser.wait(lambda: "no job unknown" in browser.text(), "the message")
@@ -212,7 +320,7 @@ def test_no_browser_can_open_a_public_tunnel(
     try:
         with _browser(viewer) as browser:
             browser.send(type="ShareUrlRequest")
-            browser.wait(lambda: "first job" in browser.text(), "what is sent after")
+            browser.wait(lambda: "no job" in browser.text(), "what is sent after")
             assert asked.wait(0.3) is not forbidden
     finally:
         viewer.stop()

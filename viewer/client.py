@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import threading
 from collections.abc import Iterator
@@ -24,6 +25,7 @@ from service.types import (
 )
 
 FINISHED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
+_JOBS_LISTED = 50
 
 
 class ServiceTrouble(Exception):
@@ -90,6 +92,8 @@ class JobView:
     photo_name: str
     photo: Intrinsics
     """Of the image that `Service.photo` returns."""
+    truth: Pose | None
+    """As whoever sent the photo knows it."""
     answer: Answer | None
     """None until it has ended."""
 
@@ -104,10 +108,9 @@ class Service:
     def close(self) -> None:
         self._http.close()
 
-    def first_scene(self) -> str | None:
-        """Return the id of the first scene that is in memory."""
-        scenes = self._json("/scenes")["scenes"]
-        return next((s["id"] for s in scenes if s["gaussians"] is not None), None)
+    def scenes(self) -> list[str]:
+        """Return the ids of the scenes that are in memory."""
+        return [s["id"] for s in self._json("/scenes")["scenes"] if s["gaussians"] is not None]
 
     def scene(self, scene_id: str) -> SceneView:
         raw = self._json(f"/scenes/{scene_id}")
@@ -124,10 +127,9 @@ class Service:
         return parsed_splats(self._bytes(f"/scenes/{scene_id}/splats", {"max": limit}))
 
     def jobs(self) -> list[JobSummary]:
-        """Return the jobs, newest first."""
-        return [
-            JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in self._json("/jobs")["jobs"]
-        ]
+        """Return the newest jobs, the newest first."""
+        jobs = json.loads(self._bytes("/jobs", {"limit": _JOBS_LISTED}))["jobs"]
+        return [JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in jobs]
 
     def job(self, job_id: str) -> JobView:
         return _job(self._json(f"/jobs/{job_id}"))
@@ -139,6 +141,27 @@ class Service:
         """Return a JPEG of the scene at a record's pose, or at the camera that its matches refer to."""
         query = {"camera": "matches"} if matched else {}
         return self._bytes(f"/jobs/{job_id}/iterations/{index}/render.jpg", query)
+
+    def picture(self, scene_id: str, camera: Camera) -> bytes:
+        """Return a JPEG of the scene as a camera sees it, rendered by the service."""
+        return self._rendered(scene_id, camera, "jpeg")
+
+    def depth(self, scene_id: str, camera: Camera) -> Float32[np.ndarray, "h w"]:
+        """Return the z-depth of what a camera sees; 0 where that is nothing opaque."""
+        return np.load(io.BytesIO(self._rendered(scene_id, camera, "depth")), allow_pickle=False)
+
+    def _rendered(self, scene_id: str, camera: Camera, kind: str) -> bytes:
+        k = camera.intrinsics
+        size = {name: getattr(k, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        pose = {"world_from_camera": camera.pose.world_from_camera.tolist()}
+        path = f"/scenes/{scene_id}/render"
+        try:
+            answer = self._http.post(path, json={"pose": pose, "intrinsics": size, "format": kind})
+            return answer.raise_for_status().content
+        except httpx.HTTPStatusError as error:
+            raise ServiceTrouble(path, error, error.response.status_code) from error
+        except httpx.HTTPError as error:
+            raise ServiceTrouble(path, error) from error
 
     def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | JobView]:
         """Yield a job's records from the first one on, at last the finished job; less if `stop` is set."""
@@ -231,6 +254,7 @@ def _job(raw: dict[str, Any]) -> JobView:
         raw["estimator"],
         raw["photo"]["name"],
         _intrinsics(raw["photo"]["intrinsics"]),
+        raw["truth"] and Pose(np.array(raw["truth"]["world_from_camera"]["matrix"], np.float64)),
         _answer(raw),
     )
 

@@ -5,21 +5,28 @@ Images are uint8 RGB. Pixel coordinates have the centre of the top-left pixel at
 
 from __future__ import annotations
 
+import base64
 from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from service.types import MatchVectors
+from viewer.measure import MatchView
 
-Mode = Literal["side by side", "blend", "difference"]
+Mode = Literal["beside", "blend", "checker", "difference", "flicker"]
 MODES: tuple[Mode, ...] = get_args(Mode)
+ColourBy = Literal["inlier", "residual"]
 
-INLIER, OUTLIER = (70, 225, 120), (240, 70, 70)
+INLIER, OUTLIER, UNKNOWN = (70, 225, 120), (240, 70, 70), (150, 150, 150)
+_RESIDUAL_PX = 0.5, 50.0
+"""Ends of the colours of residuals, logarithmic between them."""
+_RESIDUAL_RAMP = np.array([INLIER, (225, 225, 80), OUTLIER], np.float64)
 # Dull blue to bright yellow, lightness rising all the way: readable on a dark ground and without hue.
 _RAMP = np.array([(72, 84, 150), (44, 130, 165), (60, 175, 150), (150, 205, 90), (255, 225, 60)], np.float64)
 _GAP_PX = 8
+_TILES = 10
+"""Of a checkerboard, in a row."""
 _WIDTH_PX, _HEIGHT_PX = 800, 1160
 """Of every picture, at most: twice what the docked window shows, for fine displays and for enlarging."""
 _GROUND = (36, 36, 36)
@@ -43,7 +50,7 @@ def reduced(image: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarr
 
 
 def overlaid(
-    mode: Literal["blend", "difference"],
+    mode: Literal["blend", "checker", "difference"],
     photo: UInt8[np.ndarray, "h w 3"],
     render: UInt8[np.ndarray, "a b 3"],
     weight: float = 0.5,
@@ -53,14 +60,53 @@ def overlaid(
     render = _resized(render, photo.shape[1], photo.shape[0])
     if mode == "blend":
         both = cv2.addWeighted(photo, 1 - weight, render, weight, 0)
+    elif mode == "checker":
+        rows, columns = np.indices(photo.shape[:2]) // max(1, photo.shape[1] // _TILES)
+        both = np.where(((rows + columns) % 2 == 0)[..., None], photo, render)
     else:
         # Doubled: at the answer most differences are below a tenth of the range and would look black.
         both = np.minimum(cv2.absdiff(photo, render).astype(np.uint16) * 2, 255).astype(np.uint8)
     return _pasted((both, ((_WIDTH_PX - both.shape[1]) // 2, 0)))
 
 
-def side_by_side(
-    photo: UInt8[np.ndarray, "h w 3"], render: UInt8[np.ndarray, "a b 3"], matches: MatchVectors | None = None
+def flicker_html(photo: UInt8[np.ndarray, "h w 3"], render: UInt8[np.ndarray, "a b 3"]) -> str:
+    """Return HTML that shows photo and render in turn, once a second each; the browser does it alone."""
+    photo = _fitted(photo, _WIDTH_PX, _HEIGHT_PX)
+    render = _resized(render, photo.shape[1], photo.shape[0])
+    below, above = (
+        f"<img alt='{name}' src='{_data_url(image)}' style='width:100%;display:block;{style}'>"
+        for name, image, style in (
+            ("photo", photo, ""),
+            ("render", render, "position:absolute;inset:0;animation:splatfix-flicker 1.4s steps(1) infinite"),
+        )
+    )
+    return (
+        "<style>@keyframes splatfix-flicker{0%{opacity:0}50%{opacity:1}100%{opacity:1}}</style>"
+        f"<div class='splatfix-flicker' style='position:relative;margin:0 .6em .5em'>{below}{above}</div>"
+    )
+
+
+def _data_url(image: UInt8[np.ndarray, "h w 3"]) -> str:
+    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 88])[1]
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()
+
+
+def match_colours(view: MatchView, by: ColourBy) -> UInt8[np.ndarray, "m 3"]:
+    """Return a colour for each match: whether it agrees with the pose, or how far it is off."""
+    if by == "inlier":
+        return np.array([OUTLIER, INLIER], np.uint8)[view.inlier.astype(int)]
+    low, high = np.log(_RESIDUAL_PX)
+    share = (np.log(np.nan_to_num(view.residual_px, nan=1.0).clip(1e-6)) - low) / (high - low)
+    colours = _interpolated(_RESIDUAL_RAMP, np.clip(share, 0, 1))
+    colours[np.isnan(view.residual_px)] = UNKNOWN
+    return colours
+
+
+def beside(
+    photo: UInt8[np.ndarray, "h w 3"],
+    render: UInt8[np.ndarray, "a b 3"],
+    view: MatchView | None = None,
+    colours: UInt8[np.ndarray, "m 3"] | None = None,
 ) -> UInt8[np.ndarray, "c d 3"]:
     """Return photo and render with a line per match: outliers below, inliers above.
 
@@ -76,22 +122,24 @@ def side_by_side(
         a, b = _fitted(photo, *box), _fitted(render, *box)
         corners = ((_WIDTH_PX - a.shape[1]) // 2, 0), ((_WIDTH_PX - b.shape[1]) // 2, a.shape[0] + _GAP_PX)
     pair = _pasted((a, corners[0]), (b, corners[1]))
-    if matches is None:
+    if view is None or colours is None:
         return pair
-    k = matches.render_camera.intrinsics
-    starts = matches.photo_px * [a.shape[1] / photo.shape[1], a.shape[0] / photo.shape[0]] + corners[0]
-    ends = matches.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
-    colours = [INLIER if inlier else OUTLIER for inlier in matches.inlier]
-    order = np.argsort(matches.inlier, kind="stable")
+    k = view.render_camera.intrinsics
+    # Not what lies outside, or behind the camera: NaN.
+    within = np.all((view.render_px >= 0) & (view.render_px < [k.width, k.height]), axis=1)
+    starts = view.photo_px * [a.shape[1] / photo.shape[1], a.shape[0] / photo.shape[0]] + corners[0]
+    ends = view.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
+    order = [i for i in np.argsort(view.inlier, kind="stable") if within[i]]
+    inks = [tuple(map(int, colour)) for colour in colours]
     lines = pair.copy()
     for i in order:
-        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), colours[i], 2, cv2.LINE_AA, _SHIFT)
+        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), inks[i], 2, cv2.LINE_AA, _SHIFT)
     # Lines translucent, the more the denser: three hundred must not hide what they connect. The ends are plain.
     opacity = 0.3 + 0.4 / (1 + len(order) / 50)
     picture = cv2.addWeighted(pair, 1 - opacity, lines, opacity, 0)
     for i in order:
         for end in (starts[i], ends[i]):
-            cv2.circle(picture, _fixed(end), 3 << _SHIFT, colours[i], -1, cv2.LINE_AA, _SHIFT)
+            cv2.circle(picture, _fixed(end), 3 << _SHIFT, inks[i], -1, cv2.LINE_AA, _SHIFT)
     return picture
 
 
@@ -104,8 +152,12 @@ def score_colours(scores: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:
 
 def ramp(share: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:
     """Return colours for values 0..1."""
-    stops = np.linspace(0, 1, len(_RAMP))
-    return np.stack([np.interp(share, stops, channel) for channel in _RAMP.T], -1).round().astype(np.uint8)
+    return _interpolated(_RAMP, share)
+
+
+def _interpolated(ramp: Float[np.ndarray, "s 3"], share: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:
+    stops = np.linspace(0, 1, len(ramp))
+    return np.stack([np.interp(share, stops, channel) for channel in ramp.T], -1).round().astype(np.uint8)
 
 
 _SHIFT = 4

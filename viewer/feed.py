@@ -19,6 +19,7 @@ from jaxtyping import UInt8
 from service.types import IterationRecord
 from viewer.client import JobSummary, JobView, SceneView, Service, ServiceTrouble, Splats
 from viewer.draw import decode
+from viewer.measure import Lifted, lifted
 from viewer.shapes import Extent, extent
 
 log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ class JobFeed:
         self._stop = threading.Event()
         self._photo: UInt8[np.ndarray, "h w 3"] | None = None
         self._renders: OrderedDict[tuple[int, bool], UInt8[np.ndarray, "h w 3"]] = OrderedDict()
+        self._lifted: OrderedDict[int, Lifted] = OrderedDict()
         self._lock = threading.Lock()
 
     def start(self) -> None:
@@ -77,6 +79,25 @@ class JobFeed:
             if len(self._renders) > _RENDERS_KEPT:
                 self._renders.popitem(last=False)
         return image
+
+    def matches(self, index: int) -> Lifted | None:
+        """Return the latest matches that a step knows: its own, or an earlier one's.
+
+        Raises ServiceTrouble, ValueError.
+        """
+        record = next((r for r in reversed(self.records[: index + 1]) if r.matches is not None), None)
+        if record is None or record.matches is None or self.job is None:
+            return None
+        with self._lock:
+            if record.index in self._lifted:
+                return self._lifted[record.index]
+        depth = self._service.depth(self.job.scene, record.matches.render_camera)
+        found = lifted(record.matches, depth, record.index)
+        with self._lock:
+            self._lifted[record.index] = found
+            if len(self._lifted) > _RENDERS_KEPT:
+                self._lifted.popitem(last=False)
+        return found
 
     def _follow(self) -> None:
         while not self._stop.is_set() and not self.complete:
@@ -122,6 +143,8 @@ class Library:
         self.service = service
         self.jobs: tuple[JobSummary, ...] | None = None
         """Newest first, up to date while somebody listens; None: not known yet."""
+        self.scenes: tuple[str, ...] = ()
+        """Ids of those that can be shown."""
         self._feeds: dict[str, JobFeed] = {}
         self._scenes: OrderedDict[str, SceneContent] = OrderedDict()
         self._listeners: set[Listener] = set()
@@ -140,7 +163,7 @@ class Library:
                 feed.stop()
 
     def listen(self, listener: Listener) -> None:
-        """Call `listener` whenever the list of jobs has changed, until `ignore`."""
+        """Call `listener` whenever the list of jobs or of scenes has changed, until `ignore`."""
         with self._lock:
             self._listeners.add(listener)
         self._awake.set()
@@ -185,18 +208,19 @@ class Library:
         return content
 
     def _watch(self) -> None:
-        """Poll the list of jobs while somebody listens."""
+        """Poll the lists of jobs and scenes while somebody listens."""
         trouble = ""
         while self._awake.wait() and not self._closed.is_set():
             try:
-                jobs, trouble = tuple(self.service.jobs()), ""
+                known = tuple(self.service.jobs()), tuple(self.service.scenes())
+                trouble = ""
             except (ServiceTrouble, ValueError, KeyError) as error:
                 if str(error) != trouble:  # once, not at every poll
                     trouble = str(error)
                     log.warning("list of jobs: %s", error)
-                jobs = self.jobs
-            if jobs != self.jobs:
-                self.jobs = jobs
+                known = self.jobs, self.scenes
+            if known != (self.jobs, self.scenes):
+                self.jobs, self.scenes = known
                 with self._lock:
                     listeners = tuple(self._listeners)
                 for listener in listeners:

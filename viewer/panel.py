@@ -1,4 +1,4 @@
-"""The widgets of one browser: a control panel, and a window with photo and render."""
+"""The widgets of one browser: a control panel, and a window with pictures, match vectors and curves."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from typing import get_args
 import numpy as np
 import viser
 
-from viewer.draw import MODES
+from viewer.draw import MODES, ColourBy
 from viewer.stage import Layer
 
 NO_JOB: str = "no job yet"
+NO_SCENE: str = "no scene yet"
 _PANEL_WIDTH_PX = 340
 _WINDOW_WIDTH_PX = 420
+_SPEEDS = ("1", "2", "5", "10", "20")
 
 
 class Panel:
@@ -24,25 +26,39 @@ class Panel:
         gui.main_panel.set_width(_PANEL_WIDTH_PX)
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
         self.newest = gui.add_checkbox("follow newest", True, hint="Change to every new job as soon as it appears.")
+        self.scenes = gui.add_dropdown("scene", (NO_SCENE,), initial_value=NO_SCENE)
         self.headline = gui.add_html("")
         self.step = gui.add_slider("step", 0, 0, 1, 0, disabled=True)
+        self.strip = gui.add_html("")
         self.play = gui.add_button_group("", ("◀ previous", "play / pause", "next ▶"))
+        self.speed = gui.add_dropdown("steps per second", _SPEEDS, initial_value="2")
         self.numbers = gui.add_html("")
         self.look_through = gui.add_button("look through this camera", disabled=True)
         self.fly = gui.add_button("fly to result", disabled=True)
         with gui.add_folder("show"):
             self.layers = {layer: gui.add_checkbox(layer, True) for layer in get_args(Layer)}
+            self.exact = gui.add_checkbox(
+                "exact render at rest",
+                True,
+                hint="When the view rests, the service's renderer draws it: what the estimator sees.",
+            )
             self.scene = gui.add_html("")
-        self._add_picture(gui)
+        self._add_window(gui)
 
-    def _add_picture(self, gui: viser.GuiApi) -> None:
+    def _add_window(self, gui: viser.GuiApi) -> None:
         self.window = gui.add_panel(visible=False)
         with self.window.add_tab("photo and render"):
             self.mode = gui.add_button_group("compare", MODES)
             self.picture = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88)
+            self.flicker = gui.add_html("", visible=False)
             self.caption = gui.add_html("")
-            self.matches = gui.add_checkbox("match vectors", True)
+            self.matches = gui.add_checkbox("match lines", True)
             self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
+            self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
+        with self.window.add_tab("match vectors"):
+            self.vectors = gui.add_html("")
+        with self.window.add_tab("curves"):
+            self.curves = gui.add_html("")
         self.window.dock_left()
         self.window.set_width(_WINDOW_WIDTH_PX)
         # The page is viser's file, with its title; this is the one way to another title from here.

@@ -6,9 +6,12 @@ from dataclasses import dataclass
 from datetime import datetime
 from html import escape
 
-from service.types import IterationRecord, MatchVectors
+import numpy as np
+
+from service.types import IterationRecord, Pose
 from viewer.client import Answer, JobSummary, JobView
-from viewer.draw import INLIER, OUTLIER, Mode
+from viewer.draw import INLIER, OUTLIER, ColourBy, Mode
+from viewer.measure import MatchView, pose_error
 
 STATUS_COLOURS = {
     "localized": (60, 180, 90),
@@ -16,6 +19,7 @@ STATUS_COLOURS = {
     "not_localized": (215, 65, 65),
     "failed": (215, 65, 65),
     "cancelled": (140, 140, 140),
+    "interrupted": (140, 140, 140),
 }
 PENDING_COLOUR = (40, 120, 200)
 
@@ -72,7 +76,7 @@ def headline_html(job: JobView | None, records: int, trouble: str) -> str:
     if trouble:
         return _block(_badge("no connection", (215, 65, 65)), trouble)
     if job is None:
-        return _block(_badge("waiting", PENDING_COLOUR), "for a first job: POST a photo to /localize.")
+        return _block(_badge("no job", PENDING_COLOUR), "Drop a photo on the start page, or choose a job above.")
     title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
     if job.answer is None:
         word = "queued" if not records else "running"
@@ -86,8 +90,9 @@ def headline_html(job: JobView | None, records: int, trouble: str) -> str:
     )
 
 
-def record_html(record: IterationRecord) -> str:
+def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
     """The numbers of one record as a small table."""
+    off = pose_error(record.pose, truth) if truth else (None, None)
     rows = [
         ("stage", escape(record.stage)),
         ("after", f"{record.elapsed_s * 1000:.0f} ms"),
@@ -98,6 +103,8 @@ def record_html(record: IterationRecord) -> str:
         ("turned", _or_dash(record.step_deg, ".3g", "°")),
         ("moved", _or_dash(record.step_units, ".3g", " units")),
     ]
+    if truth:
+        rows += [("turned off", _or_dash(off[0], ".3g", "°")), ("away", _or_dash(off[1], ".3g", " units"))]
     cells = "".join(
         f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
@@ -105,19 +112,33 @@ def record_html(record: IterationRecord) -> str:
     return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>")
 
 
-def caption_html(mode: Mode, matches: MatchVectors | None) -> str:
+_CAPTIONS: dict[Mode, str] = {
+    "beside": "photo, and render at this step's pose",
+    "blend": "photo and render at this step's pose, blended",
+    "checker": "photo and render at this step's pose, in turns: edges should run on from tile to tile",
+    "difference": "difference of photo and render at this step's pose, doubled",
+    "flicker": "photo and render at this step's pose, one after the other: what jumps is off",
+}
+
+
+def caption_html(mode: Mode, view: MatchView | None, colour_by: ColourBy = "inlier") -> str:
     """What the picture shows."""
-    if mode == "blend":
-        return _small("photo and render at this step's pose, blended")
-    if mode == "difference":
-        return _small("difference of photo and render at this step's pose, doubled")
-    if matches is None:
-        return _small("photo, and render at this step's pose")
-    inliers = int(matches.inlier.sum())
-    return _small(
-        f"photo, and the render that was matched; lines: {_coloured(f'{inliers} agree', INLIER)}, "
-        f"{_coloured(f'{len(matches.inlier) - inliers} do not', OUTLIER)}"
-    )
+    if view is None:
+        return _small(_CAPTIONS[mode])
+    if view.carried_from is None:
+        what = "photo, and the render that was matched"
+    else:
+        what = f"photo, and render at this step's pose with the matches of step {view.carried_from}"
+    if colour_by == "residual":
+        known = view.residual_px[np.isfinite(view.residual_px)]
+        middle = f"; median {np.median(known):.2g} px" if len(known) else ""
+        colours = f"off by {_coloured('½ px', INLIER)} to {_coloured('50 px', OUTLIER)}{middle}"
+    else:
+        inliers = int(view.inlier.sum())
+        colours = (
+            f"{_coloured(f'{inliers} agree', INLIER)}, {_coloured(f'{len(view.inlier) - inliers} do not', OUTLIER)}"
+        )
+    return _small(f"{what}; lines: {colours}")
 
 
 def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:

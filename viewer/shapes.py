@@ -150,9 +150,21 @@ def frustum_colours(colours: UInt8[np.ndarray, "k 3"]) -> UInt8[np.ndarray, "e 2
     return np.repeat(colours, 2 * len(_EDGES), 0).reshape(-1, 2, 3)
 
 
-def path(points: Float64[np.ndarray, "k 3"]) -> Float32[np.ndarray, "s 2 3"]:
-    """Return the polyline through the points as line segments."""
-    return np.stack([points[:-1], points[1:]], 1).astype(np.float32)
+def nearest_to_ray(
+    origin: Float64[np.ndarray, "3"],
+    direction: Float64[np.ndarray, "3"],
+    poses: Float64[np.ndarray, "k 4 4"],
+    depth: float,
+) -> int | None:
+    """Return the frustum that a click's ray hits, the nearest one first; None: it passes all of them."""
+    if not len(poses):
+        return None
+    direction = direction / np.linalg.norm(direction)
+    middles = poses[:, :3, 3] + 0.6 * depth * poses[:, :3, 2]
+    along = (middles - origin) @ direction
+    beside = np.linalg.norm(middles - origin - along[:, None] * direction, axis=1)
+    hit = np.flatnonzero((beside < 0.6 * depth) & (along > 0))
+    return int(hit[np.argmin(along[hit])]) if len(hit) else None
 
 
 def stacked(poses: Sequence[Pose]) -> Float64[np.ndarray, "k 4 4"]:

@@ -7,25 +7,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import viser
 import viser.transforms as vt
-from jaxtyping import UInt8
+from jaxtyping import Float64, UInt8
 
 from service.types import Camera, Candidates, Intrinsics, IterationRecord, Pose
 from viewer import shapes
 from viewer.client import JobView
 from viewer.draw import score_colours
 from viewer.feed import SceneContent
+from viewer.measure import MatchView
 from viewer.playback import answer_colour
 
-Layer = Literal["splats", "training cameras", "trajectory", "candidates"]
+Layer = Literal["splats", "training cameras", "trajectory", "candidates", "match vectors"]
 
-_INITIAL, _CURRENT = (150, 150, 150), (255, 140, 0)
+_INITIAL, _CURRENT, _TRUTH = (150, 150, 150), (255, 140, 0), (240, 240, 240)
 _TRAINING = (70, 105, 160)
 _WIDTH_PX = 2.0
+_FRUSTA = 24
+"""Candidates that are drawn as frusta, the best; all are points."""
 _FLIGHT_S, _FRAME_S = 0.8, 1 / 30
 
 
@@ -35,14 +38,17 @@ class Stage:
     def __init__(self, client: viser.ClientHandle) -> None:
         self._client = client
         self._scene: SceneContent | None = None
-        self._visible: dict[Layer, bool] = dict.fromkeys(
-            ("splats", "training cameras", "trajectory", "candidates"), True
-        )
+        self._visible: dict[Layer, bool] = dict.fromkeys(get_args(Layer), True)
+        self._splats_wanted = True
+        self._ground = np.zeros((1, 1, 3), np.uint8)
+        self._steps: tuple[list[int], Float64[np.ndarray, "k 4 4"]] = [], np.zeros((0, 4, 4))
+        """Records at which the pose changed, and their poses."""
         self._nodes: dict[Layer, dict[str, viser.SceneNodeHandle]] = {layer: {} for layer in self._visible}
 
     def show_scene(self, content: SceneContent, pose: Pose | None) -> None:
         """Draw a scene; stand behind a camera in it, or at its first view."""
         self._scene = content
+        self._ground = (255 * np.array([[content.view.background_rgb]])).astype(np.uint8)
         scene, client = content.extent, self._client
         cameras = [named.camera for named in content.view.cameras]
         with client.atomic():
@@ -53,9 +59,8 @@ class Stage:
                 self.look(shapes.first_view(scene, cameras))
             else:
                 self.look_over(pose)
+        self.show_exact(None)
         client.flush()
-        background = np.array([[content.view.background_rgb]])
-        client.scene.set_background_image((255 * background).astype(np.uint8), format="png")
         poses = shapes.stacked([c.pose for c in cameras])
         segments = shapes.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
         self._lines("training cameras", "cameras", segments, _TRAINING, 1.0)
@@ -68,14 +73,18 @@ class Stage:
         depth = self._scene.extent.frustum
         poses = shapes.stacked([r.pose for r in records])
         moved = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max((1, 2), initial=0.0) > 0) + 1
-        steps = poses[np.concatenate([[0], moved])]
+        kept = [0, *moved.tolist()]
+        steps = poses[kept]
+        self._steps = [records[i].index for i in kept], steps
         colour = answer_colour(job.answer)
-        self._lines("trajectory", "path", shapes.path(steps[:, :3, 3]), colour, 2.0)
+        self._spline(steps[:, :3, 3], colour)
         ghosts = shapes.frusta(steps[1:-1], [job.photo] * len(steps[1:-1]), 0.5 * depth)
         self._lines("trajectory", "steps", ghosts, _INITIAL, 1.0)
         self._frustum("initial", records[0].pose, job.photo, _INITIAL, 0.8 * depth)
         if job.answer is not None:
             self._frustum("final", records[-1].pose, job.photo, colour, 1.1 * depth)
+        if job.truth is not None:
+            self._frustum("truth", job.truth, job.photo, _TRUTH, 1.15 * depth)
 
     def show_current(self, pose: Pose, photo: Intrinsics, texture: UInt8[np.ndarray, "h w 3"] | None) -> None:
         """Draw the camera of the record that is looked at, with the photo in it."""
@@ -93,22 +102,58 @@ class Stage:
         poses = candidates.world_from_camera if candidates else np.zeros((0, 4, 4))
         if self._scene is None:
             return
-        segments = shapes.frusta(poses, [photo] * len(poses), 0.7 * self._scene.extent.frustum)
         scores = candidates.scores if candidates else np.zeros(0)
-        # viser takes one colour as sRGB, but colours by vertex as linear light.
-        linear = (255 * (score_colours(scores) / 255) ** 2.2).astype(np.uint8)
-        colours = shapes.frustum_colours(linear)
-        self._lines("candidates", "candidates", segments, colours, 1.5)
+        colours = score_colours(scores)
+        depth = self._scene.extent.frustum
+        best = np.argsort(-scores, kind="stable")[:_FRUSTA]
+        segments = shapes.frusta(poses[best], [photo] * len(best), 0.7 * depth)
+        self._lines("candidates", "candidates", segments, shapes.frustum_colours(_linear(colours[best])), 1.5)
+        # All of them as one cloud: hundreds of frusta would be a thicket.
+        self._points("candidates", "cloud", poses[:, :3, 3], colours, 0.07 * depth)
+
+    def show_matches(self, view: MatchView | None, colours: UInt8[np.ndarray, "m 3"] | None) -> None:
+        """Draw the matched points of the scene, each with a line to the ray of its photo's point."""
+        if self._scene is None:
+            return
+        segments, drawn = np.zeros((0, 2, 3), np.float32), np.zeros((0, 3), np.uint8)
+        if view is not None and colours is not None:
+            segments, drawn = view.segments, colours[view.drawn]
+        self._lines("match vectors", "vectors", segments, np.repeat(_linear(drawn)[:, None], 2, 1), 2.0)
+        self._points("match vectors", "points", segments[:, 0], drawn, 0.05 * self._scene.extent.frustum)
 
     def clear_job(self) -> None:
-        for layer in ("trajectory", "candidates"):
+        self._steps = [], np.zeros((0, 4, 4))
+        for layer in ("trajectory", "candidates", "match vectors"):
             for name in tuple(self._nodes[layer]):
                 self._nodes[layer].pop(name).remove()
 
     def set_visible(self, layer: Layer, visible: bool) -> None:
         self._visible[layer] = visible
         for node in self._nodes[layer].values():
-            node.visible = visible
+            node.visible = visible and (layer != "splats" or self._splats_wanted)
+
+    def show_exact(self, picture: UInt8[np.ndarray, "h w 3"] | None) -> None:
+        """Put a picture behind everything, in the place of the splats; None: the splats again."""
+        self._splats_wanted = picture is None
+        with self._client.atomic():
+            self.set_visible("splats", self._visible["splats"])
+            if picture is None:
+                self._client.scene.set_background_image(self._ground, format="png")
+            else:
+                self._client.scene.set_background_image(picture, format="jpeg", jpeg_quality=92)
+
+    def clicked(self, origin: Sequence[float], direction: Sequence[float]) -> int | Camera | None:
+        """Return what a click's ray meets: the index of a step, or a training camera."""
+        if self._scene is None:
+            return None
+        ray, depth = (np.array(origin, np.float64), np.array(direction, np.float64)), self._scene.extent.frustum
+        indices, poses = self._steps
+        if self._visible["trajectory"] and (hit := shapes.nearest_to_ray(*ray, poses, depth)) is not None:
+            return indices[hit]
+        cameras = [named.camera for named in self._scene.view.cameras]
+        training = shapes.stacked([camera.pose for camera in cameras])
+        hit = shapes.nearest_to_ray(*ray, training, 0.6 * depth) if self._visible["training cameras"] else None
+        return None if hit is None else cameras[hit]
 
     def look(self, view: shapes.Viewpoint) -> None:
         camera = self._client.camera
@@ -154,7 +199,7 @@ class Stage:
             rgbs=splats.rgba[:, :3],
             opacities=splats.rgba[:, 3:],
             scale=1 / k,
-            visible=self._visible["splats"],
+            visible=self._visible["splats"] and self._splats_wanted,
         )
 
     def _lines(
@@ -176,6 +221,42 @@ class Stage:
             colours,
             thickness=width_px,
             thickness_units="screen",
+            visible=self._visible[layer],
+        )
+
+    def _spline(self, points: Float64[np.ndarray, "k 3"], colour: tuple[int, int, int]) -> None:
+        """The way of the camera's centre."""
+        apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
+        points = points[np.concatenate([[True], apart])]
+        old = self._nodes["trajectory"].pop("path", None)
+        if len(points) < 2:
+            if old is not None:
+                old.remove()
+            return
+        self._nodes["trajectory"]["path"] = self._client.scene.add_spline_catmull_rom(
+            "/trajectory/path",
+            points,
+            thickness=_WIDTH_PX,
+            thickness_units="screen",
+            color=colour,
+            visible=self._visible["trajectory"],
+        )
+
+    def _points(
+        self, layer: Layer, name: str, points: np.ndarray, colours: UInt8[np.ndarray, "k 3"], size: float
+    ) -> None:
+        old = self._nodes[layer].pop(name, None)
+        if not len(points):
+            if old is not None:
+                old.remove()
+            return
+        self._nodes[layer][name] = self._client.scene.add_point_cloud(
+            f"/{layer}/{name}",
+            points.astype(np.float32),
+            colours,
+            point_size=size,
+            point_shape="circle",
+            precision="float32",
             visible=self._visible[layer],
         )
 
@@ -206,6 +287,11 @@ class Stage:
             cast_shadow=False,
             receive_shadow=False,
         )
+
+
+def _linear(colours: UInt8[np.ndarray, "k 3"]) -> UInt8[np.ndarray, "k 3"]:
+    """viser takes one colour as sRGB, but lines' colours by vertex as linear light."""
+    return (255 * (colours / 255) ** 2.2).astype(np.uint8)
 
 
 def _wxyz(world_from_camera: np.ndarray) -> np.ndarray:

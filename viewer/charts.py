@@ -1,0 +1,245 @@
+"""Small charts as SVG in HTML: curves over the steps, histograms of match vectors, the strip of stages.
+
+No viser, no HTTP. viser's own plots know neither gaps in a curve nor marks. Colours are for viser's dark ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from html import escape
+from itertools import groupby
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.types import IterationRecord, Pose
+from viewer.measure import MatchView, angle_counts, mean_angle_deg, pose_error
+
+_BINS = 24
+_QUIET = "#9aa0a8"
+_SERIES = ("#f0953f", "#5cb3e8", "#7bd88f", "#d68ce6", "#e8d44d", "#ef6f6c", "#8fa3ff", "#c2b280")
+
+
+def vectors_html(view: MatchView | None) -> str:
+    """The directions of the match vectors as a rose, their lengths as bars, and both in numbers."""
+    if view is None or not len(view.inlier):
+        return _note("This step has no matches.")
+    angle = mean_angle_deg(view.vectors_px)
+    lengths = np.linalg.norm(view.vectors_px, axis=1)
+    lengths = lengths[np.isfinite(lengths)]
+    if angle is None or not len(lengths):
+        return _note("No match vector has a direction here.")
+    return (
+        "<div style='display:flex;gap:.8em;padding:0 .6em;flex-wrap:wrap'>"
+        f"{_figure(_rose(angle_counts(view.vectors_px, _BINS)), f'angles: {angle:.0f}° between two, on average')}"
+        f"{_figure(_bars(lengths), f'lengths: {np.median(lengths):.3g} px, the median')}"
+        "</div>"
+        + _note(
+            "From where the render has a point to where the photo has it. Turned about its axis or swung round what it "
+            "sees, the camera interweaves the vectors; shifted, it makes them long and parallel."
+        )
+    )
+
+
+def stages_html(records: Sequence[IterationRecord], index: int) -> str:
+    """The stages as a strip under the slider, with a mark at the step that is shown."""
+    if not records:
+        return ""
+    last = max(1, len(records) - 1)
+    colours = stage_colours(records)
+    parts, names = [], []
+    for stage, steps in groupby(records, lambda r: r.stage):
+        indices = [r.index for r in steps]
+        left, right = (100 * float(np.clip(i, 0, last)) / last for i in (indices[0] - 0.5, indices[-1] + 0.5))
+        parts.append(
+            f"<div title='{escape(stage)}: {len(indices)} steps' style='position:absolute;left:{left:.2f}%;"
+            f"width:{right - left:.2f}%;height:100%;background:{colours[stage]}'></div>"
+        )
+    for stage, colour in colours.items():
+        names.append(
+            f"<span style='white-space:nowrap'><i style='display:inline-block;width:.7em;height:.7em;"
+            f"background:{colour};margin-right:.3em'></i>{escape(stage)}</span>"
+        )
+    mark = (
+        f"<div style='position:absolute;left:calc({100 * index / last:.2f}% - 1.5px);top:-3px;bottom:-3px;width:3px;"
+        "background:#fff;box-shadow:0 0 2px #000'></div>"
+    )
+    return (
+        f"<div style='padding:.2em .9em .3em'><div style='position:relative;height:7px'>{''.join(parts)}{mark}</div>"
+        "<div style='display:flex;flex-wrap:wrap;gap:.1em .8em;margin-top:.35em;font-size:.75em'>"
+        f"{''.join(names)}</div></div>"
+    )
+
+
+def stage_colours(records: Sequence[IterationRecord]) -> dict[str, str]:
+    """A colour for each stage, in the order in which they come."""
+    names = dict.fromkeys(record.stage for record in records)
+    return {name: _SERIES[i % len(_SERIES)] for i, name in enumerate(names)}
+
+
+def curves_html(records: Sequence[IterationRecord], truth: Pose | None, index: int) -> str:
+    """Loss, change, matches, and errors where the truth is known, over the steps; with a mark at the step shown."""
+    loss = _column(records, "loss")
+    # A curve for each stage: losses of different stages can't be compared.
+    losses = {stage: np.where([r.stage == stage for r in records], loss, np.nan) for stage in stage_colours(records)}
+    turned, moved = _column(records, "step_deg"), _column(records, "step_units")
+    matches, inliers = _column(records, "num_matches"), _column(records, "num_inliers")
+    charts = [
+        ("loss", {name: values for name, values in losses.items() if np.isfinite(values).any()}),
+        ("turned by the step, degrees", {"": turned}),
+        ("moved by the step, units", {"": moved}),
+        ("matches and inliers", {"matches": matches, "inliers": inliers}),
+    ]
+    if truth is not None and records:
+        errors = np.array([pose_error(r.pose, truth) for r in records]).T
+        charts += [("error of rotation, degrees", {"": errors[0]}), ("error of position, units", {"": errors[1]})]
+    drawn = [_curves(title, series, records, index) for title, series in charts if _known(series).size]
+    return "".join(drawn) or _note("There is nothing to plot yet.")
+
+
+_WIDTH, _HEIGHT, _LEFT = 390, 104, 46
+
+
+def _curves(
+    title: str, series: dict[str, Float64[np.ndarray, "n"]], records: Sequence[IterationRecord], index: int
+) -> str:
+    known = _known(series)
+    log = bool(known.min() > 0 and known.max() > 30 * known.min())
+    low, high, ticks = _axis(known, log=log)
+    last = max(1, len(records) - 1)
+
+    def x(step: float) -> float:
+        return _LEFT + 4 + (_WIDTH - _LEFT - 12) * step / last
+
+    def y(value: float) -> float:
+        share = np.log(value / low) / np.log(high / low) if log else (value - low) / (high - low)
+        return float(_HEIGHT - 14 - (_HEIGHT - 22) * share)
+
+    colours = stage_colours(records)
+    palette = colours if set(series) <= set(colours) else dict(zip(series, _SERIES, strict=False))
+    parts = [_bands(records, x)]
+    for tick in ticks:
+        parts.append(f"<path d='M{_LEFT} {y(tick):.1f}H{_WIDTH - 4}' stroke='{_QUIET}' stroke-opacity='.25'/>")
+        parts.append(_text(_LEFT - 5, y(tick) + 3, f"{tick:g}", "end"))
+    parts.append(f"<path d='M{x(index):.1f} 6V{_HEIGHT - 12}' stroke='#fff' stroke-width='1.5'/>")
+    for name, values in series.items():
+        parts.append(_line(values, x, y, palette[name]))
+    parts += [_text(x(step), _HEIGHT - 2, str(step)) for step in (0, last)]
+    legend = " ".join(f"<b style='color:{palette[name]}'>{escape(name)}</b>" for name in series if name)
+    return (
+        f"<div style='padding:0 .6em'><div style='font-size:.8em'>{escape(title)} {legend}</div>"
+        f"<svg viewBox='0 0 {_WIDTH} {_HEIGHT}' width='100%' role='img' aria-label='{escape(title)} by step'>"
+        f"{''.join(parts)}</svg></div>"
+    )
+
+
+def _known(series: dict[str, Float64[np.ndarray, "n"]]) -> Float64[np.ndarray, "k"]:
+    values = np.concatenate([np.zeros(0), *series.values()])
+    return values[np.isfinite(values)]
+
+
+def _axis(known: Float64[np.ndarray, "k"], *, log: bool) -> tuple[float, float, list[float]]:
+    """Return the ends of an axis and a few round values between them."""
+    if log:
+        low, high = 10.0 ** np.floor(np.log10(known.min())), 10.0 ** np.ceil(np.log10(known.max()))
+        powers = np.arange(np.log10(low), np.log10(high) + 0.5)
+        return float(low), float(high), [float(10.0**p) for p in powers[:: -(-len(powers) // 4)]]
+    low, high = min(0.0, float(known.min())), float(known.max()) or 1.0
+    step = 10.0 ** np.floor(np.log10(high - low))
+    step *= next(f for f in (0.2, 0.5, 1.0) if (high - low) / (f * step) <= 5) if (high - low) / step < 5 else 2.0
+    return low, high, [float(t) for t in np.arange(np.ceil(low / step), high / step + 1e-9) * step]
+
+
+def _bands(records: Sequence[IterationRecord], x: Callable[[float], float]) -> str:
+    """The stages as coloured grounds."""
+    colours, bands = stage_colours(records), []
+    for stage, steps in groupby(records, lambda r: r.stage):
+        indices = [r.index for r in steps]
+        left, right = x(indices[0] - 0.5), x(indices[-1] + 0.5)
+        bands.append(
+            f"<rect x='{left:.1f}' y='4' width='{right - left:.1f}' height='{_HEIGHT - 18}' "
+            f"fill='{colours[stage]}' fill-opacity='.12'><title>{escape(stage)}</title></rect>"
+        )
+    return "".join(bands)
+
+
+_DOTS = 60
+"""Points that get a dot, and its value under the mouse; more would be a band, and long to send."""
+
+
+def _line(
+    values: Float64[np.ndarray, "n"], x: Callable[[float], float], y: Callable[[float], float], colour: str
+) -> str:
+    """A line with gaps where there is no value."""
+    path, dots, pen = [], [], "M"
+    known = np.flatnonzero(np.isfinite(values))
+    for i in range(len(values)):
+        if not np.isfinite(values[i]):
+            pen = "M"
+            continue
+        path.append(f"{pen}{x(i):.1f} {y(values[i]):.1f}")
+        pen = "L"
+        if len(known) <= _DOTS:
+            dots.append(
+                f"<circle cx='{x(i):.1f}' cy='{y(values[i]):.1f}' r='2.6'>"
+                f"<title>step {i}: {values[i]:.4g}</title></circle>"
+            )
+    line = f"<path d='{''.join(path)}' fill='none' stroke='{colour}' stroke-width='1.6'/>"
+    return f"{line}<g fill='{colour}'>{''.join(dots)}</g>"
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
+    return f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='{_QUIET}' font-size='9'>{text}</text>"
+
+
+def _column(records: Sequence[IterationRecord], name: str) -> Float64[np.ndarray, "n"]:
+    found = [getattr(record, name) for record in records]
+    return np.array([np.nan if value is None else value for value in found], np.float64)
+
+
+def _rose(counts: Float64[np.ndarray, "bins"]) -> str:
+    """Wedges round a centre, area by count; right is right in the picture, down is down."""
+    reach = 62 * np.sqrt(counts / max(counts.max(), 1))
+    half = np.pi / len(counts)
+    wedges = []
+    for i, r in enumerate(reach):
+        (ax, ay), (bx, by) = (
+            (r * np.cos(turn), r * np.sin(turn)) for turn in (2 * half * i - 0.9 * half, 2 * half * i + 0.9 * half)
+        )
+        wedges.append(f"<path d='M0 0L{ax:.1f} {ay:.1f}A{r:.1f} {r:.1f} 0 0 1 {bx:.1f} {by:.1f}Z'/>")
+    rings = "".join(f"<circle r='{r}' fill='none' stroke='{_QUIET}' stroke-opacity='.35'/>" for r in (31, 62))
+    labels = "".join(
+        _text(x, y, text) for x, y, text in ((72, 3, "0°"), (0, 74, "90°"), (-72, 3, "180°"), (0, -67, "270°"))
+    )
+    return _svg("-84 -78 168 158", "directions", f"{rings}<g fill='{_SERIES[0]}'>{''.join(wedges)}</g>{labels}")
+
+
+def _bars(lengths: Float64[np.ndarray, "m"]) -> str:
+    """Counts over a logarithmic axis of pixels."""
+    low = np.floor(np.log10(max(np.quantile(lengths, 0.02), 1e-2)))
+    high = np.ceil(np.log10(max(lengths.max(), 10**low * 10)))
+    edges = np.linspace(low, high, int(4 * (high - low)) + 1)
+    counts, _ = np.histogram(np.log10(np.clip(lengths, 10**low, 10**high)), edges)
+    wide, top = 164 / len(counts), max(counts.max(), 1)
+    bars = "".join(
+        f"<rect x='{i * wide + 0.5:.1f}' y='{130 - 120 * c / top:.1f}' width='{wide - 1:.1f}' "
+        f"height='{120 * c / top:.1f}'/>"
+        for i, c in enumerate(counts)
+    )
+    ticks = "".join(_text(164 * (p - low) / (high - low), 145, f"{10.0**p:g}") for p in np.arange(low, high + 1))
+    return _svg("-12 0 188 158", "lengths", f"<g fill='{_SERIES[1]}'>{bars}</g>{ticks}")
+
+
+def _svg(box: str, label: str, inner: str) -> str:
+    return f"<svg viewBox='{box}' width='168' role='img' aria-label='{label}'>{inner}</svg>"
+
+
+def _figure(svg: str, caption: str) -> str:
+    return (
+        f"<figure style='margin:0'>{svg}"
+        f"<figcaption style='font-size:.75em;max-width:168px'>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _note(text: str) -> str:
+    return f"<div style='padding:.3em .6em;font-size:.8em;opacity:.75'>{escape(text)}</div>"
