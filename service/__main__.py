@@ -7,9 +7,6 @@ import dataclasses
 import json
 import logging
 import os
-import socket
-import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,13 +16,9 @@ from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 
-from service import __version__
 from service.errors import InvalidRequest, SplatfixError
 
 if TYPE_CHECKING:
-    import uvicorn
-    from fastapi import FastAPI
-
     from service.api.schemas import Result
     from service.api.settings import Settings
     from service.localize import LoadedScene
@@ -35,7 +28,9 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="Photo in, pose out.")
 bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
 scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes.")
+keys_app = typer.Typer(no_args_is_help=True, help="Who may use the service.")
 app.add_typer(bench_app, name="bench")
+app.add_typer(keys_app, name="keys")
 app.add_typer(scenes_app, name="scenes")
 out, err = Console(), Console(stderr=True)
 
@@ -69,35 +64,16 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="0: any free one.", min=0, max=65535)] = None,
     viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
+    open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
 ) -> None:
-    """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment."""
-    import uvicorn
+    """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment, or a file.
 
-    from service.api.app import create_app
-    from service.api.settings import DATA_HOME
+    The file is the one that SPLATFIX_CONFIG names, or ~/.config/splatfix/splatfix.toml.
+    """
+    from service.serve import run
 
-    given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer}
-    settings = _settings({name: value for name, value in given.items() if value is not None})
-    if settings.data_dir is None and settings.port:  # on a random port nobody would come back to it
-        settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
-    with _listener(settings.host, settings.port) as listener:
-        settings = settings.model_copy(update={"port": listener.getsockname()[1]})
-        application = create_app(settings)
-        server = uvicorn.Server(
-            uvicorn.Config(
-                application,
-                log_level="warning",
-                access_log=False,
-                ws="websockets-sansio",
-                ws_max_size=2**26,
-                ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
-                timeout_graceful_shutdown=3,
-            )
-        )
-        logging.getLogger("service").setLevel(logging.INFO)
-        announce = threading.Thread(target=_announce, args=(server, application, settings), daemon=True)
-        announce.start()
-        server.run(sockets=[listener])
+    given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
+    run(_settings({name: value for name, value in given.items() if value is not None}), out, err)
 
 
 def _settings(given: dict[str, Any]) -> Settings:
@@ -111,42 +87,6 @@ def _settings(given: dict[str, Any]) -> Settings:
     except ValidationError as error:
         where, message = described(error.errors())
         raise InvalidRequest(message, where=where) from error
-
-
-def _listener(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except OSError as error:
-        raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
-
-
-def _announce(server: uvicorn.Server, application: FastAPI, settings: Settings) -> None:
-    """Wait until the service is ready, then say where it is and what to type."""
-    from service.example import curl_line
-
-    with err.status("starting") as status:
-        while not server.started:
-            time.sleep(0.05)
-        scenes = application.state.parts.scenes
-        while awaited := scenes.readiness().awaited:
-            status.update(", ".join(awaited))
-            time.sleep(0.1)
-    readiness, url = scenes.readiness(), settings.loopback_url
-    for reason in readiness.failed:
-        err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
-    lines = [
-        f"splatfix {__version__} {'is ready' if readiness.ready else 'runs, but has no usable scene'}:",
-        f"  start page  {url}/",
-        *([f"  viewer      {url}/viewer/"] if settings.viewer else []),
-        f"  API         {url}/docs",
-    ]
-    ready = [entry for entry in scenes.entries() if entry.state == "ready"]
-    if ready:
-        scene, folder = ready[0].loaded.scene, ready[0].path
-        several = len(scenes.entries()) > 1
-        lines += ["Try it:", f"  {curl_line(url, scene, folder, name_scene=several)}"]
-    out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
 
 
 @app.command()
@@ -312,6 +252,41 @@ def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or sc
     facts |= {"memory": f"{found.nbytes / 1e6:.1f} MB", "extent": f"{lower.tolist()} to {upper.tolist()}"}
     for name, value in (facts | dataclasses.asdict(found.info)).items():
         out.print(f"{name:22} {value}", markup=False, highlight=False, soft_wrap=True)
+
+
+@keys_app.command("add")
+def add_key(
+    name: Annotated[str, typer.Argument(help="Whose it is; for you.")],
+    role: Annotated[Literal["read", "localize", "admin"], typer.Option()] = "localize",
+) -> None:
+    """Make an API key and print it; only its hash is kept."""
+    from service.api import keys
+
+    print(keys.add_key(_keys_file(), name, role))
+
+
+@keys_app.command("list")
+def list_keys() -> None:
+    """List names and roles."""
+    from service.api import keys
+
+    for key in keys.read_keys(_keys_file()):
+        out.print(f"{key.role:9} {key.name}", markup=False, highlight=False, soft_wrap=True)
+
+
+@keys_app.command("remove")
+def remove_key(name: str) -> None:
+    """Forget a key; running services refuse it within a second."""
+    from service.api import keys
+
+    keys.remove_key(_keys_file(), name)
+
+
+def _keys_file() -> Path:
+    path = _settings({}).keys_file
+    if path is None:
+        raise InvalidRequest("there is no file for keys.", where="SPLATFIX_KEYS_FILE")
+    return path
 
 
 @app.command()

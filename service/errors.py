@@ -13,7 +13,8 @@
       |-- IdempotencyConflict  a key was used for another request
       |-- DeadlineExceeded, Interrupted  why a job ended without a result
       |-- StorageFailed      the disk is full or broken; nothing was accepted
-      |-- QueueFull          too much work is waiting; try again later
+      |-- QueueFull, RateLimited  too much work is waiting, or too much of it is yours; try again later
+      |-- Unauthorized, Forbidden, NoKeys
       |-- BackendMissing     a package or device that a plug-in needs is not here
       `-- EstimatorFault     an estimator broke its contract (our mistake)
 
@@ -28,13 +29,15 @@ class SplatfixError(Exception):
 
     code = "error"
 
-    def __init__(self, message: str, *, where: str = "", hint: str = "") -> None:
+    def __init__(self, message: str, *, where: str = "", hint: str = "", retry_after_s: int | None = None) -> None:
         super().__init__(message)
         self.message = message
         self.where = where
         """Field, file or element the error is about; empty if there is no such place."""
         self.hint = hint
         """What the caller can do; empty if the message says it."""
+        self.retry_after_s = retry_after_s
+        """When it is worth another try, if that is known."""
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.message}" if self.where else self.message
@@ -131,6 +134,22 @@ class StorageFailed(SplatfixError):
 
 class QueueFull(SplatfixError):
     code = "queue_full"
+
+
+class RateLimited(SplatfixError):
+    code = "rate_limited"
+
+
+class Unauthorized(SplatfixError):
+    code = "unauthorized"
+
+
+class Forbidden(SplatfixError):
+    code = "forbidden"
+
+
+class NoKeys(SplatfixError):
+    code = "no_keys"
 
 
 class BackendMissing(SplatfixError):

@@ -16,10 +16,12 @@ _AT_MOST = 2000
 """Files to look through."""
 
 
-def curl_line(url: str, scene: GaussianScene, folder: Path | None, *, name_scene: bool) -> str:
+def curl_line(url: str, scene: GaussianScene, folder: Path | None, *, name_scene: bool, key: str = "") -> str:
     """Return a command that localizes a photo; `PHOTO.jpg` stands for one where the folder has none."""
     photo = example_photo(folder, scene) if folder and folder.is_dir() else None
     parts = ["curl", "-H", "Prefer: wait=30", "-F", f"photo=@{photo or 'PHOTO.jpg'}"]
+    if key:
+        parts[1:1] = ["-H", f"Authorization: Bearer {key}"]
     if name_scene:
         parts += ["-F", f"scene={scene.info.id}"]
     intrinsics = _needed_intrinsics(photo, scene) if photo else None

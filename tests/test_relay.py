@@ -172,7 +172,7 @@ def test_a_viewer_that_dies_is_started_again_and_ends_with_its_supervisor(tmp_pa
     )
 
     async def scenario() -> list[int]:
-        child = ViewerChild("http://127.0.0.1:1")
+        child = ViewerChild("http://127.0.0.1:1", "key")
         child.command = [sys.executable, "-c", dies_twice]
         task = asyncio.create_task(child.supervise())
         while not log.exists() or log.read_text().count("\n") < 3:
@@ -193,7 +193,7 @@ def test_the_viewer_ends_when_its_parent_is_killed(tmp_path):
             sys.executable,
             "-c",
             "import asyncio; from service.api.viewer_child import ViewerChild\n"
-            "asyncio.run(ViewerChild('http://127.0.0.1:1').supervise())",
+            "asyncio.run(ViewerChild('http://127.0.0.1:1', 'key').supervise())",
         ],
         cwd=Path(__file__).parents[1],
     )

@@ -101,9 +101,10 @@ class JobView:
 class Service:
     """One running splatfix service. Safe to use from several threads."""
 
-    def __init__(self, url: str, transport: httpx.BaseTransport | None = None) -> None:
+    def __init__(self, url: str, transport: httpx.BaseTransport | None = None, key: str = "") -> None:
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
         # Loopback: no proxy from the environment may stand between. A busy machine renders for seconds.
-        self._http = httpx.Client(base_url=url, timeout=30.0, trust_env=False, transport=transport)
+        self._http = httpx.Client(base_url=url, timeout=30.0, trust_env=False, transport=transport, headers=headers)
 
     def close(self) -> None:
         self._http.close()

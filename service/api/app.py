@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-import re
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -22,13 +21,16 @@ from anyio import to_thread
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic.json_schema import models_json_schema
-from starlette.datastructures import Headers
-from starlette.exceptions import HTTPException
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.middleware.cors import CORSMiddleware
 
 from service import __version__
+from service.api.admission import Admission
+from service.api.edge import Edge
+from service.api.gate import Door, Gate, allowed_hosts, is_loopback
 from service.api.jobs import Jobs
-from service.api.problems import install, problem_response
+from service.api.keys import KeyRing
+from service.api.metrics import Metrics
+from service.api.problems import install
 from service.api.relay import Relay
 from service.api.requests import LocalizeIn
 from service.api.routes import router
@@ -38,18 +40,20 @@ from service.api.schemas import Problem, Record
 from service.api.settings import Settings
 from service.api.ui import add_pages
 from service.api.viewer_child import ViewerChild
-from service.errors import StorageFailed
+from service.errors import InvalidRequest, StorageFailed
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
 
-_BODY_OVERHEAD = 1_000_000
-"""Bytes that a body may have beyond the photo's limit: the other fields and the form's own lines."""
 
-
-def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScene] | None = None) -> FastAPI:
+def create_app(
+    settings: Settings | None = None,
+    scenes: Mapping[str, LoadedScene] | None = None,
+    keys: KeyRing | None = None,
+) -> FastAPI:
     """Make the app. Scenes are found here and loaded after start-up; `scenes` are in memory already.
 
-    Raises SceneNotFound, BadInput or BackendMissing if the settings name what is not there.
+    Without `keys` those of the settings' file count. Raises SceneNotFound, BadInput or BackendMissing if the
+    settings name what is not there, InvalidRequest if they would let everybody in without saying so.
     """
     settings = settings or Settings()
     ESTIMATORS.load(settings.estimator)  # an unknown name shall be told now, not in each job
@@ -57,20 +61,22 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
         known = Scenes(settings.scenes, settings.estimator, settings.cache_dir)
     else:
         known = Scenes.of(scenes, settings.estimator)
-    viewer = ViewerChild(settings.loopback_url) if settings.viewer else None
+    keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
+    viewer = ViewerChild(settings.loopback_url, keys.make_passing("viewer", "read")) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
             folder = stack.enter_context(data_folder(settings.data_dir))
-            jobs = Jobs(settings, known, folder)
+            jobs = Jobs(settings, known, folder, metrics)
             stack.push_async_callback(to_thread.run_sync, jobs.close)
             await to_thread.run_sync(jobs.start)
             known.start()
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
-            app.state.parts = Parts(settings, known, jobs, *limits)
+            app.state.parts = Parts(settings, known, jobs, keys, metrics, *limits)
+            _show(metrics, known, jobs)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -87,8 +93,20 @@ def create_app(settings: Settings | None = None, scenes: Mapping[str, LoadedScen
     add_pages(app)
     if relay:
         app.include_router(relay.router)
-    app.add_middleware(SizeLimit, limit=settings.max_upload_bytes + _BODY_OVERHEAD)
-    app.add_middleware(SubPath, default=settings.root_path)
+    # The last one added is the first one that a request meets.
+    app.add_middleware(
+        Admission, settings=settings, room=lambda *who: to_thread.run_sync(app.state.parts.jobs.room, *who)
+    )
+    app.add_middleware(Gate, door=door(settings, keys))
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["*"],
+            allow_headers=["*"],
+            expose_headers=["Location", "Retry-After"],
+        )
+    app.add_middleware(Edge, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
     app.openapi = lambda: openapi(app)
     return app
 
@@ -108,6 +126,27 @@ def data_folder(path: Path | None) -> Iterator[Path]:
                 f"{folder} can't be used: {told}.", where="data_dir", hint="Name another one: SPLATFIX_DATA_DIR."
             ) from error
         yield folder
+
+
+def door(settings: Settings, keys: KeyRing) -> Door:
+    """Return who may come in. Raises InvalidRequest for an open service that nobody asked for."""
+    is_open = not keys
+    if is_open and not is_loopback(settings.host) and not settings.open:
+        raise InvalidRequest(
+            f"everybody who reaches {settings.host} could use the service.",
+            where="host",
+            hint="Make a key (splatfix keys add NAME), or say SPLATFIX_OPEN=true.",
+        )
+    hosts = allowed_hosts(settings.host, settings.allowed_hosts, open_to_all=is_open)
+    return Door(keys, is_open, hosts, settings.cors_origins)
+
+
+def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs) -> None:
+    """Put the service's state among the metrics."""
+    metrics.gauge("jobs_queued", "Jobs that wait", (), lambda: {(): jobs.waiting()})
+    metrics.gauge("jobs_running", "Jobs that run", (), lambda: {(): jobs.running()})
+    metrics.gauge("workers_stuck", "Abandoned workers", (), lambda: {(): jobs.stuck_workers()})
+    metrics.gauge("scene_bytes", "Memory of a scene", ("scene",), scenes.memory)
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:
@@ -153,52 +192,3 @@ camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field sa
 are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
 Every error is a problem document (RFC 9457).
 """
-
-
-class SubPath:
-    """Tells the app the sub-path under which a proxy shows it (ASGI: `path` includes `root_path`)."""
-
-    def __init__(self, app: ASGIApp, default: str) -> None:
-        self._app, self._default = app, default.rstrip("/")
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] in ("http", "websocket"):
-            given = Headers(scope=scope).get("x-forwarded-prefix", "").rstrip("/")
-            # Only what is a plain path: it ends up in links.
-            root = given if re.fullmatch(r"(/[\w~-][\w.~-]*){1,8}", given) else self._default
-            path = scope["path"]
-            if root and path != root and not path.startswith(f"{root}/"):
-                path = root + path
-            scope = {**scope, "root_path": root, "path": path}
-        await self._app(scope, receive, send)
-
-
-class SizeLimit:
-    """Refuses a large body: by its announced length before a byte of it is read, else as soon as it is too long.
-
-    Starlette's own limit answers in plain text, whatever the app would say.
-    """
-
-    def __init__(self, app: ASGIApp, limit: int) -> None:
-        self._app, self._limit = app, limit
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        error = HTTPException(413, f"The body may have {self._limit} bytes.")
-        length = Headers(scope=scope).get("content-length", "")
-        if length.isdecimal() and int(length) > self._limit:
-            await problem_response(error, scope["path"])(scope, receive, send)
-            return
-        received = 0
-
-        async def counted() -> Message:
-            nonlocal received
-            message = await receive()
-            received += len(message.get("body", b""))
-            if received > self._limit:
-                raise error
-            return message
-
-        await self._app(scope, counted, send)

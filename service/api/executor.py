@@ -26,6 +26,10 @@ _WATCH_S = 0.5
 class Executor(Protocol):
     """Here threads; machines, if one is not enough, fit behind the same calls."""
 
+    def full(self) -> bool:
+        """Return whether another job would be refused."""
+        ...
+
     def reserve(self) -> None:
         """Take a place in the queue for a job that is about to come. Raises QueueFull."""
         ...
@@ -79,12 +83,19 @@ class ThreadExecutor:
             self._add_worker()
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
+    def full(self) -> bool:
+        with self._changed:
+            return self._full()
+
+    def _full(self) -> bool:
+        idle = sum(worker.job is None for worker in self._workers)
+        taken = len(self._queue) + self._reserved
+        held = sum(job.memory_bytes for job in self._queue)
+        return self._closed.is_set() or taken >= self._queue_size + idle or held > self._queue_bytes
+
     def reserve(self) -> None:
         with self._changed:
-            idle = sum(worker.job is None for worker in self._workers)
-            taken = len(self._queue) + self._reserved
-            held = sum(job.memory_bytes for job in self._queue)
-            if self._closed.is_set() or taken >= self._queue_size + idle or held > self._queue_bytes:
+            if self._full():
                 raise QueueFull(f"{len(self._queue)} jobs are waiting.", hint="Try again later.")
             self._reserved += 1
 

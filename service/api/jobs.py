@@ -9,44 +9,30 @@ records go to the store in batches, the last ones together with its end.
 from __future__ import annotations
 
 import hashlib
-import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
-from service.api.convert import intrinsics_out, record_out, result_out, timing_out
-from service.api.documents import versions
+from service.api.attempts import Attempts
+from service.api.convert import intrinsics_out
+from service.api.desk import Desk, ending
 from service.api.executor import Executor, ThreadExecutor
 from service.api.intake import Body, Task, make_task
 from service.api.live import LiveJob
+from service.api.metrics import Metrics
 from service.api.photos import Photos
-from service.api.problems import problem_of
 from service.api.requests import LocalizeFields
 from service.api.scenes import Scenes
 from service.api.schemas import PhotoOut
 from service.api.settings import Settings
-from service.api.store import Batch, Ending, JobFilter, JobStore, NewJob, Retention, StoredJob
-from service.errors import (
-    DeadlineExceeded,
-    Interrupted,
-    JobNotReady,
-    RecordNotFound,
-    SceneError,
-    StorageFailed,
-)
+from service.api.store import Ending, JobFilter, JobStore, NewJob, Retention, StoredJob
+from service.errors import Interrupted, JobNotReady, QueueFull, RecordNotFound, StorageFailed
 from service.images import encode_image
-from service.localize import Cancelled, LoadedScene, localize
-from service.types import IterationRecord, PoseEstimate, Query
+from service.localize import LoadedScene
+from service.types import Query
 
-_log = logging.getLogger(__name__)
-_T = TypeVar("_T")
-
-_BATCH_S = 0.5
-_RETRY_S = 0.5
 _HOUSEKEEPING_S = 2.0
 _STUCK_LIMIT = 2
 """Abandoned threads keep their memory; so many, and it is time for a new process."""
@@ -72,29 +58,27 @@ class Order:
 class Jobs:
     """All jobs of one service."""
 
-    def __init__(self, settings: Settings, scenes: Scenes, folder: Path) -> None:
+    def __init__(self, settings: Settings, scenes: Scenes, folder: Path, metrics: Metrics) -> None:
         """Open the folder. Raises StorageFailed."""
         self._settings, self._scenes = settings, scenes
-        self._photos = Photos(folder / "photos")
-        self._store = JobStore(folder / "jobs.sqlite")
-        self._live: dict[str, LiveJob] = {}
-        self._closing = threading.Event()
+        self._photos, self._store = Photos(folder / "photos"), JobStore(folder / "jobs.sqlite")
+        self._desk = Desk(settings, scenes, self._store, self._photos, metrics)
+        self._live = self._desk.live
+        attempts = Attempts(self._desk)
         self._executor: Executor = ThreadExecutor(
-            self._run,
-            self._give_up,
+            attempts.run,
+            attempts.give_up,
             workers=settings.workers,
             queue_size=settings.queue_size,
             queue_bytes=settings.queue_bytes,
             stuck_s=settings.stuck_s,
         )
         self._housekeeper = threading.Thread(target=self._keep_house, name="housekeeper", daemon=True)
-        self.storage_error = ""
-        """Why nothing can be written to disk; empty while it can."""
 
     def start(self) -> None:
         """Take up what an ended process left behind."""
         error = Interrupted(f"the service ended {self._settings.crashes} times while this job ran.")
-        for job in self._store.recover(self._settings.crashes, _ending("interrupted", error)):
+        for job in self._store.recover(self._settings.crashes, ending("interrupted", error)):
             live = self._live[job.id] = LiveJob(job.id, job.scene)
             self._scenes.when_settled(job.scene, lambda live=live: self._executor.submit(live, reserved=False))
         for orphan in self._photos.ids() - self._store.ids():
@@ -121,7 +105,7 @@ class Jobs:
         except Exception as error:
             self._executor.release()
             self._photos.delete(new.id)
-            self._note_storage(error)
+            self._desk.note_storage(error)
             raise
         if job.id != new.id:  # the same key came twice at once
             self._executor.release()
@@ -161,7 +145,7 @@ class Jobs:
         live = self._live.get(job.id)
         if live is None:
             return self._photos.kept(job.id)
-        query = live.query or self._decoded(job, self._scenes.get(job.scene))[1]
+        query = live.query or self._desk.decoded(job, self._scenes.get(job.scene))[1]
         return encode_image(query.rgb)
 
     def waiting(self) -> int:
@@ -170,11 +154,19 @@ class Jobs:
     def running(self) -> int:
         return self._store.count("running")
 
+    def room(self, client: str, key: str | None) -> None:
+        """Raises QueueFull if a new job would be refused; a repeated one never is."""
+        if self._executor.full() and not (key and self._store.knows(client, key)):
+            raise QueueFull(f"{self._executor.waiting()} jobs are waiting.", hint="Try again later.")
+
+    def stuck_workers(self) -> int:
+        return self._executor.stuck()
+
     def ailments(self) -> list[str]:
         """Say what keeps jobs from being done; a supervisor should restart the process."""
         stuck = self._executor.stuck()
         told = [f"{stuck} workers are stuck"] if stuck >= _STUCK_LIMIT else []
-        return [*told, *([self.storage_error] if self.storage_error else [])]
+        return [*told, *([self._desk.storage_error] if self._desk.storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended."""
@@ -183,13 +175,13 @@ class Jobs:
             return
         self._store.ask_to_cancel(job.id)
         live.cancel.set()
-        if self._store.end_queued(job, Ending("cancelled"), self._photo_until()):
+        if self._store.end_queued(job, Ending("cancelled"), self._desk.photo_until()):
             self._executor.withdraw(live)
-            self._retire(live)
+            self._desk.retire(live)
 
     def close(self) -> None:
         """Let what runs finish within the grace period; the rest waits on disk for the next start."""
-        self._closing.set()
+        self._desk.closing.set()
         self._executor.close(self._settings.shutdown_s)
         for live in tuple(self._live.values()):
             live.cancel.set()
@@ -199,104 +191,6 @@ class Jobs:
         self._housekeeper.join(_HOUSEKEEPING_S + 1)
         self._store.close()
 
-    # ------------------------------------------------------------------ on a worker's thread
-
-    def _run(self, live: LiveJob) -> None:
-        job = self._store.get(live.id)
-        attempt = self._persisted(live, lambda: self._store.claim(job))
-        if attempt is None:
-            return
-        live.attempt = attempt
-        live.announce()
-        sent = _Sent()
-        ending = self._attempt(live, job, sent)
-        if ending is None:
-            self._persisted(live, lambda: self._store.requeue(job.id, attempt))
-            return
-        batch = Batch(sent.count, live.records[sent.count :], live.stage)
-        until = self._photo_until()
-        if self._persisted(live, lambda: self._store.finish(job.id, attempt, batch, ending, until)):
-            self._retire(live)
-
-    def _attempt(self, live: LiveJob, job: StoredJob, sent: _Sent) -> Ending | None:
-        """Localize; None if it was stopped because the service ends."""
-        try:
-            loaded = self._scenes.get(job.scene)
-            if live.query is None:
-                live.task, live.query = self._decoded(job, loaded)
-            assert live.task
-            request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
-            estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
-            return _success(estimate, live.task, loaded)
-        except Cancelled:
-            stopped = self._closing.is_set() and not self._store.get(job.id).cancelled
-            return None if stopped else Ending("cancelled")
-        except Exception as error:  # a job's failure, even by a bug, must not end its worker
-            expected = isinstance(error, DeadlineExceeded | SceneError)
-            _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
-            return _ending("interrupted" if isinstance(error, SceneError) else "failed", error)
-
-    def _tell(self, live: LiveJob, record: IterationRecord, sent: _Sent) -> None:
-        live.tell(record_out(record).model_dump_json(), record.stage)
-        if time.monotonic() - sent.at < _BATCH_S:
-            return
-        batch = Batch(sent.count, live.records[sent.count :], live.stage)
-        try:
-            self._store.append(live.id, live.attempt, batch)
-        except StorageFailed as error:  # they stay in memory, and go with the next batch
-            self._note_storage(error)
-        else:
-            sent.count += len(batch.records)
-        sent.at = time.monotonic()
-
-    def _decoded(self, job: StoredJob, loaded: LoadedScene) -> tuple[Task, Query]:
-        body = Body(self._photos.original(job.id), "", {})
-        return make_task(body, LocalizeFields.model_validate_json(job.fields), loaded, job.estimator)
-
-    def _budget_s(self, job: StoredJob) -> float:
-        """What is left of the caller's budget, the caller's deadline and the operator's limit."""
-        asked = LocalizeFields.model_validate_json(job.fields).budget_s
-        left = None if job.deadline is None else job.deadline - time.time()
-        if left is not None and left <= 0:
-            raise DeadlineExceeded("the deadline was over before the job could start.", where="deadline_s")
-        return min(limit for limit in (asked, left, self._settings.max_job_s) if limit is not None)
-
-    def _persisted(self, live: LiveJob, write: Callable[[], _T]) -> _T | None:
-        """Write to the store, again and again while the disk is full. None if the service ends before that."""
-        while True:
-            try:
-                result = write()
-            except StorageFailed as error:
-                self._note_storage(error)
-                live.beat()
-                if self._closing.wait(_RETRY_S):
-                    return None
-            else:
-                self.storage_error = ""
-                return result
-
-    def _give_up(self, live: LiveJob) -> None:
-        """End a job whose worker is stuck."""
-        error = Interrupted(f"the job told nothing for {self._settings.stuck_s:g} s and was given up.")
-        nothing = Batch(len(self._store.records(live.id)), (), live.stage)
-        ending = _ending("interrupted", error)
-        if self._store.finish(live.id, live.attempt, nothing, ending, self._photo_until()):
-            live.cancel.set()
-            self._retire(live)
-
-    # ------------------------------------------------------------------ afterwards
-
-    def _retire(self, live: LiveJob) -> None:
-        """Let go of an ended job's memory, and of its photo as it was sent."""
-        job = self._store.get(live.id)
-        wanted = live.query is not None and (job.keep_photo or self._settings.photo_grace_s > 0)
-        self._photos.settle(live.id, encode_image(live.query.rgb) if wanted and live.query else None)
-        self._live.pop(live.id, None)
-        live.end()
-
-    def _photo_until(self) -> float:
-        return time.time() + self._settings.photo_grace_s
-
     def _current(self, job: StoredJob) -> StoredJob:
         """Return the job with what its thread has told since the last batch."""
         live = self._live.get(job.id)
@@ -304,32 +198,18 @@ class Jobs:
             return job
         return replace(job, records=len(live.records), stage=live.stage)
 
-    def _note_storage(self, error: Exception) -> None:
-        if isinstance(error, StorageFailed):
-            if not self.storage_error:
-                _log.error("%s", error)
-            self.storage_error = error.message
-
     def _keep_house(self) -> None:
         """Delete what is over its time."""
         kept = Retention(self._settings.keep_jobs, self._settings.keep_days * 86_400, self._settings.keep_bytes)
-        while not self._closing.wait(_HOUSEKEEPING_S):
+        while not self._desk.closing.wait(_HOUSEKEEPING_S):
             try:
                 for job_id in [*self._store.stale_photos(), *self._store.forget(kept)]:
                     self._photos.delete(job_id)
-                if self.storage_error:
+                if self._desk.storage_error:
                     self._store.probe()
-                    self.storage_error = ""
+                    self._desk.storage_error = ""
             except StorageFailed as error:
-                self._note_storage(error)
-
-
-@dataclass(slots=True)
-class _Sent:
-    """How many records of an attempt are in the store, and since when."""
-
-    count: int = 0
-    at: float = 0.0
+                self._desk.note_storage(error)
 
 
 def _new_job(order: Order, scene: str, task: Task, query: Query) -> NewJob:
@@ -350,13 +230,3 @@ def _new_job(order: Order, scene: str, task: Task, query: Query) -> NewJob:
         photo_bytes=len(order.body.photo),
         keep_photo=fields.keep_photo,
     )
-
-
-def _ending(state: str, error: Exception) -> Ending:
-    return Ending(state, error=problem_of(error, "").model_dump_json())
-
-
-def _success(estimate: PoseEstimate, task: Task, loaded: LoadedScene) -> Ending:
-    anchor = loaded.scene.info.geo_anchor
-    result = result_out(estimate, timing_out(task.decode), versions(), anchor)
-    return Ending("succeeded", result.status, result.score, result.model_dump_json())

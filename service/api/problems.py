@@ -17,21 +17,25 @@ from service.errors import (
     BackendMissing,
     BadInput,
     DeadlineExceeded,
+    Forbidden,
     IdempotencyConflict,
     Interrupted,
     InvalidRequest,
     JobNotFound,
     JobNotReady,
     NoGeoAnchor,
+    NoKeys,
     NoPose,
     PhotoGone,
     QueueFull,
+    RateLimited,
     RecordNotFound,
     SceneError,
     SceneNotFound,
     SceneNotReady,
     SplatfixError,
     StorageFailed,
+    Unauthorized,
 )
 
 _log = logging.getLogger(__name__)
@@ -57,6 +61,10 @@ _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
     (Interrupted, 503),
     (StorageFailed, 503),
     (QueueFull, 503),
+    (RateLimited, 429),
+    (Unauthorized, 401),
+    (Forbidden, 403),
+    (NoKeys, 409),
     (BackendMissing, 501),
     (SplatfixError, 500),
 )
@@ -66,6 +74,7 @@ _HTTP_CODES = {
     400: "bad_request",
     404: "not_found",
     405: "method_not_allowed",
+    408: "request_timeout",
     413: "content_too_large",
     415: "unsupported_media_type",
     503: "unavailable",
@@ -102,8 +111,9 @@ def problem_response(error: Exception, path: str) -> Response:
     """Answer with the error's problem document."""
     problem = problem_of(error, path)
     headers = dict(getattr(error, "headers", None) or {})
-    if problem.status == 503:
-        headers.setdefault("Retry-After", str(RETRY_AFTER_S))
+    if problem.status in (429, 503):
+        wait_s = error.retry_after_s if isinstance(error, SplatfixError) else None
+        headers.setdefault("Retry-After", str(wait_s or RETRY_AFTER_S))
     return Response(problem.model_dump_json(), problem.status, headers, MEDIA_TYPE)
 
 

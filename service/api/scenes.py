@@ -101,6 +101,10 @@ class Scenes:
                 return
         do()
 
+    def memory(self) -> dict[tuple[str, ...], float]:
+        """Return the bytes of each scene in memory, by (id,)."""
+        return {(e.id,): float(e.loaded.scene.nbytes) for e in self.entries() if e.loaded}
+
     def readiness(self) -> Readiness:
         entries = self.entries()
         awaited = [f"scene {e.id}: {e.state}" for e in entries if e.state in ("loading", "preparing")]

@@ -367,5 +367,12 @@ class Readiness(Model):
     """Scenes that could not be loaded, a disk that can't be written to, workers that are stuck; with the reason."""
 
 
+class Token(Model):
+    token: str
+    """Stands for the key that it was made with: in `?token=` of a page, or as Bearer."""
+    seconds: float
+    """How long it is valid."""
+
+
 class Liveness(Model):
     alive: Literal[True] = True

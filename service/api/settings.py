@@ -1,17 +1,21 @@
-"""What an operator can set: environment variables `SPLATFIX_*`, or arguments of `splatfix serve`."""
+"""What an operator can set: arguments of `splatfix serve`, `SPLATFIX_*` in the environment, or a TOML file."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
 from service.localize import DEFAULT_ESTIMATOR
 
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
 """Where `splatfix serve` keeps its jobs, a folder for each port."""
+
+
+CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "splatfix"
 
 
 def _cores() -> int:
@@ -20,6 +24,19 @@ def _cores() -> int:
 
 class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix="SPLATFIX_", use_attribute_docstrings=True, extra="forbid")
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: Any,
+        env_settings: Any,
+        dotenv_settings: Any,
+        file_secret_settings: Any,
+    ) -> tuple[Any, ...]:
+        """Arguments win over the environment, and that over the file."""
+        file = Path(os.environ.get("SPLATFIX_CONFIG") or CONFIG_HOME / "splatfix.toml")
+        return init_settings, env_settings, TomlConfigSettingsSource(settings_cls, file)
 
     scenes: list[Path] = []
     """Scene folders, scene files, or folders of scene folders. In the environment: a JSON list."""
@@ -54,11 +71,30 @@ class Settings(BaseSettings):
     """How long after its job a photo can be looked at, unless the request says `keep_photo`; 0: not at all."""
     crashes: int = Field(default=3, ge=1)
     """A job that was running in so many crashes is not run again."""
-    max_upload_bytes: int = Field(default=100_000_000, ge=1)
+    max_upload_bytes: int = Field(default=50_000_000, ge=1)
+    """Of a photo."""
+    max_uploads: int = Field(default=8, ge=1)
+    """Requests whose bodies come in at once."""
+    upload_s: float = Field(default=60.0, gt=0)
+    """How long a body may take to come in, and a second more for each megabyte that it may have."""
+    send_s: float = Field(default=30.0, gt=0)
+    """A client that takes nothing of its answer for so long is dropped."""
+    rate_limit: str = "30/second"
+    """Requests of one client that make work, e.g. 10/second or 600/minute; empty: any number."""
     max_wait_s: float = Field(default=60.0, gt=0)
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
     """Where view indexes are kept between runs; None: nowhere."""
+    keys_file: Path | None = CONFIG_HOME / "keys.json"
+    """API keys, as `splatfix keys add` stores them. If it has any, everybody needs one."""
+    open: bool = False
+    """Listen beyond this machine without keys."""
+    allowed_hosts: list[str] = []
+    """Names under which the service may be called, e.g. of a proxy; empty: any, except while there are no keys."""
+    cors_origins: list[str] = []
+    """Origins of other sites whose pages may use the service, e.g. https://example.org."""
+    log_json: bool | None = None
+    """Log lines of JSON; None: unless a person watches."""
     viewer: bool = True
     """Start the viewer and relay it under /viewer."""
 

@@ -194,6 +194,11 @@ class JobStore:
         with self._reading:
             return _repeated(self._reader, client, key, digest)
 
+    def knows(self, client: str, key: str) -> bool:
+        """Return whether the client has used that idempotency key."""
+        with self._reading:
+            return bool(_select(self._reader, "WHERE client = ? AND idempotency_key = ?", client, key))
+
     def probe(self) -> None:
         """Write something. Raises StorageFailed."""
         with self._transaction() as writer:

@@ -24,7 +24,9 @@ _GRACE_S = 3.0
 class ViewerChild:
     """Supervises one viewer; `supervise` runs until it is cancelled."""
 
-    def __init__(self, service_url: str) -> None:
+    def __init__(self, service_url: str, key: str) -> None:
+        """`key` lets the viewer in; it goes by the environment, since everybody can see a process's arguments."""
+        self._environment = os.environ | {"SPLATFIX_VIEWER_KEY": key}
         self.port = _free_port()
         self.command = [sys.executable, "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
@@ -41,7 +43,9 @@ class ViewerChild:
     async def _run_once(self) -> None:
         # Its log goes to stderr; on stdout is viser's banner with an address that is not for people.
         nothing = asyncio.subprocess.DEVNULL
-        child = await asyncio.create_subprocess_exec(*self.command, stdin=nothing, stdout=nothing)
+        child = await asyncio.create_subprocess_exec(
+            *self.command, stdin=nothing, stdout=nothing, env=self._environment
+        )
         try:
             code = await child.wait()
             _log.warning("the viewer ended with code %s; it is started again", code)

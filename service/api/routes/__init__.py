@@ -12,7 +12,8 @@ GET    /jobs/{id}/export/{format}             the pose as COLMAP, nerfstudio, TU
 GET    /scenes                                GET /scenes/{id}
 GET    /scenes/{id}/splats?max=N              binary, see `service/api/splats.py`
 POST   /scenes/{id}/render                    a picture or depth from any pose
-GET    /capabilities, /version, /livez, /readyz
+POST   /tokens                                short-lived, for pages
+GET    /capabilities, /version, /livez, /readyz, /metrics
 """
 
 from __future__ import annotations

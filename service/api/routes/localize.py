@@ -10,6 +10,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Header, Request, Response
 
 from service.api import documents
+from service.api.admission import client_of
 from service.api.intake import read_body, read_fields
 from service.api.jobs import Order
 from service.api.requests import LocalizeFields, LocalizeIn
@@ -81,7 +82,7 @@ async def localize_photo(
     fields = read_fields(body.fields)
     scene = parts.scenes.get(fields.scene)
     digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
-    order = Order(body, fields, _client(request), idempotency_key, digest)
+    order = Order(body, fields, client_of(request.scope), idempotency_key, digest)
     job = await to_thread.run_sync(parts.jobs.accept, order, scene, limiter=parts.decoding)
     wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
     if wait_s:
@@ -92,10 +93,6 @@ async def localize_photo(
     response.headers["Location"] = f"{root}/jobs/{job.id}"
     response.status_code = 200 if job.ended else 202
     return documents.job_document(job, root)
-
-
-def _client(request: Request) -> str:
-    return request.client.host if request.client else ""
 
 
 def wait_preference(header: str) -> float:

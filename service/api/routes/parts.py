@@ -9,6 +9,8 @@ import anyio
 from fastapi import Depends, Path, Request
 
 from service.api.jobs import Jobs
+from service.api.keys import Caller, KeyRing
+from service.api.metrics import Metrics
 from service.api.problems import MEDIA_TYPE
 from service.api.scenes import Scenes
 from service.api.settings import Settings
@@ -22,6 +24,8 @@ class Parts:
     settings: Settings
     scenes: Scenes
     jobs: Jobs
+    keys: KeyRing
+    metrics: Metrics
     decoding: anyio.CapacityLimiter
     """Photos decoded at once: each may take 200 MB for a moment."""
     rendering: anyio.CapacityLimiter
@@ -40,7 +44,12 @@ def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id."
     return parts.jobs.get(job_id)  # not async: reads the disk
 
 
+def _caller(request: Request) -> Caller | None:
+    return request.state.caller
+
+
 PartsOf = Annotated[Parts, Depends(_parts)]
+CallerOf = Annotated[Caller | None, Depends(_caller)]
 RootOf = Annotated[str, Depends(_root)]
 JobOf = Annotated[StoredJob, Depends(_job)]
 
@@ -54,9 +63,13 @@ def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
 
 _PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
 MEANINGS = {
+    401: "An API key is needed, or it is not valid",
+    403: "The key's role doesn't allow it, or another site's page asks",
     400: "The request can't be understood",
     404: "There is no such thing",
     409: "Not yet, or there is nothing to give",
+    408: "The body took too long",
+    429: "Too many requests of yours; see Retry-After",
     413: "The body is too large",
     415: "Neither a multipart form nor JSON",
     422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",

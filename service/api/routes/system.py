@@ -5,8 +5,12 @@ from __future__ import annotations
 from fastapi import APIRouter, Response
 
 from service.api import documents
-from service.api.routes.parts import PartsOf, errors
-from service.api.schemas import Capabilities, Liveness, Readiness
+from service.api.metrics import METRICS_TYPE
+from service.api.routes.parts import CallerOf, PartsOf, errors
+from service.api.schemas import Capabilities, Liveness, Readiness, Token
+from service.errors import NoKeys
+
+TOKEN_S = 300.0
 
 router = APIRouter()
 
@@ -37,3 +41,22 @@ async def ready(parts: PartsOf, response: Response) -> Readiness:
     readiness = readiness.model_copy(update={"ready": readiness.ready and not ill, "failed": readiness.failed + ill})
     response.status_code = 200 if readiness.ready else 503
     return readiness
+
+
+@router.get(
+    "/metrics",
+    tags=["service"],
+    response_class=Response,
+    responses={200: {"description": "Prometheus's text form", "content": {"text/plain": {}}}} | errors(),
+)
+def get_metrics(parts: PartsOf) -> Response:
+    """Return what there is to watch: requests, queue, jobs by stage and outcome, memory by scene, workers."""
+    return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
+
+
+@router.post("/tokens", tags=["service"], responses=errors(409))
+def make_token(parts: PartsOf, caller: CallerOf) -> Token:
+    """Make a token that stands for the caller's key for some minutes, to open a page with: `/viewer/?token=…`."""
+    if caller is None:
+        raise NoKeys("the service has no keys: its pages are open.", where="header.authorization")
+    return Token(token=parts.keys.token(caller, TOKEN_S), seconds=TOKEN_S)

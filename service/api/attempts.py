@@ -1,0 +1,118 @@
+"""A job's attempt, on a worker's thread: claim it, localize, store the records in batches and the end once."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, replace
+
+from service.api.convert import record_out, result_out, timing_out
+from service.api.desk import Desk, ending
+from service.api.documents import versions
+from service.api.intake import Task
+from service.api.live import LiveJob
+from service.api.requests import LocalizeFields
+from service.api.store import Batch, Ending, StoredJob
+from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFailed
+from service.localize import Cancelled, LoadedScene, localize
+from service.logs import bound
+from service.types import IterationRecord, PoseEstimate
+
+_log = logging.getLogger(__name__)
+
+_BATCH_S = 0.5
+
+
+class Attempts:
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+
+    def run(self, live: LiveJob) -> None:
+        """Make one attempt, unless the job was cancelled while it waited."""
+        with bound(job_id=live.id):
+            self._run(live)
+
+    def give_up(self, live: LiveJob) -> None:
+        """End a job whose worker is stuck."""
+        desk = self._desk
+        error = Interrupted(f"the job told nothing for {desk.settings.stuck_s:g} s and was given up.")
+        nothing = Batch(len(desk.store.records(live.id)), (), live.stage)
+        end = ending("interrupted", error)
+        if desk.store.finish(live.id, live.attempt, nothing, end, desk.photo_until()):
+            live.cancel.set()
+            desk.retire(live)
+
+    def _run(self, live: LiveJob) -> None:
+        desk = self._desk
+        job = desk.store.get(live.id)
+        attempt = desk.persisted(live, lambda: desk.store.claim(job))
+        if attempt is None:
+            return
+        desk.metrics.started(time.time() - job.created)
+        live.attempt = attempt
+        live.announce()
+        sent = _Sent()
+        end = self._attempt(live, job, sent)
+        if end is None:
+            desk.persisted(live, lambda: desk.store.requeue(job.id, attempt))
+            return
+        batch = Batch(sent.count, live.records[sent.count :], live.stage)
+        until = desk.photo_until()
+        if desk.persisted(live, lambda: desk.store.finish(job.id, attempt, batch, end, until)):
+            _log.info("job %s: %s %s", job.id, end.state, end.status or "")
+            desk.retire(live)
+
+    def _attempt(self, live: LiveJob, job: StoredJob, sent: _Sent) -> Ending | None:
+        """Localize; None if it was stopped because the service ends."""
+        desk = self._desk
+        try:
+            loaded = desk.scenes.get(job.scene)
+            if live.query is None:
+                live.task, live.query = desk.decoded(job, loaded)
+            assert live.task
+            request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
+            estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
+            for timing in estimate.timings:
+                desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
+            return _success(estimate, live.task, loaded)
+        except Cancelled:
+            stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled
+            return None if stopped else Ending("cancelled")
+        except Exception as error:  # a job's failure, even by a bug, must not end its worker
+            expected = isinstance(error, DeadlineExceeded | SceneError)
+            _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
+            return ending("interrupted" if isinstance(error, SceneError) else "failed", error)
+
+    def _tell(self, live: LiveJob, record: IterationRecord, sent: _Sent) -> None:
+        live.tell(record_out(record).model_dump_json(), record.stage)
+        if time.monotonic() - sent.at < _BATCH_S:
+            return
+        batch = Batch(sent.count, live.records[sent.count :], live.stage)
+        try:
+            self._desk.store.append(live.id, live.attempt, batch)
+        except StorageFailed as error:  # they stay in memory, and go with the next batch
+            self._desk.note_storage(error)
+        else:
+            sent.count += len(batch.records)
+        sent.at = time.monotonic()
+
+    def _budget_s(self, job: StoredJob) -> float:
+        """What is left of the caller's budget, the caller's deadline and the operator's limit."""
+        asked = LocalizeFields.model_validate_json(job.fields).budget_s
+        left = None if job.deadline is None else job.deadline - time.time()
+        if left is not None and left <= 0:
+            raise DeadlineExceeded("the deadline was over before the job could start.", where="deadline_s")
+        return min(limit for limit in (asked, left, self._desk.settings.max_job_s) if limit is not None)
+
+
+@dataclass(slots=True)
+class _Sent:
+    """How many records of an attempt are in the store, and since when."""
+
+    count: int = 0
+    at: float = 0.0
+
+
+def _success(estimate: PoseEstimate, task: Task, loaded: LoadedScene) -> Ending:
+    result = result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor)
+    return Ending("succeeded", result.status, result.score, result.model_dump_json())

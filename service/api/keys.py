@@ -1,0 +1,155 @@
+"""Who may do what: API keys with roles, and the short-lived tokens that stand for them in a browser.
+
+A key is 256 random bits, so a plain SHA-256 of it can't be turned back and needs no salt. Only that is stored.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import time
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from service.errors import InvalidRequest
+
+Role = Literal["read", "localize", "admin"]
+ROLES: tuple[Role, ...] = get_args(Role)
+"""Each may do what the ones before it may."""
+_PREFIX = "sfx_"
+"""Tells people and secret scanners what it is."""
+_FRESH_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    name: str
+    role: Role
+
+    def may(self, role: Role) -> bool:
+        return ROLES.index(self.role) >= ROLES.index(role)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredKey:
+    name: str
+    role: Role
+    sha256: str
+
+
+class KeyRing:
+    """The keys of a file, read again when it changes, and keys that live as long as the process."""
+
+    def __init__(self, path: Path | None) -> None:
+        """Raises InvalidRequest if the file can't be understood."""
+        self._path = path
+        self._passing: list[StoredKey] = []
+        self._secret = secrets.token_bytes(32)
+        self._read_at, self._stamp = 0.0, (0, 0)
+        self._stored: list[StoredKey] = []
+        self._refresh()
+
+    def __bool__(self) -> bool:
+        self._refresh()
+        return bool(self._stored) or any(key.name != "viewer" for key in self._passing)
+
+    def make_passing(self, name: str, role: Role) -> str:
+        """Return a new key that ends with the process."""
+        key = _PREFIX + secrets.token_urlsafe(32)
+        self._passing.append(StoredKey(name, role, _digest(key)))
+        return key
+
+    def caller(self, key: str) -> Caller | None:
+        """Return whose key it is; takes the same time for every wrong one."""
+        self._refresh()
+        digest, found = _digest(key), None
+        for known in (*self._stored, *self._passing):
+            if hmac.compare_digest(known.sha256, digest):
+                found = Caller(known.name, known.role)
+        return found
+
+    def token(self, caller: Caller, seconds: float) -> str:
+        """Return what stands for the caller for some time; it ends with the process, and with the key."""
+        claim = json.dumps({"name": caller.name, "role": caller.role, "until": time.time() + seconds})
+        text = base64.urlsafe_b64encode(claim.encode()).decode()
+        return f"{text}.{self._signature(text)}"
+
+    def bearer(self, token: str) -> Caller | None:
+        """Return whom a token stands for; None if it is forged, too old, or its key is gone."""
+        text, _, signature = token.partition(".")
+        if not hmac.compare_digest(self._signature(text).encode(), signature.encode()):
+            return None
+        claim = json.loads(base64.urlsafe_b64decode(text))
+        caller = Caller(claim["name"], claim["role"])
+        self._refresh()
+        living = {(key.name, key.role) for key in (*self._stored, *self._passing)}
+        return caller if claim["until"] > time.time() and (caller.name, caller.role) in living else None
+
+    def _signature(self, text: str) -> str:
+        return hmac.new(self._secret, text.encode(), "sha256").hexdigest()
+
+    def _refresh(self) -> None:
+        if self._path is None or time.monotonic() - self._read_at < _FRESH_S:
+            return
+        self._read_at = time.monotonic()
+        try:
+            found = self._path.stat()
+        except FileNotFoundError:
+            self._stored, self._stamp = [], (0, 0)
+            return
+        stamp = found.st_mtime_ns, found.st_size
+        if stamp != self._stamp:
+            self._stored, self._stamp = read_keys(self._path), stamp
+
+
+def read_keys(path: Path) -> list[StoredKey]:
+    """Return a file's keys; none if there is no file. Raises InvalidRequest."""
+    try:
+        entries = json.loads(path.read_text("utf-8")) if path.exists() else []
+        keys = [StoredKey(**entry) for entry in entries]
+    except (OSError, ValueError, TypeError) as error:
+        raise InvalidRequest(f"not a file of keys: {error}.", where=str(path)) from error
+    if not all(key.role in ROLES for key in keys):
+        raise InvalidRequest(f"a role must be one of {', '.join(ROLES)}.", where=str(path))
+    return keys
+
+
+def add_key(path: Path, name: str, role: Role) -> str:
+    """Make a key and store its hash; return the key, which can't be had again. Raises InvalidRequest."""
+    keys = read_keys(path)
+    if any(key.name == name for key in keys):
+        raise InvalidRequest(f"there is a key '{name}' already.", where="name", hint="Remove it first.")
+    key = _PREFIX + secrets.token_urlsafe(32)
+    _write(path, [*keys, StoredKey(name, role, _digest(key))])
+    return key
+
+
+def remove_key(path: Path, name: str) -> None:
+    """Forget a key; running services refuse it from the next second on. Raises InvalidRequest."""
+    keys = read_keys(path)
+    left = [key for key in keys if key.name != name]
+    if len(left) == len(keys):
+        raise InvalidRequest(f"there is no key '{name}'.", where="name")
+    _write(path, left)
+
+
+def _write(path: Path, keys: list[StoredKey]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+            json.dump([asdict(key) for key in keys], file, indent=1)
+        draft.replace(path)
+    finally:
+        with suppress(FileNotFoundError):
+            draft.unlink()
+
+
+def _digest(key: str) -> str:
+    return hashlib.sha256(key.encode()).hexdigest()
