@@ -184,10 +184,14 @@ def bench_localize(
     intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
+    budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
+    budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
 ) -> None:
     """Localize a scene's test photos and compare with the truth."""
-    from service.bench.localize import run
+    from service.api.intake import options_from
+    from service.bench.localize import Budget, run
 
     _tell_machine()
     with _progress() as progress:
@@ -200,6 +204,8 @@ def bench_localize(
             intrinsics=intrinsics,
             cameras=cameras,
             modify=tuple(modify or ()),
+            options=options_from(estimator, _json(options, "options") or {}),
+            budget=Budget(budget_s, budget_renders),
             progress=_counter(progress, "photos"),
             cache_dir=_settings({}).cache_dir,
         )

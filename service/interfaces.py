@@ -101,6 +101,13 @@ class Matcher(Protocol):
         ...
 
 
+@dataclass(slots=True)
+class RenderTally:
+    """Counts a job's renders: pictures, and gradients as one more each."""
+
+    count: int = 0
+
+
 @dataclass(frozen=True, slots=True)
 class Tools:
     """What an estimator works with; bound to one scene and one job."""
@@ -115,6 +122,8 @@ class Tools:
     memo: dict[Any, Any] = field(default_factory=dict)
     """What one part of the job computed and another wants too (the photo's features, the last render): a cache
     of this job alone; it never changes a result's meaning."""
+    tally: RenderTally = field(default_factory=RenderTally)
+    """Of `rasterizer`; an estimator that renders with another one wraps it with `counted`, too."""
 
 
 @runtime_checkable

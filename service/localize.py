@@ -25,10 +25,11 @@ import numpy as np
 
 from service.errors import EstimatorFault
 from service.estimators import ESTIMATORS
-from service.interfaces import Matcher, Rasterizer, Tools
+from service.interfaces import Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
 from service.pose.gate import verify
 from service.render import RASTERIZERS
+from service.render.counted import Counted
 from service.scene_formats import load_scene
 from service.types import (
     GaussianScene,
@@ -109,6 +110,8 @@ class Request:
     seed: int = 0
     budget_s: float | None = None
     """Wall time after which the best pose so far is the answer; None: until the estimator ends."""
+    budget_renders: int | None = None
+    """Renders after which it is; a step that was begun is finished. A measure that no other load disturbs."""
     cancel: threading.Event | None = None
 
 
@@ -122,12 +125,14 @@ def localize(
     request = request or Request()
     plugin = ESTIMATORS.load(request.estimator)
     options = request.options if request.options is not None else plugin.Options()
+    tally = RenderTally()
     tools = Tools(
         loaded.scene,
-        loaded.rasterizer,
+        Counted(loaded.rasterizer, tally),
         loaded.matcher,
         np.random.default_rng(request.seed),
         loaded.prepare(request.estimator),
+        tally=tally,
     )
     clock = _Clock()
     records: list[IterationRecord] = []
@@ -137,12 +142,12 @@ def localize(
             records.append(record)
             if on_record:
                 on_record(record)
-            exhausted = request.budget_s is not None and clock.wall_s > request.budget_s
+            exhausted = _exhausted(request, clock, tally)
             if exhausted:
                 break
     if not records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
-    pose = records[-1].pose
+    pose, renders = records[-1].pose, tally.count
     verdict = _qualified(verify(query, pose, tools), query, exhausted)
     return PoseEstimate(
         pose=pose,
@@ -156,10 +161,16 @@ def localize(
         matcher=loaded.matcher.name,
         seed=request.seed,
         budget_exhausted=exhausted,
+        renders=renders,
         timings=_timings(records, clock),
         warnings=query.warnings + loaded.scene.info.warnings,
         records=tuple(records),
     )
+
+
+def _exhausted(request: Request, clock: _Clock, tally: RenderTally) -> bool:
+    late = request.budget_s is not None and clock.wall_s > request.budget_s
+    return late or (request.budget_renders is not None and tally.count >= request.budget_renders)
 
 
 def _qualified(verdict: Verdict, query: Query, exhausted: bool) -> Verdict:

@@ -366,6 +366,8 @@ class PoseEstimate:
     matcher: str
     seed: int
     budget_exhausted: bool
+    renders: int
+    """Pictures that the estimator rendered, and gradients as one more each; the gate's own not counted."""
     timings: tuple[StageTiming, ...]
     warnings: tuple[str, ...]
     records: tuple[IterationRecord, ...]

@@ -147,6 +147,7 @@ class FakeJob:
             matcher="xfeat",
             seed=0,
             budget_exhausted=False,
+            renders=0,
             timings=(),
             warnings=(),
             records=tuple(self.records),

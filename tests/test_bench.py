@@ -20,6 +20,7 @@ from service.geometry import look_at, moved, pose_distance, project, rotation_fr
 from service.images import encode_image, read_query
 from service.interfaces import Frame
 from service.localize import LoadedScene
+from service.pose.focus import centre_depth
 from service.types import Camera, Intrinsics, Pose, PoseEstimate, Reason, Status, Verdict
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -119,7 +120,7 @@ class TestPhotos:
 
 def estimate(pose: Pose, status=Status.LOCALIZED) -> PoseEstimate:
     verdict = Verdict(status, Reason.AGREES, 0.9, 100, 0.8, 1.0, None)
-    return PoseEstimate(pose, verdict, LENS, "given", "s", "0", "fake", "fake", "fake", 0, False, (), (), ())
+    return PoseEstimate(pose, verdict, LENS, "given", "s", "0", "fake", "fake", "fake", 0, False, 0, (), (), ())
 
 
 class FakeRasterizer:
@@ -248,7 +249,7 @@ class TestRun:
             bench.run(folder_of(tmp_path / "s", "nerfstudio"), **arguments)
 
     def test_depth_of_the_middle(self):
-        assert bench.centre_depth(FakeRasterizer(), Camera(LENS, poses()[0])) == 2
+        assert centre_depth(FakeRasterizer(), Camera(LENS, poses()[0])) == 2
 
 
 class TestStarts:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
-from service.errors import InvalidOptions
+from service.errors import InvalidOptions, UnknownName
 from service.estimators import ESTIMATORS
 from service.geometry import moved, pose_distance
 from service.interfaces import Tools
@@ -19,6 +19,8 @@ from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pos
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 DEFAULT = "view_index"
+QUICK: dict[str, dict] = {"mc_do": {"hypotheses": 16, "rounds": 1, "iterations": 4, "refinement_steps": 20}}
+"""Where the defaults are for far starts: options with which a near one is enough."""
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +35,10 @@ def estimator(request: pytest.FixtureRequest) -> str:
     if reason:
         pytest.skip(reason)
     return request.param
+
+
+STEP_RENDERS = 3
+"""What one step of any method renders at most."""
 
 
 def photo_at(room: LoadedScene, pose: Pose, lens: Intrinsics = LENS, prior: Pose | None = None) -> Query:
@@ -55,6 +61,12 @@ def assert_near(found: Pose, truth: Pose, degrees: float = 0.2, units: float = 0
     assert distance < units
 
 
+def quick(estimator: str, **more: int) -> Request:
+    """The estimator's defaults, but no longer than the near starts of these tests need."""
+    options = ESTIMATORS.load(estimator).Options(**QUICK.get(estimator, {}))
+    return Request(estimator, options, **more)
+
+
 def trace(records: tuple[IterationRecord, ...]) -> list[tuple]:
     return [(r.stage, r.pose.world_from_camera.tobytes(), r.num_matches, r.num_inliers) for r in records]
 
@@ -65,14 +77,14 @@ def trace(records: tuple[IterationRecord, ...]) -> list[tuple]:
 def test_finds_a_planted_pose_from_a_prior_nearby(estimator: str, room: LoadedScene) -> None:
     truth = unseen_pose()
     prior = moved(truth, np.array([0.05, -0.05, 0.03, 0.05, 0.02, -0.05]))
-    found = localize(photo_at(room, truth, prior=prior), room, Request(estimator))
+    found = localize(photo_at(room, truth, prior=prior), room, quick(estimator))
     assert found.verdict.status is Status.LOCALIZED
     assert_near(found.pose, truth)
 
 
 def test_the_trace_is_well_formed(estimator: str, room: LoadedScene) -> None:
     truth = unseen_pose(1)
-    found = localize(photo_at(room, truth, prior=truth), room, Request(estimator))
+    found = localize(photo_at(room, truth, prior=truth), room, quick(estimator))
     assert found.records
     for record in found.records:
         assert record.stage
@@ -86,7 +98,7 @@ def test_the_trace_is_well_formed(estimator: str, room: LoadedScene) -> None:
 
 def test_the_same_seed_gives_the_same_trace(estimator: str, room: LoadedScene) -> None:
     query = photo_at(room, unseen_pose(2), prior=unseen_pose(2))
-    a, b = (localize(query, room, Request(estimator, seed=5)) for _ in range(2))
+    a, b = (localize(query, room, quick(estimator, seed=5)) for _ in range(2))
     assert trace(a.records) == trace(b.records)
     assert a.verdict.score == b.verdict.score
 
@@ -97,7 +109,7 @@ def test_can_be_stopped_at_any_record(estimator: str, room: LoadedScene) -> None
     query = photo_at(room, unseen_pose(3), prior=unseen_pose(3))
     for count in (1, 2, 3):
         tools = Tools(room.scene, room.rasterizer, room.matcher, np.random.default_rng(0), room.prepare(estimator))
-        steps = plugin.run(query, tools, plugin.Options())
+        steps = plugin.run(query, tools, quick(estimator).options)
         records = [record for record, _ in zip(steps, range(count), strict=False)]
         steps.close()
         assert all(isinstance(record.pose, Pose) for record in records)
@@ -105,9 +117,20 @@ def test_can_be_stopped_at_any_record(estimator: str, room: LoadedScene) -> None
 
 def test_a_photo_without_texture_is_no_error(estimator: str, room: LoadedScene) -> None:
     blank = Query(np.full((HEIGHT, WIDTH, 3), 120, np.uint8), LENS, "given", LENS)
-    found = localize(blank, room, Request(estimator))
+    found = localize(blank, room, quick(estimator))
     assert found.verdict.status is Status.NOT_LOCALIZED
     assert found.verdict.reason is Reason.FEW_FEATURES
+
+
+def test_the_budget_counts_renders(estimator: str, room: LoadedScene) -> None:
+    """No more are made once it is reached than one step needs: at most a batch of a few poses."""
+    query = photo_at(room, unseen_pose(3), prior=moved(unseen_pose(3), np.array([0.03, 0.02, 0, 0, 0.02, 0])))
+    free = localize(query, room, quick(estimator))
+    assert not free.budget_exhausted
+    stopped = localize(query, room, quick(estimator, budget_renders=2))
+    assert 2 <= stopped.renders <= 2 + STEP_RENDERS
+    assert stopped.budget_exhausted
+    assert stopped.renders <= free.renders
 
 
 # --- the default: no prior at all
@@ -198,3 +221,37 @@ def test_a_prior_is_one_more_candidate_and_may_be_wrong(room: LoadedScene) -> No
 def test_senseless_options_are_refused(candidates: int) -> None:
     with pytest.raises(InvalidOptions, match="candidates"):
         ESTIMATORS.load(DEFAULT).Options(candidates=candidates)
+
+
+# --- the supplement's method
+
+
+@pytest.mark.parametrize("solver", ["least_squares", "gradient"])
+def test_mc_do_leaves_out_what_is_switched_off(solver: str, room: LoadedScene) -> None:
+    truth = unseen_pose(1)
+    query = photo_at(room, truth, prior=moved(truth, np.array([0.1, 0.1, 0, 0.1, 0, 0])))
+    kinds = {"hypotheses": "hypothesis", "iterations": "decouple", "refinement_steps": "refine"}
+    for left in kinds:
+        amounts = {name: 3 if name == left else 0 for name in kinds}
+        options = ESTIMATORS.load("mc_do").Options(**amounts, rounds=0, solver=solver)
+        found = localize(query, room, Request("mc_do", options))
+        stages = {record.stage for record in found.records}
+        assert kinds[left] in stages
+        assert stages <= {"start", "sample", kinds[left]}
+        assert all(record.matches for record in found.records if record.stage in ("hypothesis", "decouple"))
+
+
+def test_mc_do_comes_back_from_the_hard_protocol(room: LoadedScene) -> None:
+    """Here the motion about the centre turns a camera that looks outwards to another wall."""
+    truth = unseen_pose(2)
+    away = moved(truth, np.array([0.0, 0.6, 0.1, 0.2, 0.0, 0.0]))
+    options = ESTIMATORS.load("mc_do").Options(refinement_steps=20)
+    found = localize(photo_at(room, truth, prior=away), room, Request("mc_do", options))
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+
+
+@pytest.mark.parametrize(("name", "value"), [("hypotheses", -1), ("solver", "newton"), ("loss", "l3")])
+def test_mc_do_refuses_senseless_options(name: str, value: object) -> None:
+    with pytest.raises((InvalidOptions, UnknownName), match=str(value) if name != "hypotheses" else name):
+        ESTIMATORS.load("mc_do").Options(**{name: value})

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from service.bench.metrics import Outcome, Units, errors, is_forward_facing, summary, units_of
+from service.bench.metrics import Outcome, Units, errors, summary, units_of
 from service.geometry import look_at, moved, pose_distance, so3_exp
+from service.pose.focus import is_forward_facing
 from service.types import Camera, Intrinsics, Pose, Status
 
 LENS = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)

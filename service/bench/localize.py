@@ -7,6 +7,7 @@ estimator's index ready and one localization done before; CPU time is the whole 
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,9 +19,10 @@ import numpy as np
 from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, summary, units_of
 from service.bench.queries import BenchPhoto, find_photos, photo_bytes
 from service.bench.starts import require_kind, start_pose
+from service.estimators import ESTIMATORS
 from service.images import read_query
-from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request, localize
+from service.pose.focus import centre_depth
 from service.scene_formats import load_scene
 from service.types import Camera, Pose, PoseEstimate
 
@@ -46,14 +48,18 @@ def run(
     intrinsics: Literal["given", "withheld"] = "given",
     cameras: Literal["given", "ignored"] = "given",
     modify: Sequence[str] = (),
+    options: Any = None,
+    budget: Budget | None = None,
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
 ) -> dict[str, Any]:
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
-    With `cameras="ignored"` the scene is used without its training cameras; they still define the units.
+    `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is used without
+    its training cameras; they still define the units.
     """
     require_kind(start)
+    chosen, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
     folder = Path(folder)
     photos = find_photos(folder)
     loaded, training = _loaded(folder, photos, cameras, cache_dir)
@@ -67,15 +73,25 @@ def run(
     def answer(trial: Trial) -> PoseEstimate:
         given = trial.truth.intrinsics if intrinsics == "given" else None
         query = read_query(trial.data, intrinsics=given, prior=trial.start, background_rgb=background)
-        return localize(query, loaded, Request(estimator=estimator, seed=seed))
+        limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
+        return localize(query, loaded, Request(estimator=estimator, options=chosen, seed=seed, **limits))
 
     outcomes, per_query = measure(todo, answer, units, progress)
     asked = {"estimator": estimator, "start": start, "trials": trials, "seed": seed}
     asked |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
+    asked |= {"options": dataclasses.asdict(chosen), "budget": dataclasses.asdict(budget)}
     facts = {"photos": len(photos), "training_cameras": len(training), "gaussians": loaded.scene.count}
     facts |= {"forward_facing": units.forward_facing, "units_per_scene_unit": units.units_per_scene_unit}
     facts |= {"prepare_s": prepare_s}
     return {"scene": loaded.scene.info.name, **asked, **facts, **summary(outcomes), "per_query": per_query}
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """When an estimator is stopped; its best so far is then the answer."""
+
+    seconds: float | None = None
+    renders: int | None = None
 
 
 def measure(
@@ -97,15 +113,6 @@ def measure(
         if progress:
             progress(done, len(todo))
     return outcomes, lines
-
-
-def centre_depth(rasterizer: Rasterizer, camera: Camera) -> float:
-    """Return the median depth rendered in the middle of the image, in scene units; 0 if nothing is there."""
-    small = Camera(camera.intrinsics.with_long_side(256), camera.pose)
-    (frame,) = rasterizer.render([small])
-    height, width = frame.median_depth.shape
-    middle = frame.median_depth[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4]
-    return float(np.median(middle[middle > 0])) if np.any(middle > 0) else 0.0
 
 
 def _loaded(
@@ -152,9 +159,11 @@ def _line(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) 
         "success_1deg_0p01": outcome.success(FINE),
         "rotation_deg": outcome.rotation_deg,
         "translation_units": outcome.translation_units,
+        "start_world_from_camera": trial.start.world_from_camera.tolist() if trial.start else None,
         "start_rotation_deg": begun[0],
         "start_translation_units": begun[1],
         "intrinsics_source": estimate.intrinsics_source,
+        "renders": estimate.renders,
         "latency_ms": outcome.latency_ms,
         "cpu_ms": outcome.cpu_ms,
         "stages_ms": {timing.stage: 1e3 * timing.wall_s for timing in estimate.timings},

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from service.geometry import nearest_point_to_axes, pose_distance
+from service.geometry import pose_distance
+from service.pose.focus import focus_of
 from service.types import Camera, Pose, Status
 
 FOCUS_DISTANCE = 4.0
 """Median distance of the training cameras from the focus, in normalized units."""
-FORWARD_FACING_DEG = 15.0
-"""Below this root-mean-square angle between the optical axes and their common direction, the point nearest to all
-of them is not determined. LLFF's fern has 6 degrees; orbits and walks round an object had 33 or more."""
 COARSE = (5.0, 0.05)
 """Degrees and normalized units."""
 FINE = (1.0, 0.01)
@@ -36,35 +34,10 @@ class Units:
         return matrix
 
 
-def units_of(cameras: Sequence[Camera], centre_depth: Callable[[Camera], float]) -> Units:
-    """Return the units of a scene with these training cameras.
-
-    The focus is the point nearest to all optical axes. In a forward-facing scene it is the mean of the points
-    that the cameras see in their image centre, at the median of their depths: `centre_depth` renders it, in scene
-    units, 0 where there is nothing.
-    """
-    poses = [camera.pose for camera in cameras]
-    positions = np.stack([pose.position_in_world for pose in poses])
-    forward_facing = is_forward_facing(poses)
-    if forward_facing:
-        depths = np.array([centre_depth(camera) for camera in cameras])
-        depth = float(np.median(depths[depths > 0])) if np.any(depths > 0) else 1.0
-        focus = np.mean([p.position_in_world + depth * p.axis_in_world for p in poses], axis=0)
-    else:
-        focus = nearest_point_to_axes(poses)
-    distance = float(np.median(np.linalg.norm(positions - focus, axis=1)))
-    return Units(focus, FOCUS_DISTANCE / max(distance, 1e-9), forward_facing)
-
-
-def is_forward_facing(poses: Sequence[Pose]) -> bool:
-    """Whether the optical axes are nearly parallel: see FORWARD_FACING_DEG.
-
-    The common direction is the axes' first principal one; 1 - its eigenvalue is the mean squared sine to it.
-    """
-    axes = np.stack([pose.axis_in_world for pose in poses])
-    along = float(np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1])
-    opposed = np.any(axes @ axes[0] < 0)  # a room seen both ways is not forward-facing
-    return bool(not opposed and 1.0 - along < np.sin(np.radians(FORWARD_FACING_DEG)) ** 2)
+def units_of(cameras: Sequence[Camera], depth_of: Callable[[Camera], float]) -> Units:
+    """Return the units of a scene with these training cameras; `depth_of` as in `focus_of`."""
+    focus = focus_of(cameras, depth_of)
+    return Units(focus.point_in_world, FOCUS_DISTANCE / focus.distance, focus.forward_facing)
 
 
 @dataclass(frozen=True, slots=True)
