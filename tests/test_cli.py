@@ -151,10 +151,20 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         return {"scene": "x", "success_5deg_0p05": 0.5, "per_query": [{"photo": "a"}]}
 
     monkeypatch.setattr(service.bench.localize, "run", run)
-    flags = "--estimator view_index --budget-renders 9 --start hard --trials 3 --seed 4 --intrinsics withheld --cameras ignored"
+    flags = "--estimator view_index --start hard --trials 3 --seed 4 --intrinsics withheld --cameras ignored"
+    flags += " --budget-renders 9"
     written = tmp_path / "out.json"
     code, told, complaint = splatfix(
-        "bench", "localize", tmp_path, *flags.split(), "--modify", "blur=2", "--options", '{"candidates": 3}', "--json", written
+        "bench",
+        "localize",
+        tmp_path,
+        *flags.split(),
+        "--modify",
+        "blur=2",
+        "--options",
+        '{"candidates": 3}',
+        "--json",
+        written,
     )
     assert code == 0, complaint
     assert asked.pop("progress")
