@@ -6,6 +6,8 @@
       |     `-- UnknownName  (a plug-in, scene or modification that does not exist; lists what does)
       |-- SceneError
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
+      |     |-- SceneExists
+      |     |-- SceneUnloaded, SceneInUse, NoRoom  (in memory, or not)
       |     `-- SceneNotReady  (still loading; try again later)
       |-- JobNotFound, RecordNotFound, JobNotReady
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
@@ -86,6 +88,22 @@ class UnsupportedFormat(SceneError):
 
 class CorruptScene(SceneError):
     code = "corrupt_scene"
+
+
+class SceneExists(SceneError):
+    code = "scene_exists"
+
+
+class SceneUnloaded(SceneError):
+    code = "scene_unloaded"
+
+
+class SceneInUse(SceneError):
+    code = "scene_in_use"
+
+
+class NoRoom(SceneError):
+    code = "no_room"
 
 
 class SceneNotReady(SceneError):

@@ -45,6 +45,11 @@ class Rasterizer(Protocol):
 
     name: str
 
+    @property
+    def nbytes(self) -> int:
+        """What it keeps of the scene in memory."""
+        ...
+
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         """Render several cameras; independent ones may use idle cores."""
         ...

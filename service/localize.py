@@ -31,6 +31,7 @@ from service.pose.gate import verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.scene_formats import load_scene
+from service.scene_formats.cache import mapped_scene
 from service.types import (
     GaussianScene,
     IterationRecord,
@@ -75,7 +76,8 @@ class LoadedScene:
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
         """Read a scene folder (or a bare scene file) and bind tools to it. Raises SceneError, UnknownName."""
-        return cls.of(load_scene(folder), cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
+        return cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
 
     @classmethod
     def of(
@@ -87,6 +89,11 @@ class LoadedScene:
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
         return cls(scene, RASTERIZERS.load(rasterizer).create(scene), MATCHERS.load(matcher).create(), cache_dir)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the scene and its renderer; a mapped scene's is the kernel's to take back."""
+        return self.scene.nbytes + self.rasterizer.nbytes
 
     def prepare(self, estimator: str) -> Any:
         """Return what the estimator prepares for this scene (e.g. its view index), made once."""

@@ -38,6 +38,7 @@ class FlatRasterizer(Rasterizer):
     """Every picture is mid-grey."""
 
     name = "flat"
+    nbytes = 1000
 
     def render(self, cameras):
         sizes = [(c.intrinsics.height, c.intrinsics.width) for c in cameras]

@@ -275,6 +275,7 @@ class FakeService:
             sh_degree=0,
             cameras=len(self.scene.cameras),
             memory_bytes=self.scene.nbytes,
+            jobs=0,
             error=None,
             links=SceneLinks(self="/", splats="/", thumbnail="/"),
             sha256=info.sha256,

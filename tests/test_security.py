@@ -399,5 +399,5 @@ def test_metrics_tell_what_happened(client, stepping):
     assert float(samples['splatfix_stage_seconds_count{estimator="stepping",stage="step"}']) == 1
     assert float(samples["splatfix_job_wait_seconds_count"]) == 1
     assert float(samples["splatfix_jobs_queued"]) == 0
-    assert float(samples['splatfix_scene_bytes{scene="room"}']) == make_scene().scene.nbytes
+    assert float(samples['splatfix_scene_bytes{scene="room"}']) == make_scene().nbytes
     assert "process_resident_memory_bytes" in samples

@@ -40,7 +40,7 @@ class Admission:
             await self._app(scope, receive, send)
             return
         path = scope["path"].removeprefix(scope.get("root_path", ""))
-        limit = self._size_limit(path)
+        limit = self._size_limit(scope["method"], path)
         try:
             self._check_rate(scope)
             _check_length(scope, limit)
@@ -52,16 +52,17 @@ class Admission:
             await problem_response(error, scope["path"])(scope, receive, send)
             return
         self._uploads += 1
-        body = _Body(receive, limit, self._settings.upload_s, self._release)
+        # A second for each megabyte that it may have: a slow line is no crime, a stalled one is.
+        body = _Body(receive, limit, self._settings.upload_s + limit / 1e6, self._release)
         try:
             await self._app(scope, body.receive, send)
         finally:
             body.end()
 
-    def _size_limit(self, path: str) -> int:
+    def _size_limit(self, method: str, path: str) -> int:
         if path in _WORK:
             return self._settings.max_upload_bytes * 4 // 3 + SMALL_BODY  # base64
-        return SMALL_BODY
+        return self._settings.max_scene_bytes if method == "PUT" and path.startswith("/scenes/") else SMALL_BODY
 
     def _check_rate(self, scope: Scope) -> None:
         client = client_of(scope)

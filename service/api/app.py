@@ -39,6 +39,7 @@ from service.api.scenes import Scenes
 from service.api.schemas import Problem, Record
 from service.api.settings import Settings
 from service.api.ui import add_pages
+from service.api.uploads import Uploads
 from service.api.viewer_child import ViewerChild
 from service.errors import InvalidRequest, StorageFailed
 from service.estimators import ESTIMATORS
@@ -58,7 +59,13 @@ def create_app(
     settings = settings or Settings()
     ESTIMATORS.load(settings.estimator)  # an unknown name shall be told now, not in each job
     if scenes is None:
-        known = Scenes(settings.scenes, settings.estimator, settings.cache_dir)
+        known = Scenes(
+            settings.scenes,
+            settings.estimator,
+            settings.cache_dir,
+            preload=settings.preload,
+            memory_bytes=settings.scene_memory_bytes,
+        )
     else:
         known = Scenes.of(scenes, settings.estimator)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
@@ -69,13 +76,15 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
             folder = stack.enter_context(data_folder(settings.data_dir))
+            uploads = Uploads(folder / "scenes", settings.max_scene_bytes)
+            known.add_uploaded(uploads.scenes())
             jobs = Jobs(settings, known, folder, metrics)
             stack.push_async_callback(to_thread.run_sync, jobs.close)
             await to_thread.run_sync(jobs.start)
             known.start()
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
-            app.state.parts = Parts(settings, known, jobs, keys, metrics, *limits)
+            app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
             _show(metrics, known, jobs)
             if viewer and relay:
                 stack.push_async_callback(relay.close)

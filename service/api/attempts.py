@@ -66,10 +66,11 @@ class Attempts:
         """Localize; None if it was stopped because the service ends."""
         desk = self._desk
         try:
-            loaded = desk.scenes.get(job.scene)
-            if live.query is None:
+            if live.loaded is None:
+                live.loaded = desk.scenes.acquire(job.scene)
+            loaded = live.loaded
+            if live.task is None or live.query is None:
                 live.task, live.query = desk.decoded(job, loaded)
-            assert live.task
             request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
             estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
             for timing in estimate.timings:

@@ -170,7 +170,8 @@ def _scene(entry: Entry, root: str) -> dict:
         "gaussians": scene and scene.count,
         "sh_degree": scene and scene.sh_degree,
         "cameras": len(scene.cameras) if scene else None,
-        "memory_bytes": scene and scene.nbytes,
+        "memory_bytes": entry.loaded.nbytes if entry.loaded else None,
+        "jobs": entry.jobs,
         "error": entry.error and problem_of(entry.error, self),
         "links": SceneLinks(self=self, splats=f"{self}/splats", thumbnail=f"{self}/thumbnail.jpg"),
     }

@@ -135,7 +135,7 @@ def needed_role(method: str, path: str) -> Role | None:
     """Return what a request needs; None: nothing."""
     if method in _SAFE and (path in _PUBLIC or path.startswith(_PUBLIC_FOLDERS)):
         return None
-    if method in _SAFE or path == "/tokens" or path.endswith("/render"):
+    if method in _SAFE or path == "/tokens" or (method == "POST" and path.endswith("/render")):
         return "read"
     return "localize" if path == "/localize" or path.startswith("/jobs/") else "admin"
 

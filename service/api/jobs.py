@@ -30,7 +30,6 @@ from service.api.settings import Settings
 from service.api.store import Ending, JobFilter, JobStore, NewJob, Retention, StoredJob
 from service.errors import Interrupted, JobNotReady, QueueFull, RecordNotFound, StorageFailed
 from service.images import encode_image
-from service.localize import LoadedScene
 from service.types import Query
 
 _HOUSEKEEPING_S = 2.0
@@ -89,31 +88,45 @@ class Jobs:
 
     # ------------------------------------------------------------------ from outside
 
-    def accept(self, order: Order, scene: LoadedScene) -> StoredJob:
+    def accept(self, order: Order) -> StoredJob:
         """Take a job; it is on disk when this returns.
 
-        Raises BadInput, QueueFull, IdempotencyConflict, StorageFailed.
+        Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed.
         """
         if known := self._store.repeated(order.client, order.idempotency_key, order.digest):
             return known
-        task, query = make_task(order.body, order.fields, scene, self._settings.estimator)
-        new = _new_job(order, scene.scene.info.id, task, query)
-        self._executor.reserve()
+        entry = self._scenes.entry(order.fields.scene)
+        loaded = self._scenes.acquire(entry.id)
         try:
-            self._photos.accept(new.id, order.body.photo)
-            job = self._store.accept(new)
-        except Exception as error:
-            self._executor.release()
-            self._photos.delete(new.id)
-            self._desk.note_storage(error)
+            task, query = make_task(order.body, order.fields, loaded, self._settings.estimator)
+            new = _new_job(order, entry.id, task, query)
+            job = self._stored(new, order.body.photo)
+        except BaseException:
+            self._scenes.release(loaded)
             raise
         if job.id != new.id:  # the same key came twice at once
-            self._executor.release()
-            self._photos.delete(new.id)
+            self._scenes.release(loaded)
             return job
-        live = self._live[job.id] = LiveJob(job.id, job.scene, task, query)
+        live = self._live[job.id] = LiveJob(job.id, job.scene, task, query, loaded)
         self._executor.submit(live)
         return job
+
+    def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
+        """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
+        self._executor.reserve()
+        taken = False
+        try:
+            self._photos.accept(new.id, photo)
+            job = self._store.accept(new)
+            taken = job.id == new.id
+            return job
+        except StorageFailed as error:
+            self._desk.note_storage(error)
+            raise
+        finally:
+            if not taken:
+                self._executor.release()
+                self._photos.delete(new.id)
 
     def get(self, job_id: str) -> StoredJob:
         """Raises JobNotFound."""

@@ -9,16 +9,26 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 
 from service.api.intake import Task
+from service.localize import LoadedScene
 from service.types import Query
 
 
 class LiveJob:
     """Changed by its worker's thread, read by any."""
 
-    def __init__(self, job_id: str, scene: str, task: Task | None = None, query: Query | None = None) -> None:
+    def __init__(
+        self,
+        job_id: str,
+        scene: str,
+        task: Task | None = None,
+        query: Query | None = None,
+        loaded: LoadedScene | None = None,
+    ) -> None:
         self.id, self.scene = job_id, scene
         self.task, self.query = task, query
         """The decoded request; None after a restart, when it is on disk only."""
+        self.loaded = loaded
+        """Held in memory for this job; None after a restart."""
         self.cancel = threading.Event()
         self.attempt = 0
         """0: not started."""

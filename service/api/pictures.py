@@ -8,7 +8,7 @@ import numpy as np
 
 from service.api.intake import checked_intrinsics, prior_from
 from service.api.requests import RenderIn
-from service.api.scenes import overview
+from service.api.warmup import overview
 from service.errors import InvalidIntrinsics
 from service.images import encode_image
 from service.localize import LoadedScene

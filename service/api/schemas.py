@@ -16,7 +16,7 @@ from service.types import Reason, Status
 
 Matrix = list[list[float]]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]
-SceneState = Literal["loading", "preparing", "ready", "failed"]
+SceneState = Literal["unloaded", "loading", "preparing", "ready", "unloading", "failed"]
 
 
 class Model(BaseModel):
@@ -311,6 +311,8 @@ class SceneSummary(Model):
     sh_degree: int | None
     cameras: int | None
     memory_bytes: int | None
+    jobs: int
+    """That use it, waiting or running."""
     error: Problem | None
     """Why it failed to load."""
     links: SceneLinks

@@ -40,6 +40,12 @@ class Settings(BaseSettings):
 
     scenes: list[Path] = []
     """Scene folders, scene files, or folders of scene folders. In the environment: a JSON list."""
+    preload: list[str] | None = None
+    """Scenes to load at start, by id; None: all. The others are loaded when they are asked for."""
+    scene_memory_bytes: int | None = Field(default=None, ge=1)
+    """What scenes may take; the one not asked for longest is dropped for another. None: no limit."""
+    max_scene_bytes: int = Field(default=2_000_000_000, ge=1)
+    """Of an uploaded scene; what an archive holds may be as large in all."""
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, lt=65536)
     """0: any free one."""

@@ -65,6 +65,10 @@ class CpuRasterizer:
         self._background = np.asarray(scene.info.background_rgb, np.float32)
         self._local = threading.local()
 
+    @property
+    def nbytes(self) -> int:
+        return self.packed.nbytes
+
     def refresh(self) -> None:
         """Take in the scene's values again, for a scene under training: its arrays are views of changing ones."""
         fill(self.packed, self.scene)

@@ -38,6 +38,10 @@ class Packed:
     spheres: Float32[np.ndarray, "blocks 4"]
 
     @property
+    def nbytes(self) -> int:
+        return self.order.nbytes + self.geometry.nbytes + self.sh.nbytes + self.spheres.nbytes
+
+    @property
     def chunks(self) -> int:
         return len(self.order) // LANES
 

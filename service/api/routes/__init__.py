@@ -10,6 +10,7 @@ GET    /jobs/{id}/trace                       all records
 GET    /jobs/{id}/iterations/{k}/render.jpg   record k's pose (or `last`), photo's size
 GET    /jobs/{id}/export/{format}             the pose as COLMAP, nerfstudio, TUM or GeoPose have it
 GET    /scenes                                GET /scenes/{id}
+PUT    /scenes/{id}                           upload; POST .../load, .../unload; DELETE
 GET    /scenes/{id}/splats?max=N              binary, see `service/api/splats.py`
 POST   /scenes/{id}/render                    a picture or depth from any pose
 POST   /tokens                                short-lived, for pages

@@ -80,10 +80,9 @@ async def localize_photo(
     """Find where a photo was taken. What is wrong with the request is told at once; the search is a job."""
     body = await read_body(request)
     fields = read_fields(body.fields)
-    scene = parts.scenes.get(fields.scene)
     digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
     order = Order(body, fields, client_of(request.scope), idempotency_key, digest)
-    job = await to_thread.run_sync(parts.jobs.accept, order, scene, limiter=parts.decoding)
+    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
     wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
     if wait_s:
         if live := parts.jobs.live(job.id):

@@ -15,6 +15,7 @@ from service.api.problems import MEDIA_TYPE
 from service.api.scenes import Scenes
 from service.api.settings import Settings
 from service.api.store import StoredJob
+from service.api.uploads import Uploads
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +25,7 @@ class Parts:
     settings: Settings
     scenes: Scenes
     jobs: Jobs
+    uploads: Uploads
     keys: KeyRing
     metrics: Metrics
     decoding: anyio.CapacityLimiter
@@ -67,7 +69,7 @@ MEANINGS = {
     403: "The key's role doesn't allow it, or another site's page asks",
     400: "The request can't be understood",
     404: "There is no such thing",
-    409: "Not yet, or there is nothing to give",
+    409: "Not yet, not any more, or there is nothing to give",
     408: "The body took too long",
     429: "Too many requests of yours; see Retry-After",
     413: "The body is too large",

@@ -6,13 +6,14 @@ from functools import partial
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Query, Request, Response
 
 from service.api import documents, splats
 from service.api.pictures import PICTURE_TYPES, picture, thumbnail
 from service.api.requests import RenderIn
 from service.api.routes.parts import JPEG, PartsOf, RootOf, errors
-from service.api.schemas import SceneList, SceneOut
+from service.api.schemas import SceneList, SceneOut, SceneSummary
+from service.errors import SceneExists, SceneInUse
 
 MAX_SPLATS = 2_000_000
 
@@ -29,6 +30,64 @@ async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Describe a scene, with its training cameras."""
     return documents.scene_document(parts.scenes.entry(scene_id), root)
+
+
+@router.put(
+    "/scenes/{scene_id}",
+    status_code=201,
+    tags=["scenes"],
+    responses=errors(400, 408, 409, 413, 422, 503),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def upload_scene(
+    scene_id: str,
+    request: Request,
+    parts: PartsOf,
+    root: RootOf,
+    file: Annotated[
+        str, Query(description="The file's name, for its suffix: `scene.ply`, `scene.splat`.")
+    ] = "scene.ply",
+) -> SceneOut:
+    """Add a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, then loaded."""
+    if any(entry.id == scene_id for entry in parts.scenes.entries()):
+        raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+    path = await parts.uploads.receive(scene_id, file, request.stream())
+    entry = parts.scenes.add(scene_id, path, uploaded=True)
+    parts.scenes.load(entry)
+    return documents.scene_document(entry, root)
+
+
+@router.post("/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors(404))
+def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+    """Load a scene into memory, and make it ready; again, if that failed before."""
+    entry = parts.scenes.entry(scene_id)
+    parts.scenes.load(entry)
+    return documents.scene_summary(entry, root)
+
+
+@router.post("/scenes/{scene_id}/unload", status_code=202, tags=["scenes"], responses=errors(404, 422))
+def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+    """Drop a scene from memory when the last job on it has ended; it takes no more, until it is loaded again."""
+    entry = parts.scenes.entry(scene_id)
+    parts.scenes.unload(entry)
+    return documents.scene_summary(entry, root)
+
+
+@router.delete("/scenes/{scene_id}", status_code=204, tags=["scenes"], responses=errors(404, 409))
+def delete_scene(scene_id: str, parts: PartsOf) -> None:
+    """Delete an uploaded scene with its files; not one that the operator named, nor one that jobs use."""
+    entry = parts.scenes.entry(scene_id)
+    if not entry.uploaded or entry.path is None:
+        raise SceneInUse("the operator named this scene; it can only be unloaded.", where="scene")
+    if entry.jobs:
+        raise SceneInUse(f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
+    parts.scenes.remove(entry)
+    parts.uploads.delete(entry.path)
 
 
 @router.get(

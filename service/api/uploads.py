@@ -1,0 +1,145 @@
+"""Scenes that come over HTTP: streamed to disk, checked, and only then given a name that others see.
+
+An archive is a ZIP of a scene folder (or of what is in it). Only files that a scene is read from are taken out of it,
+under their own names; what the archive says of paths, links and sizes is not trusted.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import zipfile
+from collections.abc import AsyncIterator
+from pathlib import Path, PurePosixPath
+from typing import IO
+
+from anyio import to_thread
+
+from service.errors import CorruptScene, InvalidRequest, SceneExists, StorageFailed, UnsupportedFormat
+from service.scene_formats import load_scene
+from service.scene_formats.folder import COLMAP_FOLDER, SCENE_SUFFIXES
+from service.scene_formats.manifest import MANIFEST
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+_MAX_MEMBERS = 20_000
+_COPY_BYTES = 1 << 20
+
+
+class Uploads:
+    """One folder of scenes; `.incoming` in it holds what is not checked yet."""
+
+    def __init__(self, folder: Path, max_bytes: int) -> None:
+        self._folder, self._max_bytes = folder, max_bytes
+        self._incoming = folder / ".incoming"
+        shutil.rmtree(self._incoming, ignore_errors=True)  # of an ended process
+        self._incoming.mkdir(parents=True, exist_ok=True)
+
+    def scenes(self) -> list[Path]:
+        """Return the scenes that were uploaded before."""
+        return sorted(p for p in self._folder.iterdir() if p.is_dir() and _NAME.fullmatch(p.name))
+
+    async def receive(self, scene_id: str, file_name: str, body: AsyncIterator[bytes]) -> Path:
+        """Store a scene file, or an archive of a scene folder. Raises InvalidRequest, SceneError, StorageFailed."""
+        check_scene_id(scene_id)
+        if (self._folder / scene_id).exists():
+            raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+        draft = self._incoming / f"{scene_id}.{os.urandom(4).hex()}"
+        try:
+            draft.mkdir()
+            await self._written(draft / "upload", body)
+            await to_thread.run_sync(self._check, draft, file_name)
+            target = self._folder / scene_id
+            await to_thread.run_sync(draft.rename, target)
+        except OSError as error:
+            raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
+        finally:
+            await to_thread.run_sync(lambda: shutil.rmtree(draft, ignore_errors=True))
+        return target
+
+    def delete(self, path: Path) -> None:
+        """Delete an uploaded scene. Raises StorageFailed."""
+        try:
+            shutil.rmtree(path)
+        except OSError as error:
+            raise StorageFailed(f"the service can't delete the scene: {error.strerror}.") from error
+
+    async def _written(self, path: Path, body: AsyncIterator[bytes]) -> None:
+        with path.open("wb") as file:
+            async for chunk in body:
+                await to_thread.run_sync(file.write, chunk)
+            await to_thread.run_sync(lambda: os.fsync(file.fileno()))
+
+    def _check(self, draft: Path, file_name: str) -> None:
+        """Make a scene folder of what was sent, and read it once."""
+        upload = draft / "upload"
+        if zipfile.is_zipfile(upload):
+            self._unpack(upload, draft)
+            upload.unlink()
+            if not any(draft.iterdir()):
+                raise UnsupportedFormat("the archive holds no scene.", where="archive")
+        else:
+            suffix = Path(file_name).suffix.lower()
+            if suffix not in SCENE_SUFFIXES:
+                raise InvalidRequest(
+                    "say what kind of file it is: `scene.ply` or `scene.splat`, or send a ZIP.", where="query.file"
+                )
+            upload.rename(draft / f"scene{suffix}")
+        load_scene(draft)
+
+    def _unpack(self, archive: Path, folder: Path) -> None:
+        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat."""
+        left = self._max_bytes
+        try:
+            with zipfile.ZipFile(archive) as opened:
+                members = [m for m in opened.infolist() if not m.is_dir()]
+                if len(members) > _MAX_MEMBERS:
+                    raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
+                top = _common_top([m.filename for m in members])
+                for member in members:
+                    name = _wanted(PurePosixPath(member.filename).relative_to(top))
+                    if name is not None:
+                        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                        with opened.open(member) as source, (folder / name).open("xb") as target:
+                            left = _copied(source, target, left)
+        except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
+            raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
+        except FileExistsError as error:
+            raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+
+
+def check_scene_id(scene_id: str) -> None:
+    """Raises InvalidRequest unless it can be the name of a folder anywhere."""
+    if not _NAME.fullmatch(scene_id):
+        raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
+
+
+def _common_top(names: list[str]) -> PurePosixPath:
+    """Return the folder that all files are in, if there is one: many pack the folder, others what is in it."""
+    tops = {PurePosixPath(name).parts[:1] for name in names}
+    nested = all(len(PurePosixPath(name).parts) > 1 for name in names)
+    if len(tops) == 1 and nested and tops != {COLMAP_FOLDER.parts[:1]}:
+        return PurePosixPath(*tops.pop())
+    return PurePosixPath()
+
+
+def _wanted(path: PurePosixPath) -> str | None:
+    """Return under what name a member is stored, None for what a scene isn't read from."""
+    name = path.name
+    if path.parts == (name,) and (
+        Path(name).suffix.lower() in SCENE_SUFFIXES or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
+    ):
+        return name if re.fullmatch(r"[\w. -]{1,200}", name) else None
+    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"\w+\.(bin|txt)", name):
+        return str(path)
+    return None
+
+
+def _copied(source: IO[bytes], target: IO[bytes], left: int) -> int:
+    """Copy at most `left` bytes; return how many more there may be. Raises CorruptScene."""
+    while chunk := source.read(_COPY_BYTES):
+        left -= len(chunk)
+        if left < 0:
+            raise CorruptScene("the archive holds more than the service takes.", where="archive")
+        target.write(chunk)
+    return left

@@ -1,0 +1,38 @@
+"""A first localization, and the camera for it: one that shows what a scene is."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from service.geometry import look_at
+from service.localize import LoadedScene, Request, localize
+from service.types import Camera, Intrinsics, Query
+
+_log = logging.getLogger(__name__)
+
+
+def warm_up(loaded: LoadedScene, estimator: str) -> None:
+    """Localize a render of the scene, so that the first photo meets compiled code and loaded networks."""
+    camera = overview(loaded, 512)
+    frame = loaded.rasterizer.render([camera])[0]
+    rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
+    estimate = localize(Query(rgb, camera.intrinsics, "given", camera.intrinsics), loaded, Request(estimator))
+    _log.info("scene %s: warmed up, %s", loaded.scene.info.id, estimate.verdict.status)
+
+
+def overview(loaded: LoadedScene, long_side: int) -> Camera:
+    """Return a camera that shows what the scene is: a training camera, else one outside."""
+    cameras = loaded.scene.cameras
+    camera = cameras[len(cameras) // 2].camera if cameras else _outside(loaded)
+    return Camera(camera.intrinsics.with_long_side(long_side), camera.pose)
+
+
+def _outside(loaded: LoadedScene) -> Camera:
+    """A camera that looks at the middle of the Gaussians from outside."""
+    means = loaded.scene.means
+    centre = np.median(means, 0)
+    radius = float(np.median(np.linalg.norm(means - centre, axis=1))) or 1.0
+    pose = look_at(centre + radius * np.array([0.0, 0.0, 3.0]), centre, np.array([0.0, 1.0, 0.0]))
+    return Camera(Intrinsics(512, 384, 450.0, 450.0, 256.0, 192.0), pose)

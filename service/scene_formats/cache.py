@@ -1,0 +1,103 @@
+"""A scene in the form it has in memory, as files that are mapped: opening one takes milliseconds, whatever its size.
+
+    CACHE/scenes/KEY/  means.npy quats.npy scales.npy opacities.npy sh.npy  scene.json (all else)
+
+The key is made of the names, sizes and times of change of the scene's own files, so that nothing of them is read.
+Files written by `numpy.save` and opened without pickle; a damaged or older one is made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.scene_formats.folder import load_scene
+from service.types import Camera, GaussianScene, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
+
+_VERSION = 1
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh")
+_log = logging.getLogger(__name__)
+
+
+def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
+    """Read a scene folder or file as `load_scene` does, or map what an earlier call has left. Raises SceneError."""
+    if not path.exists():
+        return load_scene(path)
+    folder = cache_dir / "scenes" / _key(path)
+    try:
+        return _opened(folder)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        _log.warning("%s is made anew: %s", folder, error)
+        shutil.rmtree(folder, ignore_errors=True)
+    scene = load_scene(path)
+    try:
+        _write(folder, scene)
+    except OSError as error:  # a full disk: the scene is there all the same
+        _log.warning("the scene is not kept for the next start: %s", error)
+    return scene
+
+
+def _key(path: Path) -> str:
+    """Of everything that `load_scene` may read."""
+    files = [path] if path.is_file() else [*path.iterdir(), *(path / "sparse" / "0").glob("*")]
+    stamps = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(files) if f.is_file()]
+    return hashlib.sha256(repr((_VERSION, str(path.resolve()), stamps)).encode()).hexdigest()[:32]
+
+
+def _opened(folder: Path) -> GaussianScene:
+    facts = json.loads((folder / "scene.json").read_text("utf-8"))
+    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
+    cameras = tuple(_camera(camera) for camera in facts["cameras"])
+    scene = GaussianScene(**arrays, info=_info(facts["info"]), cameras=cameras)
+    if len({len(array) for array in arrays.values()}) != 1:
+        raise ValueError("arrays of different lengths")
+    return scene
+
+
+def _write(folder: Path, scene: GaussianScene) -> None:
+    draft = folder.with_name(f"{folder.name}.{os.getpid()}")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    try:
+        for name in _ARRAYS:
+            np.save(draft / f"{name}.npy", getattr(scene, name), allow_pickle=False)
+        info = asdict(replace(scene.info, geo_anchor=None))
+        anchor = scene.info.geo_anchor
+        info["geo_anchor"] = anchor and asdict(anchor) | {"enu_from_world": anchor.enu_from_world.tolist()}
+        cameras = [
+            {
+                "name": named.name,
+                "intrinsics": asdict(named.camera.intrinsics),
+                "world_from_camera": named.camera.pose.world_from_camera.tolist(),
+            }
+            for named in scene.cameras
+        ]
+        (draft / "scene.json").write_text(json.dumps({"info": info, "cameras": cameras}), "utf-8")
+        draft.replace(folder)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _camera(facts: dict[str, Any]) -> NamedCamera:
+    intrinsics = facts["intrinsics"] | {"distortion": tuple(facts["intrinsics"]["distortion"])}
+    pose = Pose(np.array(facts["world_from_camera"], np.float64))
+    return NamedCamera(facts["name"], Camera(Intrinsics(**intrinsics), pose))
+
+
+def _info(facts: dict[str, Any]) -> SceneInfo:
+    for name in ("background_rgb", "up_in_world", "warnings"):
+        facts[name] = facts[name] if facts[name] is None else tuple(facts[name])
+    anchor = facts["geo_anchor"]
+    if anchor:
+        facts["geo_anchor"] = GeoAnchor(**anchor | {"enu_from_world": np.array(anchor["enu_from_world"])})
+    return SceneInfo(**facts)

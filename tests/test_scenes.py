@@ -1,0 +1,291 @@
+"""Scenes at run time: loaded, dropped, uploaded; and the files that make a second start quick."""
+
+from __future__ import annotations
+
+import io
+import json
+import threading
+import zipfile
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from api_server import assert_problem, finished, make_scene, post, serving, settings, until
+
+from service.api.app import create_app
+from service.api.warmup import overview
+from service.localize import LoadedScene
+from service.scene_formats import load_scene
+from service.scene_formats.cache import mapped_scene
+from service.types import GaussianScene, GeoAnchor
+
+
+def write_ply(path: Path, scene: GaussianScene) -> None:
+    """As a trainer writes it: values before activation."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)]
+    opacity = np.clip(scene.opacities, 0.01, 0.99)
+    columns = [scene.means, scene.sh[:, 0], np.log(opacity / (1 - opacity))[:, None], np.log(scene.scales), scene.quats]
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {scene.count}\n"
+    head += "".join(f"property float {name}\n" for name in names) + "end_header\n"
+    path.write_bytes(head.encode() + np.concatenate(columns, 1).astype("<f4").tobytes())
+
+
+def ply(count: int = 50) -> bytes:
+    file = Path("/dev/shm" if Path("/dev/shm").is_dir() else "/tmp") / f"splatfix-{threading.get_ident()}.ply"
+    try:
+        write_ply(file, make_scene(count=count).scene)
+        return file.read_bytes()
+    finally:
+        file.unlink()
+
+
+TRANSFORMS = {
+    **{"camera_model": "OPENCV", "fl_x": 80, "fl_y": 80, "cx": 48, "cy": 32, "w": 96, "h": 64},
+    "frames": [{"file_path": "a.png", "transform_matrix": np.eye(4).tolist()}],
+}
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """Three scenes."""
+    for name in ("attic", "cellar", "hall"):
+        (tmp_path / "scenes" / name).mkdir(parents=True)
+        (tmp_path / "scenes" / name / "scene.ply").write_bytes(ply())
+        (tmp_path / "scenes" / name / "transforms.json").write_text(json.dumps(TRANSFORMS))
+    return tmp_path / "scenes"
+
+
+def service_on(folder: Path, **changes):
+    return serving(create_app(settings(scenes=[folder], cache_dir=folder.parent / "cache", **changes)))
+
+
+def states(client: httpx.Client) -> dict[str, str]:
+    return {scene["id"]: scene["state"] for scene in client.get("/scenes").json()["scenes"]}
+
+
+def ready(client: httpx.Client) -> None:
+    until(lambda: client.get("/readyz").status_code == 200)
+
+
+# ------------------------------------------------------------------ in and out of memory
+
+
+def test_only_what_is_preloaded_is_awaited_and_the_rest_comes_when_asked_for(stepping, folder):
+    with service_on(folder, preload=["hall"]) as client:
+        ready(client)
+        assert states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready"}
+        refused = post(client, scene="attic")
+        assert_problem(refused, 503, "scene_not_ready", "scene")
+        assert refused.headers["retry-after"]
+        until(lambda: states(client)["attic"] == "ready")
+        assert post(client, scene="attic").json()["state"] == "succeeded"
+
+
+def test_an_unknown_scene_to_preload_stops_the_start(folder):
+    with pytest.raises(Exception, match="to preload"):
+        create_app(settings(scenes=[folder], preload=["roof"]))
+
+
+def test_the_scene_not_asked_for_longest_makes_room(stepping, folder):
+    size = LoadedScene.load(folder / "attic").nbytes
+    with service_on(folder, preload=["attic", "cellar"], scene_memory_bytes=int(2.5 * size)) as client:
+        ready(client)
+        assert post(client, scene="attic").json()["state"] == "succeeded"  # cellar is now the older one
+        post(client, scene="hall")
+        until(lambda: states(client) == {"attic": "ready", "cellar": "unloaded", "hall": "ready"})
+        told = {s["id"]: s["memory_bytes"] for s in client.get("/scenes").json()["scenes"]}
+        assert told == {"attic": size, "cellar": None, "hall": size}
+
+
+def test_a_scene_in_use_is_not_dropped_for_another(stepping, folder):
+    size = LoadedScene.load(folder / "attic").nbytes
+    with service_on(folder, preload=["attic"], scene_memory_bytes=int(1.5 * size)) as client:
+        ready(client)
+        held = post(client, prefer="", scene="attic", options={"hold": True}).headers["location"]
+        post(client, scene="hall")
+        until(lambda: states(client)["hall"] == "failed")
+        assert_problem(post(client, scene="hall"), 503, "no_room", "scene")
+        stepping.GO_ON.set()
+        finished(client, held)
+        assert client.post("/scenes/hall/load").status_code == 202
+        until(lambda: states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready"})
+
+
+def test_unloading_waits_for_the_jobs_and_lets_no_new_one_in(stepping, folder):
+    with service_on(folder, preload=["attic"]) as client:
+        ready(client)
+        held = [post(client, prefer="", scene="attic", options={"hold": True}).headers["location"] for _ in range(2)]
+        answer = client.post("/scenes/attic/unload")
+        assert (answer.status_code, answer.json()["state"], answer.json()["jobs"]) == (202, "unloading", 2)
+        assert_problem(post(client, scene="attic"), 409, "scene_unloaded", "scene")
+        stepping.GO_ON.set()
+        assert [finished(client, path)["state"] for path in held] == ["succeeded"] * 2
+        until(lambda: states(client)["attic"] == "unloaded")
+        assert_problem(post(client, scene="attic"), 409, "scene_unloaded")
+        assert client.post("/scenes/attic/load").json()["state"] == "loading"
+        until(lambda: states(client)["attic"] == "ready")
+        assert post(client, scene="attic").json()["state"] == "succeeded"
+
+
+def test_a_scene_without_a_file_cannot_be_unloaded(shared):
+    assert_problem(shared.post("/scenes/room/unload"), 422, "bad_input", "scene")
+    assert_problem(shared.delete("/scenes/room"), 409, "scene_in_use", "scene")
+    assert_problem(shared.post("/scenes/none/load"), 404, "scene_not_found")
+
+
+def test_a_restart_brings_back_a_scene_that_a_waiting_job_needs(stepping, folder, tmp_path):
+    import shutil
+
+    with service_on(folder, preload=["attic"], data_dir=tmp_path / "first") as client:
+        ready(client)
+        path = post(client, prefer="", scene="attic", options={"hold": True}).headers["location"]
+        until(lambda: client.get(path).json()["records"] == 1)
+        shutil.copytree(tmp_path / "first", tmp_path / "copy")
+        stepping.GO_ON.set()
+    with service_on(folder, preload=["hall"], data_dir=tmp_path / "copy") as client:
+        assert finished(client, path)["state"] == "succeeded"
+        assert states(client)["attic"] == "ready"
+
+
+# ------------------------------------------------------------------ uploads
+
+
+def archive(**files: bytes | str) -> bytes:
+    """A ZIP; `__` in a name stands for a slash, `_dot_` for a dot."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as opened:
+        for name, content in files.items():
+            opened.writestr(name.replace("__", "/").replace("_dot_", "."), content)
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def uploading(stepping, tmp_path):
+    with serving(create_app(settings(data_dir=tmp_path / "data"), {"room": make_scene()})) as client:
+        ready(client)
+        yield client, tmp_path / "data" / "scenes"
+
+
+def test_an_uploaded_scene_is_used_kept_and_deleted(uploading, stepping, tmp_path):
+    client, stored = uploading
+    packed = archive(
+        house__scene_dot_ply=ply(), house__transforms_dot_json=json.dumps(TRANSFORMS), house__notes_dot_txt="x"
+    )
+    made = client.put("/scenes/house", content=packed)
+    assert made.status_code == 201
+    until(lambda: states(client)["house"] == "ready")
+    assert sorted(p.name for p in (stored / "house").iterdir()) == ["scene.ply", "transforms.json"]
+    held = post(client, prefer="", scene="house", options={"hold": True}).headers["location"]
+    assert_problem(client.delete("/scenes/house"), 409, "scene_in_use", "scene")
+    stepping.GO_ON.set()
+    assert finished(client, held)["state"] == "succeeded"
+    assert_problem(client.put("/scenes/house", content=packed), 409, "scene_exists", "scene")
+    assert client.delete("/scenes/house").status_code == 204
+    assert not (stored / "house").exists()
+    assert client.put("/scenes/house", content=ply()).status_code == 201
+
+
+def test_uploaded_scenes_are_there_after_a_restart(stepping, tmp_path):
+    for _ in range(2):
+        with serving(create_app(settings(data_dir=tmp_path), {"room": make_scene()})) as client:
+            if "house" not in states(client):
+                assert client.put("/scenes/house", content=ply()).status_code == 201
+    assert (tmp_path / "scenes" / "house" / "scene.ply").exists()
+
+
+BOMB = archive(scene_dot_ply=b"ply\n" + b"0" * 5_000_000)
+
+
+@pytest.mark.parametrize(
+    ("content", "query", "status", "code"),
+    [
+        (b"?", "", 422, "unsupported_format"),
+        (b"", "", 422, "corrupt_scene"),
+        (b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "", 422, "corrupt_scene"),
+        (b"x", "?file=scene.exe", 400, "invalid_request"),
+        (b"x", "?file=../../evil", 400, "invalid_request"),
+        (archive(readme_dot_txt="x"), "", 422, "unsupported_format"),
+        (archive(scene_dot_ply=b"ply"), "", 422, "corrupt_scene"),
+        (archive(a_dot_ply=b"ply", b_dot_ply=b"ply"), "", 422, "corrupt_scene"),
+        (BOMB, "", 422, "corrupt_scene"),
+        (BOMB[:-30], "", 422, "unsupported_format"),
+    ],
+)  # fmt: skip
+def test_what_is_no_scene_leaves_nothing(stepping, tmp_path, content, query, status, code):
+    data = tmp_path / "data"
+    app = create_app(settings(data_dir=data, max_scene_bytes=1_000_000), {"room": make_scene()})
+    with serving(app) as client:
+        assert_problem(client.put(f"/scenes/house{query}", content=content), status, code)
+        assert list(states(client)) == ["room"]
+        assert [p.name for p in (data / "scenes").iterdir()] == [".incoming"]
+        assert not list((data / "scenes" / ".incoming").iterdir())
+
+
+@pytest.mark.parametrize("name", ["..", ".incoming", "a.b", "-x", "a%2Fb", "%2e%2e", "x" * 65, "a b", "é"])
+def test_a_scenes_name_cannot_leave_the_folder(uploading, name):
+    client, stored = uploading
+    before = sorted(stored.parent.rglob("*"))
+    assert client.put(f"/scenes/{name}", content=ply()).status_code in (400, 404, 405)
+    assert sorted(stored.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize("name", ["../evil.ply", "/evil.ply", "a/../../evil.ply", "sparse/0/../../../evil.bin"])
+def test_an_archives_names_cannot_leave_the_folder(uploading, name):
+    client, stored = uploading
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as opened:
+        opened.writestr("scene.ply", ply())
+        opened.writestr(name, b"evil")
+    client.put("/scenes/house", content=buffer.getvalue())
+    assert not [p for p in stored.parent.rglob("*") if p.name.startswith("evil")]
+    assert not (stored.parent.parent / "evil.ply").exists()
+
+
+# ------------------------------------------------------------------ mapped files
+
+
+def test_a_second_load_maps_the_same_scene(folder, tmp_path):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    manifest = {
+        "up": [0, 0, 1],
+        "geo_anchor": {"latitude": 1, "longitude": 2, "height": 3, "enu_from_world": np.eye(4).tolist()},
+    }
+    (path / "scene.json").write_text(json.dumps(manifest))
+    read, first, second = load_scene(path), mapped_scene(path, cache), mapped_scene(path, cache)
+    assert isinstance(second.means.base, np.memmap)
+    for scene in (first, second):
+        for name in ("means", "quats", "scales", "opacities", "sh"):
+            assert np.array_equal(getattr(scene, name), getattr(read, name))
+        assert isinstance(scene.info.geo_anchor, GeoAnchor)
+        assert np.array_equal(scene.info.geo_anchor.enu_from_world, np.eye(4))
+        assert (scene.info.sha256, scene.info.up_in_world) == (read.info.sha256, read.info.up_in_world)
+        assert scene.cameras[0].name == read.cameras[0].name
+        assert np.array_equal(
+            scene.cameras[0].camera.pose.world_from_camera, read.cameras[0].camera.pose.world_from_camera
+        )
+    # It is rendered as the one that was read.
+    pictures = [
+        loaded.rasterizer.render([overview(loaded, 64)])[0].rgb for loaded in map(LoadedScene.of, (read, second))
+    ]
+    assert np.array_equal(*pictures)
+
+
+def test_a_changed_or_damaged_scene_is_read_anew(folder, tmp_path):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    mapped_scene(path, cache)
+    (kept,) = (cache / "scenes").iterdir()
+    (kept / "sh.npy").write_bytes(b"\x93NUMPY garbage")
+    assert mapped_scene(path, cache).count == 50
+    assert mapped_scene(path, cache).sh.shape == (50, 1, 3)
+    (path / "scene.ply").write_bytes(ply(60))
+    assert mapped_scene(path, cache).count == 60
+
+
+def test_a_mapped_file_is_never_unpickled(folder, tmp_path):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    mapped_scene(path, cache)
+    (kept,) = (cache / "scenes").iterdir()
+    np.save(kept / "sh.npy", np.array([{"evil": 1}], dtype=object), allow_pickle=True)
+    assert mapped_scene(path, cache).sh.shape == (50, 1, 3)
