@@ -19,6 +19,10 @@ class Counted:
         self.name = inner.name
         self.inner, self.tally = inner, tally
 
+    @property
+    def nbytes(self) -> int:
+        return self.inner.nbytes
+
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         self.tally.count += len(cameras)
         return self.inner.render(cameras)
