@@ -22,7 +22,7 @@ from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
 from service.types import Reason, Status
-from viewer import app, draw, shapes
+from viewer import app, draw, private, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble
 from viewer.feed import JobFeed
@@ -331,7 +331,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
     other: Any = object.__new__(viser.ViserServer)
     other._websock_server, other.stop = SimpleNamespace(_handlers={}), stopped.set
     with pytest.raises(RuntimeError, match="tunnel"):
-        app.forbid_sharing(other)
+        private.forbid_sharing(other)
     assert stopped.is_set()
 
 
@@ -350,7 +350,7 @@ def test_only_plain_ids_are_taken_from_an_address(path: str, job: str | None) ->
 
 
 def test_a_path_that_cannot_be_told_means_the_newest_job(viewer: Viewer) -> None:
-    assert app.requested_path(viewer.server, 12345) == "/"
+    assert private.requested_path(viewer.server, 12345) == "/"
 
 
 def test_a_picture_that_cannot_be_had_is_told_and_the_rest_goes_on(

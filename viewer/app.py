@@ -1,4 +1,4 @@
-"""The viewer's server: one session per browser. The only file that touches viser's private parts."""
+"""The viewer's server: one session per browser."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import threading
 import time
 
 import viser
-from viser import _messages
 
 from viewer.client import Service
 from viewer.feed import Library
+from viewer.private import disconnect_all, forbid_sharing, requested_path
 from viewer.session import Session
 
 log = logging.getLogger(__name__)
@@ -45,8 +45,7 @@ class Viewer:
         for session in sessions:
             session.close()
         self._library.close()
-        # viser's own stop() leaves the closing of connections to callbacks that it has just switched off.
-        self.server._websock_server.disconnect_all_clients()
+        disconnect_all(self.server)
         deadline = time.monotonic() + 1.0
         while self.server.get_clients() and time.monotonic() < deadline:
             time.sleep(0.01)
@@ -69,23 +68,3 @@ def job_of(path: str) -> str | None:
     """Return the job that an address asks for; None: whichever is the newest."""
     match = _JOB_PATH.fullmatch(path.partition("?")[0])
     return match.group(1) if match else None
-
-
-def requested_path(server: viser.ViserServer, client_id: int) -> str:
-    """Return the path of a browser's websocket, which viser 1.1 keeps private; "/" where it can't be told."""
-    try:
-        return server._websock_server._live_connections[client_id].request.path  # type: ignore[union-attr]
-    except (AttributeError, KeyError):
-        log.warning("viser does not tell the path of client %s; it is shown the newest job", client_id)
-        return "/"
-
-
-def forbid_sharing(server: viser.ViserServer) -> None:
-    """Take away viser's handler by which any browser could open a public tunnel to this server.
-
-    Raises RuntimeError if it isn't where it was in viser 1.1: better no viewer than an open one.
-    """
-    handlers = getattr(server._websock_server, "_incoming_handlers", {})
-    if handlers.pop(_messages.ShareUrlRequest, None) is None:
-        server.stop()
-        raise RuntimeError("this version of viser may open public tunnels: its handler was not found")

@@ -14,6 +14,7 @@ NO_JOB: str = "no job yet"
 NO_SCENE: str = "no scene yet"
 _PANEL_WIDTH_PX = 340
 _WINDOW_WIDTH_PX = 420
+_REPLAY_HINT = "One HTML file that plays this job from disk, without a service."
 _SPEEDS = ("1", "2", "5", "10", "20")
 
 
@@ -35,6 +36,7 @@ class Panel:
         self.numbers = gui.add_html("")
         self.look_through = gui.add_button("look through this camera", disabled=True)
         self.fly = gui.add_button("fly to result", disabled=True)
+        self.replay = gui.add_button("save as replay file", disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
             self.layers = {layer: gui.add_checkbox(layer, True) for layer in get_args(Layer)}
             self.exact = gui.add_checkbox(

@@ -24,6 +24,7 @@ from viewer.exact import ExactView
 from viewer.feed import JobFeed, Library
 from viewer.panel import NO_JOB, NO_SCENE, Panel
 from viewer.playback import Playback, headline_html, job_label, scene_html
+from viewer.replay import replay_html
 from viewer.stage import Stage
 
 log = logging.getLogger(__name__)
@@ -50,6 +51,7 @@ class Session:
         self._playback = Playback()
         self._detail = Detail(self.panel, self.stage)
         self._exact = ExactView(client, library.service, self._show_exact)
+        self._saving = False
         self._opened = 0.0
         self._asked_step = 0
         self._todo: list[Action] = []
@@ -126,6 +128,7 @@ class Session:
         panel.mode.on_click(lambda event: self.post(lambda mode=event.target.value: self._set_mode(mode)))
         panel.look_through.on_click(lambda _: self.post(self._look_through))
         panel.fly.on_click(lambda _: self.post(self._fly))
+        panel.replay.on_click(lambda _: self.post(self._save_replay))
         self._client.scene.on_click()(
             lambda event: self.post(lambda: self._clicked(event.ray_origin, event.ray_direction))
         )
@@ -212,6 +215,7 @@ class Session:
         panel = self.panel
         panel.step.max = max(0, count - 1)
         panel.step.disabled = panel.look_through.disabled = panel.fly.disabled = count == 0
+        panel.replay.disabled = count == 0 or self._saving
         panel.window.visible = panel.window.visible and count > 0
 
     def _show_scene(self, scene_id: str | None, pose: Pose | None) -> None:
@@ -303,3 +307,27 @@ class Session:
             self._playback.playing = False
             self._playback.go(target)
             self._show()
+
+    def _save_replay(self) -> None:
+        """Make the replay file on a thread of its own, and send it."""
+        feed, scene_id = self._feed, self._scene_id
+        if feed is None or scene_id is None or self._saving:
+            return
+        content = self._library.scene(scene_id)
+        self._saving = self.panel.replay.disabled = True
+        self.panel.replay.label = "making the replay file…"
+
+        def make() -> None:
+            try:
+                page = replay_html(feed, content).encode()
+                self._client.send_file_download(f"splatfix-{feed.id}.html", page)
+            except Exception as error:  # whatever it is, the user shall hear of it
+                log.warning("no replay of job %s: %s", feed.id, error)
+                self._client.add_notification("No replay file", str(error), color="red")
+            self.post(self._replay_done)
+
+        threading.Thread(target=make, name=f"replay-{self._client.client_id}", daemon=True).start()
+
+    def _replay_done(self) -> None:
+        self._saving = self.panel.replay.disabled = False
+        self.panel.replay.label = "save as replay file"

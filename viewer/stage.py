@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Literal, get_args
+from contextlib import AbstractContextManager
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 import viser
@@ -32,10 +33,20 @@ _FRUSTA = 24
 _FLIGHT_S, _FRAME_S = 0.8, 1 / 30
 
 
+class Canvas(Protocol):
+    """What is drawn on: a browser, or a recording."""
+
+    scene: viser.SceneApi
+    camera: Any
+
+    def atomic(self) -> AbstractContextManager[None]: ...
+    def flush(self) -> None: ...
+
+
 class Stage:
     """What one browser sees. All methods are called from one thread."""
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    def __init__(self, client: Canvas) -> None:
         self._client = client
         self._scene: SceneContent | None = None
         self._visible: dict[Layer, bool] = dict.fromkeys(get_args(Layer), True)
@@ -96,6 +107,13 @@ class Stage:
             return
         with self._client.atomic():
             node.wxyz, node.position = _wxyz(pose.world_from_camera), pose.position_in_world
+
+    def label(self, pose: Pose, text: str) -> None:
+        """Write above the picture in a camera."""
+        if self._scene is not None:
+            depth = self._scene.extent.frustum
+            place = pose.position_in_world + depth * pose.axis_in_world + 0.6 * depth * self._scene.extent.up
+            self._nodes["trajectory"]["label"] = self._client.scene.add_label("/trajectory/label", text, position=place)
 
     def show_candidates(self, candidates: Candidates | None, photo: Intrinsics) -> None:
         """Draw poses that were weighed, coloured by score, as one node."""
