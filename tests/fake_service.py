@@ -209,6 +209,8 @@ class FakeService:
         self.jobs: list[FakeJob] = []
         self.scenes = ["ball"]
         """Ids; all have the same content."""
+        self.version = {"viser": "1"}
+        self.photos_kept = True
         self.asked: list[str] = []
         """Paths, in order."""
         self.renders: list[dict] = []
@@ -259,6 +261,8 @@ class FakeService:
             return httpx.Response(200, json=job.out().model_dump(mode="json"))
         if rest == "/events":
             return httpx.Response(200, content=job.events())
+        if rest == "/photo" and not self.photos_kept:
+            return httpx.Response(404)
         if rest == "/photo":
             return httpx.Response(200, content=jpeg((120, 160, 200)))
         index = int(rest.split("/")[2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
 from fake_service import FakeService, records
 from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from service.api.relay import Relay
+from service.api.ui import PAGES
 from viewer.app import Viewer
 from viewer.client import Service
 
@@ -40,10 +43,47 @@ def url(fake: FakeService) -> Iterator[str]:
     relay = Relay(SimpleNamespace(port=viewer.server.get_port()))
     relay_only = FastAPI()
     relay_only.include_router(relay.router)
+    relay_only.mount("/ui", StaticFiles(directory=PAGES))
+    relay_only.add_api_route("/version", lambda: fake.version)
     relay_only.router.add_event_handler("shutdown", relay.close)
     with served(relay_only) as url:
         yield f"{url}/viewer"
     viewer.stop()
+
+
+def test_an_open_page_loads_itself_anew_after_an_upgrade(browser: Browser, fake: FakeService, url: str) -> None:
+    page = opened(browser, f"{url}/")
+    page.evaluate("window.old = true")
+    for _ in range(2):  # asked twice, and the same answer
+        page.wait_for_event("response", lambda response: response.url.endswith("/version"))
+    assert page.evaluate("window.old")
+    fake.version = {"viser": "9"}
+    page.wait_for_function("!window.old")
+    page.get_by_text("no job", exact=True).wait_for()
+    page.close()
+
+
+def test_a_replay_file_plays_from_disk(browser: Browser, fake: FakeService, url: str, tmp_path: Path) -> None:
+    fake.job("saved", 4, finished=True)
+    page = opened(browser, f"{url}/jobs/saved/")
+    wait_for_step(page, 3)
+    with page.expect_download() as waited:
+        page.get_by_role("button", name="save as replay file").click()
+    assert waited.value.suggested_filename == "splatfix-saved.html"
+    waited.value.save_as(tmp_path / "replay.html")
+    page.close()
+    page = opened(browser, (tmp_path / "replay.html").as_uri())
+    troubles: list[str] = []
+    page.on("request", lambda request: troubles.append(request.url) if request.url.startswith("http") else None)
+    wait_for_splats(page)
+    assert "holiday" in page.title()
+    seen: set[bytes] = set()
+    deadline = time.monotonic() + PATIENCE_MS / 1000
+    while len(seen) < 3:  # it plays: 4 steps with renders of 4 colours
+        seen.add(page.locator("canvas").first.screenshot())
+        assert time.monotonic() < deadline, "nothing moves"
+    assert not troubles
+    page.close()
 
 
 def step_shown(page: Page) -> str:
@@ -92,7 +132,7 @@ def test_an_old_job_opens_by_its_address_and_can_be_stepped_through(
     page.get_by_text("localized", exact=True).wait_for()
     page.get_by_text("15 agree").wait_for()
     wait_for_step(page, 3)
-    assert page.title() == "splatfix"
+    assert page.title() == "splatfix viewer"
     wait_for_splats(page)
     first = picture(page)
     page.get_by_role("button", name="previous").click()

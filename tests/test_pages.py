@@ -16,6 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
 
 from service.api.app import create_app
+from service.api.keys import KeyRing
 from service.api.settings import Settings
 
 pytestmark = NEEDS_CHROMIUM
@@ -235,6 +236,18 @@ def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
 def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
     page.goto(f"{url}/#/jobs/nothing")
     expect(page.get_by_role("alert")).to_contain_text("no job 'nothing'")
+
+
+def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> None:
+    keys, port = KeyRing(tmp_path / "keys.json"), free_port()
+    key = keys.make_passing("tester", "localize")
+    with served(create_app(Settings(scenes=[], port=port, viewer=False, data_dir=tmp_path), keys=keys), port) as url:
+        page = opened(browser, f"{url}/")
+        page.get_by_label("API key").fill(key)
+        page.get_by_label("API key").press("Enter")
+        page.get_by_text("No scene is loaded").wait_for()
+        assert key not in page.url
+        page.close()
 
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:

@@ -249,6 +249,18 @@ def test_errors_are_shown_where_the_truth_is_known(fake: FakeService, viewer: Vi
         browser.wait(lambda: "turned off" in browser.text(), "the numbers")
 
 
+def test_without_the_photo_the_render_is_shown(fake: FakeService, viewer: Viewer) -> None:
+    fake.photos_kept = False
+    fake.job("j", 3, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: "photo was deleted" in browser.text(), "the message")
+        image = next(w for w in browser.widgets.values() if w["type"] == "GuiImageMessage")
+        shown = draw.decode(bytes(image["_data"])).mean((0, 1))
+        assert np.abs(shown - render_rgb(2, matched=False)).max() < 6
+        assert "agrees" in browser.text()
+        assert "between two, on average" in browser.text()
+
+
 def test_the_view_at_rest_is_rendered_by_the_service(fake: FakeService, viewer: Viewer) -> None:
     with _browser(viewer) as browser:
         browser.wait(lambda: _background(browser) == "exact", "the exact picture")

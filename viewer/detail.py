@@ -50,7 +50,8 @@ class Detail:
         self._panel.strip.content = stages_html(feed.records, index)
         if self._shown == (feed.id, index):
             return
-        texture = reduced(feed.photo(), _TEXTURE_PX) if self._shown is None else None
+        photo = feed.photo() if self._shown is None else None
+        texture = None if photo is None else reduced(photo, _TEXTURE_PX)
         self._stage.show_current(record.pose, job.photo, texture)
         weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
         self._stage.show_candidates(next(weighed, None), job.photo)
@@ -87,6 +88,11 @@ class Detail:
         if mode != "beside" or not panel.matches.value:
             view = None
         photo = feed.photo()
+        if photo is None:
+            panel.picture.image, panel.picture.visible = feed.render(record.index, matched=False), True
+            panel.caption.content = small_html("The render at this step's pose; the photo was deleted after the job.")
+            panel.window.visible, panel.flicker.visible = True, False
+            return
         # Matches of this very step may refer to another view than its pose: then that view stands beside the photo.
         render = feed.render(record.index, matched=view is not None and view.carried_from is None)
         if mode == "flicker":

@@ -60,10 +60,17 @@ class JobFeed:
         """Let the thread end at the next event or ping."""
         self._stop.set()
 
-    def photo(self) -> UInt8[np.ndarray, "h w 3"]:
-        """Return the job's photo, fetched once. Raises ServiceTrouble, ValueError."""
+    def photo(self) -> UInt8[np.ndarray, "h w 3"] | None:
+        """Return the job's photo, fetched once; None: it was deleted after the job.
+
+        Raises ServiceTrouble, ValueError.
+        """
         if self._photo is None:
-            self._photo = decode(self._service.photo(self.id))
+            try:
+                self._photo = decode(self._service.photo(self.id))
+            except ServiceTrouble as trouble:
+                if trouble.status not in (404, 410):
+                    raise
         return self._photo
 
     def render(self, index: int, *, matched: bool) -> UInt8[np.ndarray, "h w 3"]:

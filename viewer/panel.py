@@ -25,6 +25,9 @@ class Panel:
         gui = client.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH_PX)
+        gui.add_html(
+            "<a href='/' data-splatfix='./' style='padding:0 .6em;font-size:.9em'>← localize another photo</a>"
+        )
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
         self.newest = gui.add_checkbox("follow newest", True, hint="Change to every new job as soon as it appears.")
         self.scenes = gui.add_dropdown("scene", (NO_SCENE,), initial_value=NO_SCENE)
@@ -63,5 +66,3 @@ class Panel:
             self.curves = gui.add_html("")
         self.window.dock_left()
         self.window.set_width(_WINDOW_WIDTH_PX)
-        # The page is viser's file, with its title; this is the one way to another title from here.
-        gui.add_html("<img src='data:,' style='display:none' onerror=\"document.title='splatfix'\">")

@@ -78,15 +78,17 @@ def headline_html(job: JobView | None, records: int, trouble: str) -> str:
     if job is None:
         return _block(_badge("no job", PENDING_COLOUR), "Drop a photo on the start page, or choose a job above.")
     title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
+    link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>its result page</a>"
     if job.answer is None:
         word = "queued" if not records else "running"
-        return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title)
+        return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title, link=link)
     answer = job.answer
     return _block(
         _badge(answer.status.replace("_", " "), STATUS_COLOURS[answer.status]),
         _why(answer),
         title,
         answer.hint,
+        link,
     )
 
 
@@ -161,10 +163,10 @@ def _why(answer: Answer) -> str:
     return ", ".join(w for w in words if w)
 
 
-def _block(badge: str, text: str, title: str = "", hint: str = "") -> str:
+def _block(badge: str, text: str, title: str = "", hint: str = "", link: str = "") -> str:
     parts = [f"{badge} <span>{escape(text)}</span>"]
     if title:
-        parts.append(f"<div style='opacity:.6;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}</div>")
+        parts.append(f"<div style='opacity:.7;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}; {link}</div>")
     if hint:
         parts.append(f"<div style='margin-top:.3em'>{escape(hint)}</div>")
     return _padded("".join(parts))

@@ -320,7 +320,7 @@ class Session:
         def make() -> None:
             try:
                 page = replay_html(feed, content).encode()
-                self._client.send_file_download(f"splatfix-{feed.id}.html", page)
+                self._client.send_file_download(f"splatfix-{feed.id}.html", page, save_immediately=True)
             except Exception as error:  # whatever it is, the user shall hear of it
                 log.warning("no replay of job %s: %s", feed.id, error)
                 self._client.add_notification("No replay file", str(error), color="red")

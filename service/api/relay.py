@@ -23,7 +23,6 @@ from websockets.typing import Subprotocol
 
 _log = logging.getLogger(__name__)
 
-_CONTENT_HEADERS = ("content-type", "content-encoding", "cache-control", "etag")
 _TRY_AGAIN_LATER = 1013
 
 
@@ -49,20 +48,20 @@ class Relay:
         await self._http.aclose()
 
     async def _page(self, request: Request, path: str = "") -> Response:
-        answer = await self._ask(path, request)
-        return answer if answer.status_code != 404 else await self._ask("", request)
+        answer = await self._ask(path)
+        if answer.status_code == 404:
+            answer = await self._ask("")
+        content, kind = answer.content, answer.headers.get("content-type", "")
+        if kind.startswith("text/html"):  # with our own script, which knows when the page is too old
+            script = f'<script src="{request.scope.get("root_path", "")}/ui/viewer.js"></script></head>'
+            content = content.replace(b"</head>", script.encode(), 1)
+        return Response(content, answer.status_code, media_type=kind)
 
-    async def _ask(self, path: str, request: Request) -> Response:
-        url = f"http://127.0.0.1:{self._upstream.port}/{path}"
-        accepted = {"Accept-Encoding": request.headers.get("accept-encoding", "identity")}
+    async def _ask(self, path: str) -> httpx.Response:
         try:
-            async with self._http.stream("GET", url, headers=accepted) as answer:
-                # Raw: what the viewer compressed goes to the browser as it is.
-                content = b"".join([chunk async for chunk in answer.aiter_raw()])
+            return await self._http.get(f"http://127.0.0.1:{self._upstream.port}/{path}")
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             raise HTTPException(503, "The viewer does not answer; it may just be starting.") from error
-        headers = {name: answer.headers[name] for name in _CONTENT_HEADERS if name in answer.headers}
-        return Response(content, answer.status_code, headers)
 
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
         offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]

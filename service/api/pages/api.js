@@ -22,6 +22,11 @@ export async function ask(path, init) {
   return body;
 }
 
+/** Tell whether the service answers only those who have a key: this page itself has a cookie instead. */
+export async function asksForKey() {
+  return fetch("version", { credentials: "omit" }).then(response => response.status === 401, () => false);
+}
+
 export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
 
 /** Follow a job: `onRecord` for each step, `onEnd` with the ended job once. Returns a function that stops it. */

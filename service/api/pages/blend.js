@@ -2,17 +2,23 @@
 
 import { h } from "./dom.js";
 
-/** Return an element with both pictures and `share(value)`, which sets the render's share, 0 to 1. */
-export function blend(photo, render, alt) {
+/** Return an element with both pictures and `share(value)`, which sets the render's share, 0 to 1.
+ * `file` is the photo's own file, where this page has sent it: shown when the service has deleted its copy. */
+export function blend(photo, render, alt, file = null) {
   const below = h("img", { src: photo, alt: "The photo", class: "below" });
   const above = h("img", { src: render, alt, class: "above" });
   const note = h("figcaption", { class: "quiet" });
   const figure = h("figure", { class: "blend" }, h("div", { class: "stack" }, below, above), note);
-  below.addEventListener("error", () => {
+  const gone = () => {
     below.remove();
     above.classList.add("alone");
     note.textContent = "The service has not kept the photo.";
-  });
+  };
+  below.addEventListener("error", () => {
+    if (!file) return gone();
+    below.addEventListener("error", gone, { once: true });
+    below.src = URL.createObjectURL(file);
+  }, { once: true });
   above.addEventListener("error", () => {
     above.remove();
     note.textContent = "There is no render.";

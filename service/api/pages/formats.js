@@ -32,9 +32,10 @@ export function poseFormats({ result: { pose, geopose }, photo, created }) {
 
 const quoted = text => `'${text.replaceAll("'", "'\\''")}'`;
 
-/** Return the curl line that sends these fields with this photo. */
-export function curlLine(fields, photoName) {
-  const parts = Object.entries(fields).map(([name, value]) => `-F ${quoted(`${name}=${value}`)}`);
+/** Return the curl line that sends these fields with this photo; with a key, where the service asks for one. */
+export function curlLine(fields, photoName, keyed) {
+  const parts = keyed ? ['-H "Authorization: Bearer $SPLATFIX_KEY"'] : [];
+  parts.push(...Object.entries(fields).map(([name, value]) => `-F ${quoted(`${name}=${value}`)}`));
   parts.push(`-F ${quoted(`photo=@${photoName}`)}`);
   return `curl -H 'Prefer: wait=30' \\\n  ${parts.join(" \\\n  ")} \\\n  ${new URL("localize", document.baseURI).href}`;
 }

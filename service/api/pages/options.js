@@ -13,6 +13,7 @@ export class OptionsForm {
     this.estimator.addEventListener("change", () => this.#listOptions());
     this.seed = input({ type: "number", min: 0, step: 1, placeholder: "0" });
     this.budget = input({ type: "number", min: 0, step: "any", placeholder: "none" });
+    this.keep = h("input", { type: "checkbox" });
     this.numbers = Object.fromEntries(NUMBERS.map(name => [name, input({ type: "number", step: "any" })]));
     this.model = input({ placeholder: "PINHOLE" });
     this.distortion = input({ placeholder: "k1, k2, …" });
@@ -21,7 +22,8 @@ export class OptionsForm {
     this.#listOptions();
     this.element = h("div", { class: "options" },
       group("Estimator", h("div", { class: "grid" }, field("Estimator", this.estimator), field("Seed", this.seed),
-        field("Time budget, seconds", this.budget)), this.options),
+        field("Time budget, seconds", this.budget),
+        field("Keep the photo", this.keep, "As long as the job; else it is deleted soon after it.")), this.options),
       group("Intrinsics of the upright photo, in pixels",
         h("div", { class: "grid" }, NUMBERS.map(name => field(name, this.numbers[name])),
           field("Camera model (COLMAP's name)", this.model), field("Distortion", this.distortion)),
@@ -44,6 +46,7 @@ export class OptionsForm {
     if (Object.keys(options).length) fields.options = JSON.stringify(options);
     if (this.seed.value) fields.seed = this.seed.value;
     if (this.budget.value) fields.budget_s = this.budget.value;
+    if (this.keep.checked) fields.keep_photo = "true";
     const intrinsics = Object.fromEntries(
       NUMBERS.filter(name => this.numbers[name].value).map(name => [name, Number(this.numbers[name].value)]));
     if (this.model.value.trim()) intrinsics.model = this.model.value.trim();

@@ -1,6 +1,6 @@
 // The answer of an ended job: photo and render blended, the pose in every convention, why, and what to take along.
 
-import { ask } from "./api.js";
+import { ask, asksForKey } from "./api.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, copyButton, degrees, facts, h, length, seconds, when, words } from "./dom.js";
 import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
@@ -31,7 +31,7 @@ function verdict({ result, error, state }) {
 }
 
 function pictures(job) {
-  const pair = blend(job.links.photo, job.links.render, "The scene rendered at the pose");
+  const pair = blend(job.links.photo, job.links.render, "The scene rendered at the pose", recalled(job.id)?.file);
   return [
     pair.element, blendSlider([pair]),
     h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "See how it was found"),
@@ -77,12 +77,14 @@ function numbers(job, scene) {
 function taking(job) {
   const file = (name, href) => h("a", { class: "button", href, download: "" }, name);
   const sent = recalled(job.id);
-  const curl = curlLine(sent?.fields ?? fieldsOf(job), sent?.file.name || job.photo.name || "photo.jpg");
+  const line = keyed => curlLine(sent?.fields ?? fieldsOf(job), sent?.file.name || job.photo.name || "photo.jpg", keyed);
+  const curl = h("pre", { class: "curl", tabIndex: 0 }, line(false));
+  asksForKey().then(asks => { curl.textContent = line(asks); });
   return h("section", {}, h("h2", {}, "Take along"),
     h("p", { class: "buttons" }, file("JSON", job.links.self), file("Trace", job.links.trace),
       ...exports(job).map(([name, format]) => file(name, `${job.links.export}/${format}`))),
     h("h3", {}, "This very request"),
-    h("div", { class: "poserow" }, h("pre", { class: "curl", tabIndex: 0 }, curl), copyButton(() => curl, "the curl line")));
+    h("div", { class: "poserow" }, curl, copyButton(() => curl.textContent, "the curl line")));
 }
 
 function exports({ result }) {

@@ -97,7 +97,8 @@ async function listScenes(place, timer) {
   try {
     ({ scenes } = await ask("scenes"));
   } catch (error) {
-    told(error);
+    if (error.status === 401) place.replaceChildren(h("legend", {}, "Key"), keyForm());
+    else told(error);
     return;
   }
   if (!scenes.some(scene => scene.id === chosen.scene)) chosen.scene = null;
@@ -107,6 +108,15 @@ async function listScenes(place, timer) {
   if (scenes.some(scene => ["loading", "preparing"].includes(scene.state))) {
     timer.id = setTimeout(() => listScenes(place, timer), 1000);
   }
+}
+
+/** The key goes to the service once, which leaves a cookie for it and takes it out of the address. */
+function keyForm() {
+  return h("form", { action: "./", method: "get" },
+    h("p", {}, "This service asks for an API key."),
+    h("p", { class: "buttons" },
+      h("input", { type: "password", name: "key", required: true, autocomplete: "current-password", "aria-label": "API key" }),
+      h("button", {}, "Enter")));
 }
 
 function card(scene) {
