@@ -9,18 +9,26 @@ import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
-from service.errors import InvalidOptions, UnknownName
+from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
 from service.geometry import moved, pose_distance
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
 from service.pose.views import to_uint8
-from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query, Reason, Status
+from service.types import Camera, Candidates, Intrinsics, IterationRecord, MatchVectors, Pose, Query, Reason, Status
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 DEFAULT = "view_index"
-QUICK: dict[str, dict] = {"mc_do": {"hypotheses": 16, "rounds": 1, "iterations": 4, "refinement_steps": 20}}
+QUICK: dict[str, dict] = {
+    "mc_do": {"hypotheses": 16, "rounds": 1, "iterations": 4, "refinement_steps": 20},
+    "inerf": {"steps": 100, "long_side_px": 160, "rate": 0.02},
+    "inerf_dagger": {"steps": 100, "long_side_px": 160, "rate": 0.02},
+    "pnerf": {"hypotheses": 2, "steps": 120, "resample_every": 80, "long_side_px": 96, "shift_rate": 0.02},
+    "icomma": {"steps": 100, "rematch_every": 10, "long_side_px": 224, "rate": 0.02},
+}
 """Where the defaults are for far starts: options with which a near one is enough."""
+PHOTOMETRIC = {"inerf", "inerf_dagger", "pnerf", "icomma"}
+"""Their losses would take another exposure for geometry, and their steps here are few: they come nearer only."""
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +45,7 @@ def estimator(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
-STEP_RENDERS = 3
+STEP_RENDERS = 4
 """What one step of any method renders at most."""
 
 
@@ -77,9 +85,16 @@ def trace(records: tuple[IterationRecord, ...]) -> list[tuple]:
 def test_finds_a_planted_pose_from_a_prior_nearby(estimator: str, room: LoadedScene) -> None:
     truth = unseen_pose()
     prior = moved(truth, np.array([0.05, -0.05, 0.03, 0.05, 0.02, -0.05]))
-    found = localize(photo_at(room, truth, prior=prior), room, quick(estimator))
-    assert found.verdict.status is Status.LOCALIZED
-    assert_near(found.pose, truth)
+    query = photo_at(room, truth, prior=prior)
+    if estimator in PHOTOMETRIC:
+        query = replace(query, rgb=to_uint8(room.rasterizer.render([Camera(LENS, truth)])[0].rgb))
+    found = localize(query, room, quick(estimator))
+    if estimator in PHOTOMETRIC:
+        assert pose_distance(prior, truth) == pytest.approx((4.4, 0.073), rel=0.01)
+        assert_near(found.pose, truth, 1.0, 0.04)  # seen: 0.4 to 0.6 degrees, 0.02 to 0.03
+    else:
+        assert found.verdict.status is Status.LOCALIZED
+        assert_near(found.pose, truth)
 
 
 def test_the_trace_is_well_formed(estimator: str, room: LoadedScene) -> None:
@@ -116,7 +131,7 @@ def test_can_be_stopped_at_any_record(estimator: str, room: LoadedScene) -> None
 
 
 def test_a_photo_without_texture_is_no_error(estimator: str, room: LoadedScene) -> None:
-    blank = Query(np.full((HEIGHT, WIDTH, 3), 120, np.uint8), LENS, "given", LENS)
+    blank = Query(np.full((HEIGHT, WIDTH, 3), 120, np.uint8), LENS, "given", LENS, unseen_pose())
     found = localize(blank, room, quick(estimator))
     assert found.verdict.status is Status.NOT_LOCALIZED
     assert found.verdict.reason is Reason.FEW_FEATURES
@@ -255,3 +270,56 @@ def test_mc_do_comes_back_from_the_hard_protocol(room: LoadedScene) -> None:
 def test_mc_do_refuses_senseless_options(name: str, value: object) -> None:
     with pytest.raises((InvalidOptions, UnknownName), match=str(value) if name != "hypotheses" else name):
         ESTIMATORS.load("mc_do").Options(**{name: value})
+
+
+# --- the baselines
+
+
+@pytest.mark.parametrize("estimator", sorted(PHOTOMETRIC))
+def test_a_baseline_without_a_prior_says_so(estimator: str, room: LoadedScene) -> None:
+    with pytest.raises(InvalidPrior, match=f"'{estimator}' moves a given pose"):
+        localize(photo_at(room, unseen_pose()), room, quick(estimator))
+
+
+@pytest.mark.parametrize("estimator", sorted(PHOTOMETRIC))
+@pytest.mark.parametrize("name", ["steps", "long_side_px", "loss"])
+def test_a_baseline_refuses_senseless_options(estimator: str, name: str) -> None:
+    with pytest.raises((InvalidOptions, UnknownName), match="l3" if name == "loss" else name):
+        ESTIMATORS.load(estimator).Options(**{name: "l3" if name == "loss" else -1})
+
+
+def test_the_supplements_parameters_are_the_defaults() -> None:
+    inerf, dagger, pnerf, icomma = (
+        ESTIMATORS.load(name).Options() for name in ("inerf", "inerf_dagger", "pnerf", "icomma")
+    )
+    assert (inerf.steps, inerf.rays, inerf.rate, inerf.loss) == (500, 512, 0.05, "l2")
+    assert (dagger.steps, dagger.rate, dagger.loss) == (500, 0.05, "l2")
+    assert (pnerf.steps, pnerf.resample_every, pnerf.turn_rate, pnerf.shift_rate) == (2560, 512, 5e-3, 3e-3)
+    assert (icomma.steps, icomma.rematch_every, icomma.loss) == (500, 1, "l2")
+
+
+def test_icomma_stops_matching_when_the_matches_are_close(room: LoadedScene) -> None:
+    truth = unseen_pose(1)
+    query = photo_at(room, truth, prior=moved(truth, np.array([0.04, 0, 0, 0, 0.03, 0])))
+    stages = [r.stage for r in localize(query, room, quick("icomma")).records]
+    last_match = max(i for i, stage in enumerate(stages) if stage == "match")
+    assert set(stages[last_match + 1 :]) == {"compare"}
+    assert last_match < len(stages) / 2
+
+
+def test_pnerf_draws_new_hypotheses_around_the_best(room: LoadedScene) -> None:
+    truth = unseen_pose(1)
+    options = ESTIMATORS.load("pnerf").Options(hypotheses=12, steps=33, resample_every=32, long_side_px=64)
+    found = localize(photo_at(room, truth, prior=truth), room, Request("pnerf", options))
+    shown = [r.candidates for r in found.records if r.candidates]
+    nearest = [_to_nearest(shown[0]), _to_nearest(shown[-1])]
+    assert len(shown[0].scores) == 12
+    assert np.median(nearest[0]) > 5  # within +-15 degrees an axis
+    assert np.max(nearest[1]) < 3 * np.sqrt(3) + 1  # a parent or a child has one within +-3 degrees
+    assert found.renders == 33 * 12 * 2
+
+
+def _to_nearest(candidates: Candidates) -> list[float]:
+    """Degrees from each pose to the one of the others that is turned most like it."""
+    poses = [Pose(matrix) for matrix in candidates.world_from_camera]
+    return [min(pose_distance(a, b)[0] for b in poses if b is not a) for a in poses]

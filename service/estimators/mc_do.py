@@ -26,7 +26,7 @@ from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Rasterizer, Tools
 from service.pose.decoupled import MatchedPoints, Solved, gradient_solve, least_squares_solve
-from service.pose.descent import refine
+from service.pose.descent import refine, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.hypotheses import around
 from service.pose.level import contributions, pruned
@@ -82,9 +82,7 @@ class Options:
             "iterations": (0, 1000),
             "refinement_steps": (0, 10_000),
         }
-        for name, (low, high) in limits.items():
-            if not low <= getattr(self, name) <= high:
-                raise InvalidOptions(f"must lie in {low}..{high}, is {getattr(self, name)}.", where=name)
+        require_within(self, limits)
         if self.solver not in SOLVERS:
             raise InvalidOptions(f"there is no solver '{self.solver}'; known: {', '.join(SOLVERS)}.", where="solver")
         require_loss(self.loss)

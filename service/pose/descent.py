@@ -13,12 +13,13 @@ rates mean what they mean in the sources.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 
+from service.errors import InvalidOptions
 from service.geometry import hat, se3_exp, se3_log, so3_exp, so3_log
 from service.interfaces import Rasterizer
 from service.pose.adam import Adam
@@ -29,6 +30,14 @@ from service.types import Camera, Intrinsics, Pose
 
 NORMAL_DISTANCE = 4.0
 """Of the focus, in the units that the sources' learning rates are for."""
+
+
+def require_within(options: object, limits: Mapping[str, tuple[float, float]]) -> None:
+    """Raise InvalidOptions for the first of the options' fields that lies outside its limits."""
+    for name, (low, high) in limits.items():
+        value = getattr(options, name, low)
+        if not low <= value <= high:
+            raise InvalidOptions(f"must lie in {low}..{high}, is {value}.", where=name)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,9 @@ renders with the 512-px photo found 10 and 18 right matches in the median, with 
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
+from jaxtyping import Bool
 
 from service.interfaces import Features, Rasterizer, Tools
 from service.pose.views import (
@@ -19,7 +21,7 @@ from service.pose.views import (
     photo_at,
     to_uint8,
 )
-from service.types import Camera, IterationRecord, MatchVectors, Pose, Query
+from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query
 
 
 def render_and_match(
@@ -54,3 +56,12 @@ def _photo_features(camera: Camera, query: Query, tools: Tools) -> Features:
         scale = np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height], np.float32)
         tools.memo[key] = Features(found.points_px * scale, found.scores, found.descriptors)
     return tools.memo[key]
+
+
+def epipolar_inliers(matches: Correspondences, intrinsics: Intrinsics) -> Bool[np.ndarray, "m"]:
+    """Return which matches one fundamental matrix explains; none where there are fewer than eight."""
+    if len(matches.photo_px) < 8:
+        return np.zeros(len(matches.photo_px), bool)
+    photo, view = (np.asarray(px, np.float64) for px in (matches.photo_px, matches.view_px))
+    _, mask = cv2.findFundamentalMat(photo, view, cv2.USAC_MAGSAC, intrinsics.long_side / 256, 0.999, 2000)
+    return np.zeros(len(photo), bool) if mask is None else mask.ravel() > 0

@@ -1,0 +1,39 @@
+"""iNeRF-dagger of the supplement: `inerf` with its loss over the whole picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import ClassVar
+
+from service.estimators import inerf
+from service.interfaces import Tools
+from service.pose.descent import require_within
+from service.pose.losses import require_loss
+from service.pose.views import RENDER_PX
+from service.types import IterationRecord, Query
+
+prepare = inerf.prepare
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    steps: int = 500
+    rate: float = 0.05
+    """Adam's at the start; 0.8 times as much every 100 steps."""
+    loss: str = "l2"
+    """l1, l2, relative, feature, corner or blur."""
+    long_side_px: int = RENDER_PX
+    """Of the renders."""
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
+
+    def __post_init__(self) -> None:
+        require_within(self, inerf.LIMITS)
+        require_loss(self.loss)
+
+
+def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    """As `inerf`."""
+    inerf.required_prior(query, "inerf_dagger")
+    yield from inerf.run(query, tools, inerf.Options(rays=0, **asdict(options)))

@@ -1,0 +1,128 @@
+"""pNeRF, "Parallel Inversion" (Lin et al., ICRA 2023), as the supplement's section B runs it, on Gaussians.
+
+Many hypotheses descend the L2 loss side by side; from time to time the best are kept and the others drawn anew
+around them. SO(3) x T(3): each turns in place and shifts.
+
+From the supplement: 2560 steps, resampling every 512, rates 5e-3 (turn) and 3e-3 (shift), both times 0.33 per 256
+steps, L2. From the published method's code: 64 hypotheses within +-15 degrees and +-0.3 units of the prior; the best
+fraction max(4 / n, 0.25 / 2^round) is kept, children lie within +-3 degrees and +-0.1 units of their parent; the
+answer is the hypothesis of the least loss.
+
+Deviation: the scene is one of Gaussians, not an Instant-NGP. Renders of 100 px in the long side by default, for a CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.estimators.inerf import required_prior
+from service.interfaces import Tools
+from service.pose.adam import Adam
+from service.pose.descent import So3T3, photometric, require_within
+from service.pose.focus import Focus, focus_of_scene
+from service.pose.losses import loss_against, require_loss
+from service.pose.views import photo_at, sized
+from service.types import Candidates, IterationRecord, Pose, Query
+
+DECAY, DECAY_STEPS = 0.33, 256
+START_DEG, START_UNITS = 15.0, 0.3
+CHILD_DEG, CHILD_UNITS = 3.0, 0.1
+LEAST_PARENTS = 4
+REPRESENTATION = "3DGS; the supplement's pNeRF has Instant-NGP"
+"""What the bench says beside this method's figures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    hypotheses: int = 64
+    steps: int = 2560
+    resample_every: int = 512
+    """Steps."""
+    turn_rate: float = 5e-3
+    """rad."""
+    shift_rate: float = 3e-3
+    """Normalized units: the scene's focus at a distance of 4."""
+    loss: str = "l2"
+    """l1, l2, relative, feature, corner or blur."""
+    long_side_px: int = 100
+    """Of the renders."""
+
+    __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
+
+    def __post_init__(self) -> None:
+        limits = {"hypotheses": (1, 1024), "steps": (1, 100_000), "resample_every": (1, 100_000)}
+        require_within(self, limits | {"turn_rate": (0, 1), "shift_rate": (0, 1), "long_side_px": (32, 4096)})
+        require_loss(self.loss)
+
+
+def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
+    """Find the scene's focus: it defines the units."""
+    return focus_of_scene(tools.scene, tools.rasterizer)
+
+
+class _Hypothesis:
+    """A pose under way; its anchor is where it was drawn."""
+
+    def __init__(self, anchor: Pose, focus: Focus) -> None:
+        self._of = So3T3(anchor, focus)
+        self._numbers = np.zeros(6)
+        self._adam = Adam(6, 1.0)
+        self.loss = np.inf
+
+    @property
+    def pose(self) -> Pose:
+        return self._of.pose(self._numbers)
+
+    def step(self, loss: float, by_twist: Float64[np.ndarray, "6"], rates: Float64[np.ndarray, "6"]) -> None:
+        self.loss = loss
+        self._numbers = self._numbers - rates * self._adam.step(self._of.gradient(self._numbers, by_twist))
+
+
+def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    """Descend from around the prior. Raises InvalidPrior without one."""
+    start, focus = required_prior(query, "pnerf"), tools.prepared
+    intrinsics = sized(query.intrinsics, options.long_side_px)
+    loss = loss_against(options.loss, photo_at(query, tools, intrinsics))
+    yield IterationRecord("start", start)
+    fleet = [_Hypothesis(start, focus)]
+    fleet += [_drawn(start, START_DEG, START_UNITS, tools) for _ in range(options.hypotheses - 1)]
+    for step in range(options.steps):
+        if step and step % options.resample_every == 0:
+            fleet = _resampled(fleet, step // options.resample_every, tools)
+        decay = DECAY ** (step / DECAY_STEPS)
+        rates = decay * np.repeat([options.turn_rate, options.shift_rate], 3)
+        best, least = start, np.inf
+        for hypothesis in fleet:
+            pose = hypothesis.pose
+            hypothesis.step(*photometric(tools.rasterizer, intrinsics, pose, loss), rates)
+            if hypothesis.loss < least:
+                best, least = pose, hypothesis.loss
+        shown = _candidates(fleet) if step % 16 == 0 else None  # a trace holds thousands of steps
+        yield IterationRecord("descend", best, loss=least, candidates=shown)
+
+
+def _resampled(fleet: list[_Hypothesis], round_number: int, tools: Tools) -> list[_Hypothesis]:
+    """Keep the best; each is the parent of as many noisy children."""
+    ranked = sorted(fleet, key=lambda hypothesis: hypothesis.loss)
+    keep = min(len(fleet), max(LEAST_PARENTS, round(len(fleet) * 0.25 / 2**round_number)))
+    parents = ranked[:keep]
+    children = [_drawn(parents[i % keep].pose, CHILD_DEG, CHILD_UNITS, tools) for i in range(len(fleet) - keep)]
+    return parents + children
+
+
+def _drawn(pose: Pose, degrees: float, units: float, tools: Tools) -> _Hypothesis:
+    focus: Focus = tools.prepared
+    turn = np.radians(degrees) * tools.rng.uniform(-1, 1, 3)
+    numbers = np.concatenate([turn, units * tools.rng.uniform(-1, 1, 3)])
+    return _Hypothesis(So3T3(pose, focus).pose(numbers), focus)
+
+
+def _candidates(fleet: list[_Hypothesis]) -> Candidates:
+    poses = np.stack([hypothesis.pose.world_from_camera for hypothesis in fleet])
+    return Candidates(poses, -np.array([hypothesis.loss for hypothesis in fleet]))
