@@ -23,7 +23,14 @@ QUICK: dict[str, dict] = {
     "mc_do": {"hypotheses": 16, "rounds": 1, "iterations": 4, "refinement_steps": 20},
     "inerf": {"steps": 100, "long_side_px": 160, "rate": 0.02},
     "inerf_dagger": {"steps": 100, "long_side_px": 160, "rate": 0.02},
-    "pnerf": {"hypotheses": 2, "steps": 120, "resample_every": 80, "long_side_px": 96, "shift_rate": 0.02},
+    "pnerf": {
+        "hypotheses": 2,
+        "steps": 120,
+        "resample_every": 80,
+        "long_side_px": 160,
+        "turn_rate": 0.01,
+        "shift_rate": 0.05,
+    },
     "icomma": {"steps": 100, "rematch_every": 10, "long_side_px": 224, "rate": 0.02},
 }
 """Where the defaults are for far starts: options with which a near one is enough."""
