@@ -1,6 +1,6 @@
 """Train a 3D Gaussian scene on the CPU, with the gradients of our own renderer.
 
-    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 7000]
+    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 10000]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
 (float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
@@ -289,7 +289,8 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
             means_rate = 1.6e-4 * extent * 0.01**done
             # Calming every rate at the end lets the last steps agree on what the noise of single photos hides.
             rate = 0.1 ** max(0.0, (done - CALM_FROM) / (1 - CALM_FROM))
-            for loss, g in pool.map(gradients, batch):
+            # Both gradients first: they look at the memory that a step changes.
+            for loss, g in list(pool.map(gradients, batch)):
                 step(model, g, means_rate, rate, min(DEGREE, iteration // SH_EVERY))
                 average += 0.01 * (loss - average)
             if iteration % RELOCATE_EVERY == 0 and 0 < done < RELOCATE_UNTIL:
@@ -319,7 +320,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, default=240_000)
-    parser.add_argument("--iterations", type=int, default=7000)
+    parser.add_argument("--iterations", type=int, default=10_000)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     scene = train(arguments.folder, arguments.gaussians, arguments.iterations)

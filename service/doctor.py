@@ -56,7 +56,7 @@ def warm() -> None:
     frame = rasterizer.render([camera])[0]
     rasterizer.pose_gradient(camera, frame.rgb)
     rasterizer.scene_gradients(camera, frame.rgb)
-    align((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera.pose, 2)
+    align((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera, 2)
 
 
 def processor() -> str:

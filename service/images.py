@@ -91,12 +91,13 @@ def read_query(
         source = "exif" if focal_mm else "guessed"
         if not focal_mm:
             warnings.append(
-                "The photo says nothing of its focal length; 28 mm (35 mm equivalent) is assumed. "
-                "Send intrinsics for an exact pose."
+                "The photo says nothing of its focal length; it is estimated with the pose, starting from 28 mm "
+                "(35 mm equivalent). Send intrinsics for an exact pose."
             )
         long_side = max(decoded.width, decoded.height)
         focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
-        intrinsics = Intrinsics(decoded.width, decoded.height, focal, focal, decoded.width / 2, decoded.height / 2)
+        size = decoded.width, decoded.height
+        intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
     rgb, pinhole = undistorted(decoded.rgb, decoded.camera(intrinsics))
     return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
 
@@ -125,14 +126,14 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
-    """Parse `{width, height, fx, fy, cx, cy, model?, distortion?}`. Raises InvalidIntrinsics with the field.
+    """Parse `{width, height, fx, fy, cx, cy, model?, distortion?, trust?}`. Raises InvalidIntrinsics with the field.
 
     `distortion` has COLMAP's parameters of `model` after the focal lengths and the principal point.
     """
-    required = ("width", "height", "fx", "fy", "cx", "cy")
-    unknown = [key for key in mapping if key not in (*required, "model", "distortion")]
+    required, optional = ("width", "height", "fx", "fy", "cx", "cy"), ("model", "distortion", "trust")
+    unknown = [key for key in mapping if key not in (*required, *optional)]
     if unknown:
-        known = ", ".join((*required, "model", "distortion"))
+        known = ", ".join((*required, *optional))
         raise InvalidIntrinsics(f"unknown; known: {known}.", where=str(unknown[0])[:40])
     for key in required:
         if key not in mapping:
@@ -162,6 +163,7 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
         **{key: values[key] for key in required[2:]},
         model=model,
         distortion=tuple(_number(v, "distortion") for v in distortion),
+        trust=mapping.get("trust", "exact"),
     )
 
 

@@ -46,8 +46,6 @@ from service.types import (
 DEFAULT_ESTIMATOR = "view_index"
 DEFAULT_RASTERIZER = "cpu"
 DEFAULT_MATCHER = "xfeat"
-GUESSED_SCORE = 0.49
-"""The best score that a pose with guessed intrinsics gets: below what `localized` means."""
 
 
 class Cancelled(Exception):
@@ -155,7 +153,8 @@ def localize(
     if not records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
     pose, renders = records[-1].pose, tally.count
-    verdict = _qualified(verify(query, pose, tools), query, exhausted)
+    query = query.corrected(records[-1].lens)
+    verdict = _qualified(verify(query, pose, tools), exhausted)
     return PoseEstimate(
         pose=pose,
         verdict=verdict,
@@ -180,14 +179,10 @@ def _exhausted(request: Request, clock: _Clock, tally: RenderTally) -> bool:
     return late or (request.budget_renders is not None and tally.count >= request.budget_renders)
 
 
-def _qualified(verdict: Verdict, query: Query, exhausted: bool) -> Verdict:
-    """Put on record what the gate can't see in the pictures: a guessed lens, a budget that cut the search short."""
-    if verdict.status is not Status.LOCALIZED:
-        return replace(verdict, reason=Reason.BUDGET_EXHAUSTED) if exhausted else verdict
-    if query.intrinsics_source == "guessed":
-        # A focal length 5 % off moves the pose by 5 % of the distance, and photo and render still agree.
-        score = min(verdict.score, GUESSED_SCORE)
-        return replace(verdict, status=Status.UNCERTAIN, reason=Reason.GUESSED_INTRINSICS, score=score)
+def _qualified(verdict: Verdict, exhausted: bool) -> Verdict:
+    """Put on record what the gate can't see in the pictures: a budget that cut the search short."""
+    if exhausted and verdict.status is not Status.LOCALIZED:
+        return replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
     return verdict
 
 

@@ -27,6 +27,20 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
+class Lens:
+    """How a camera differs from the intrinsics that were assumed for it."""
+
+    focal_factor: float = 1.0
+    shift_x: float = 0.0
+    """Of the principal point, in long sides of the image: the same at every size."""
+    shift_y: float = 0.0
+
+
+EXACT = Lens()
+"""No difference."""
+
+
+@dataclass(frozen=True, slots=True)
 class Intrinsics:
     """A camera without its place. Refers to the upright image (EXIF orientation applied)."""
 
@@ -42,6 +56,8 @@ class Intrinsics:
     """COLMAP's name of the camera model; renderers and estimators see PINHOLE only."""
     distortion: tuple[float, ...] = ()
     """COLMAP's parameters after the focal lengths and the principal point."""
+    trust: Literal["exact", "approximate"] = "exact"
+    """Approximate: the focal length is where the search begins, and is estimated with the pose."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -53,6 +69,8 @@ class Intrinsics:
                 raise InvalidIntrinsics(f"must be a positive focal length in pixels, is {value}.", where=name)
         if not np.all(np.isfinite([self.cx, self.cy, *self.distortion])):
             raise InvalidIntrinsics("cx, cy and distortion must be finite numbers.", where="cx, cy")
+        if self.trust not in ("exact", "approximate"):
+            raise InvalidIntrinsics(f"must be exact or approximate, is {str(self.trust)[:40]!r}.", where="trust")
 
     @property
     def long_side(self) -> int:
@@ -69,6 +87,16 @@ class Intrinsics:
             fy=self.fy * sy,
             cx=self.cx * sx,
             cy=self.cy * sy,
+        )
+
+    def corrected(self, lens: Lens) -> Intrinsics:
+        """Return the same camera with another focal length and principal point."""
+        return replace(
+            self,
+            fx=self.fx * lens.focal_factor,
+            fy=self.fy * lens.focal_factor,
+            cx=self.cx + lens.shift_x * self.long_side,
+            cy=self.cy + lens.shift_y * self.long_side,
         )
 
     def with_long_side(self, pixels: int) -> Intrinsics:
@@ -203,6 +231,10 @@ class GaussianScene:
         return sum(getattr(self, n).nbytes for n in ("means", "quats", "scales", "opacities", "sh"))
 
 
+FOCAL_SIGMA = {"given": 0.15, "exif": 0.06, "guessed": 0.5}
+"""By the source of approximate intrinsics. EXIF is rounded to a millimetre, and its definition is ambiguous by 4 %."""
+
+
 @dataclass(frozen=True, slots=True)
 class Query:
     """A photo to localize: upright, undistorted, with a pinhole camera."""
@@ -219,6 +251,23 @@ class Query:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+
+    @property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the logarithm of the focal length before the scene was looked at; 0: it is exact."""
+        if self.intrinsics.trust == "exact":
+            return 0.0
+        return FOCAL_SIGMA[self.intrinsics_source]
+
+    def corrected(self, lens: Lens) -> Query:
+        """Return the query with another focal length and principal point."""
+        if lens == EXACT:
+            return self
+        return replace(
+            self,
+            intrinsics=self.intrinsics.corrected(lens),
+            photo_intrinsics=self.photo_intrinsics.corrected(lens),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,6 +317,8 @@ class IterationRecord:
     stage: str
     pose: Pose
     """The answer that the estimator would give if it were stopped here: best so far."""
+    lens: Lens = EXACT
+    """What goes with the pose; other than the default only where the photo's intrinsics are approximate."""
     loss: float | None = None
     """The stage's own objective; comparable within a stage only."""
     num_matches: int | None = None
@@ -300,7 +351,8 @@ class Reason(StrEnum):
     RENDER_DISAGREES = "render_disagrees"
     FEW_INLIERS = "few_inliers"
     LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
-    GUESSED_INTRINSICS = "guessed_intrinsics"
+    FOCAL_UNCERTAIN = "focal_uncertain"
+    INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -316,8 +368,12 @@ HINTS: dict[Reason, str] = {
         "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
     ),
     Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: show the captured part, or send a prior.",
-    Reason.GUESSED_INTRINSICS: (
-        "The photo fits the scene, but its focal length was guessed, and a wrong one shifts the pose: send intrinsics."
+    Reason.FOCAL_UNCERTAIN: (
+        "The photo fits the scene, but does not tell its focal length, on which the place depends: send intrinsics."
+    ),
+    Reason.INTRINSICS_CONTRADICTED: (
+        "The photo fits the scene far better with another focal length: check the intrinsics, or send them with "
+        'trust "approximate".'
     ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }
@@ -341,6 +397,8 @@ class Verdict:
     covariance: Float64[np.ndarray, "6 6"] | None
     """Of the right perturbation (rotation in rad, translation in units) in the camera frame:
     true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
+    focal_sigma: float = 0.0
+    """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,12 +22,12 @@ from service.types import (
     GaussianScene,
     Intrinsics,
     IterationRecord,
+    Lens,
     Pose,
     Query,
     Reason,
     SceneInfo,
     Status,
-    Verdict,
 )
 
 LENS = Intrinsics(64, 64, 60.0, 60.0, 32.0, 32.0)
@@ -120,22 +120,19 @@ def test_stamps_the_records_and_answers_with_the_last(monkeypatch: pytest.Monkey
     assert found.scene_sha256 == "f" * 64
 
 
-@pytest.mark.parametrize(
-    ("source", "status", "reason"),
-    [
-        ("given", Status.LOCALIZED, Reason.AGREES),
-        ("exif", Status.LOCALIZED, Reason.AGREES),
-        ("guessed", Status.UNCERTAIN, Reason.GUESSED_INTRINSICS),
-    ],
-)
-def test_a_guessed_lens_is_never_localized(monkeypatch, loaded, source, status, reason) -> None:
-    """However well photo and render agree: a wrong focal length moves the pose and hardly the picture."""
-    agreed = Verdict(Status.LOCALIZED, Reason.AGREES, 0.97, 500, 0.95, 1.0, None)
-    monkeypatch.setattr(service.localize, "verify", lambda *_: agreed)
-    use(monkeypatch, Script(2))
-    verdict = localize(replace(QUERY, intrinsics_source=source), loaded).verdict
-    assert (verdict.status, verdict.reason) == (status, reason)
-    assert (verdict.score >= 0.5) == (status is Status.LOCALIZED)
+def test_the_lens_of_the_last_record_is_the_answers(monkeypatch: pytest.MonkeyPatch, loaded: LoadedScene) -> None:
+    """The photo's own intrinsics are corrected, in its own size."""
+
+    class Zoomed(Script):
+        def run(self, query, tools, options):
+            for record in super().run(query, tools, options):
+                yield replace(record, lens=Lens(1.25, 0.01, -0.02))
+
+    use(monkeypatch, Zoomed(2))
+    found, photo = localize(QUERY, loaded).intrinsics, QUERY.photo_intrinsics
+    assert (found.fx, found.fy) == (1.25 * photo.fx, 1.25 * photo.fy)
+    assert found.cx - photo.cx == pytest.approx(0.01 * photo.long_side)
+    assert found.cy - photo.cy == pytest.approx(-0.02 * photo.long_side)
 
 
 def test_times_add_up_by_stage(monkeypatch: pytest.MonkeyPatch, loaded: LoadedScene) -> None:

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.geometry import look_at, moved, pose_distance, project, se3_log, transformed
+from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.alignment import align
-from service.pose.gate import Scale, colour_agreement, covariance_of, gradient_agreement, verify
+from service.pose.gate import Scale, colour_agreement, gradient_agreement, verify
 from service.pose.index import built_index, prepared_index
 from service.pose.pnp import reprojection_error_px, resection
 from service.pose.retrieval import top, visual_words, vlad, vote
@@ -297,7 +297,7 @@ def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
     pose = moved(truth, offset)
     for _ in range(2):
         camera = Camera(LENS, pose)
-        result = align(query.rgb, PaintedWalls().render([camera])[0], camera, pose, 3)
+        result = align(query.rgb, PaintedWalls().render([camera])[0], camera, camera, 3)
         pose = result.pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.06  # seen: 0.01 to 0.03; the board's edge is not antialiased
@@ -308,7 +308,7 @@ def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
 def test_alignment_at_the_truth_stays_there() -> None:
     truth = true_pose()
     camera = Camera(LENS, truth)
-    result = align(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, truth, 2)
+    result = align(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 2)
     angle, distance = pose_distance(result.pose, truth)
     assert angle < 0.003  # the photo's 8 bits: seen 0.0005
     assert distance < 0.0003
@@ -321,7 +321,7 @@ def test_alignment_ignores_what_a_fifth_of_the_photo_hides() -> None:
     pose = moved(truth, np.array([0.01, -0.008, 0.01, 0.03, -0.02, 0.02]))
     for _ in range(2):
         camera = Camera(LENS, pose)
-        pose = align(rgb, PaintedWalls().render([camera])[0], camera, pose, 3).pose
+        pose = align(rgb, PaintedWalls().render([camera])[0], camera, camera, 3).pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.4  # seen: 0.17
     assert distance < 0.03  # of 3.2
@@ -332,7 +332,7 @@ def test_alignment_starts_from_any_pose_near_the_render() -> None:
     truth = true_pose(4)
     camera = Camera(LENS, moved(truth, np.array([0.01, 0.01, 0, 0.02, 0, 0])))
     frame = PaintedWalls().render([camera])[0]
-    a, b = (align(photo_from(truth).rgb, frame, camera, start, 3).pose for start in (camera.pose, truth))
+    a, b = (align(photo_from(truth).rgb, frame, camera, Camera(LENS, start), 3).pose for start in (camera.pose, truth))
     angle, distance = pose_distance(a, b)
     assert angle < 0.01
     assert distance < 0.001
@@ -342,9 +342,9 @@ def test_alignment_without_overlap_has_infinite_loss() -> None:
     camera = Camera(LENS, true_pose())
     frame = PaintedWalls().render([camera])[0]
     away = moved(camera.pose, np.array([0.0, 2.5, 0, 0, 0, 0]))
-    assert align(photo_from(true_pose()).rgb, frame, camera, away, 2).loss == np.inf
+    assert align(photo_from(true_pose()).rgb, frame, camera, Camera(LENS, away), 2).loss == np.inf
     empty = Frame(frame.rgb, 0 * frame.alpha, 0 * frame.depth, 0 * frame.depth)
-    assert align(photo_from(true_pose()).rgb, empty, camera, camera.pose, 2).loss == np.inf
+    assert align(photo_from(true_pose()).rgb, empty, camera, camera, 2).loss == np.inf
 
 
 # --- the gate
@@ -373,26 +373,6 @@ def test_the_gate_says_why() -> None:
     assert verdict.status is Status.NOT_LOCALIZED
     assert verdict.reason is Reason.NO_MATCHING_VIEW
     assert verdict.covariance is None
-
-
-def test_the_covariance_predicts_how_resections_scatter() -> None:
-    """Against a simulation: many resections of the same points with noise on the pixels."""
-    rng = np.random.default_rng(5)
-    pose = true_pose()
-    points = np.concatenate([rng.uniform(-1.5, 1.5, (120, 2)), rng.choice([0.0, 0.7], (120, 1))], 1)
-    px = project(transformed(pose.camera_from_world, points), LENS)
-    twists = []
-    for _ in range(200):
-        found = resection(px + rng.normal(0, 0.5, px.shape), points, LENS, 5.0, 100)
-        assert found is not None
-        twists.append(se3_log(pose.camera_from_world @ found.pose.world_from_camera))
-    noise = np.linalg.norm(rng.normal(0, 0.5, px.shape), axis=1)
-    predicted = covariance_of(points.astype(np.float32), noise, Camera(LENS, pose))
-    assert predicted is not None
-    ratio = np.sqrt(np.diag(np.cov(np.array(twists).T)) / np.diag(predicted))
-    assert np.all((ratio > 0.75) & (ratio < 1.3))  # seen: 0.93 to 1.09
-    correlation = [m / np.sqrt(np.outer(np.diag(m), np.diag(m))) for m in (np.cov(np.array(twists).T), predicted)]
-    assert np.abs(correlation[0] - correlation[1]).max() < 0.3  # seen: 0.15
 
 
 def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place() -> None:

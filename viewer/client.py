@@ -18,6 +18,7 @@ from service.types import (
     Candidates,
     Intrinsics,
     IterationRecord,
+    Lens,
     MatchVectors,
     NamedCamera,
     Pose,
@@ -231,6 +232,7 @@ def parsed_record(raw: dict[str, Any]) -> IterationRecord:
     return IterationRecord(
         stage=raw["stage"],
         pose=_pose(raw),
+        lens=Lens(**raw["lens"]),
         matches=matches
         and MatchVectors(
             frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),

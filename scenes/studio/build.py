@@ -39,8 +39,8 @@ from mathutils import Matrix
 
 SEED = 7
 TRAINING = 120
-# Per pixel, before denoising. Training averages over many photos, so it gets by with fewer.
-SAMPLES = {"train": 8, "heldout_original": 12}
+# Per pixel, before denoising.
+SAMPLES = {"train": 16, "heldout_original": 24}
 MODIFICATIONS = (
     "none", "exposure", "wide", "occlusion", "none", "portrait", "none", "exposure",
     "occlusion", "none", "wide", "none", "exposure", "portrait", "occlusion", "none",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 
 from service.api.geo import geographic
@@ -14,6 +16,7 @@ from service.api.schemas import (
     GeoPosition,
     GeoQuaternion,
     IntrinsicsOut,
+    LensOut,
     MatchesOut,
     Matrix,
     NamedCameraOut,
@@ -31,6 +34,7 @@ from service.types import (
     GeoAnchor,
     Intrinsics,
     IterationRecord,
+    Lens,
     NamedCamera,
     Pose,
     PoseEstimate,
@@ -87,6 +91,7 @@ def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
         cx=intrinsics.cx,
         cy=intrinsics.cy,
         distortion=list(intrinsics.distortion),
+        trust=intrinsics.trust,
     )
 
 
@@ -109,6 +114,7 @@ def record_out(record: IterationRecord) -> Record:
         index=record.index,
         stage=record.stage,
         world_from_camera=rows(record.pose.world_from_camera),
+        lens=LensOut(**asdict(record.lens)),
         elapsed_s=record.elapsed_s,
         cpu_s=record.cpu_s,
         loss=record.loss,
@@ -133,7 +139,8 @@ def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> 
     if of_matches and record.matches is not None:
         camera = record.matches.render_camera
         return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
-    return Camera(_intrinsics_in(photo), Pose(np.array(record.world_from_camera)))
+    lens = Lens(**record.lens.model_dump())
+    return Camera(_intrinsics_in(photo).corrected(lens), Pose(np.array(record.world_from_camera)))
 
 
 def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
@@ -168,6 +175,7 @@ def result_out(
         geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
+        focal_sigma_px=verdict.focal_sigma * estimate.intrinsics.fx if verdict.focal_sigma else None,
         inliers=verdict.inliers,
         agreement=verdict.agreement,
         coverage=verdict.coverage,

@@ -47,8 +47,9 @@ class LocalizeFields(Model):
     options: dict[str, Any] = Field(default_factory=dict)
     """The estimator's options; `/capabilities` has their schema."""
     intrinsics: dict[str, Any] | None = None
-    """Of the upright photo: `width, height, fx, fy, cx, cy`, and COLMAP's `model` and `distortion`. Left out:
-    taken from the EXIF data, or guessed."""
+    """Of the upright photo: `width, height, fx, fy, cx, cy`, COLMAP's `model` and `distortion`, and `trust`: `exact`
+    (the default), or `approximate`, whose focal length is estimated with the pose. Left out: taken from the EXIF
+    data, or guessed; approximate then."""
     prior: PriorIn | None = None
     truth: PriorIn | None = None
     """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""

@@ -82,6 +82,16 @@ class IntrinsicsOut(Model):
     cy: float
     distortion: list[float]
     """COLMAP's parameters after focal lengths and principal point."""
+    trust: Literal["exact", "approximate"]
+
+
+class LensOut(Model):
+    """How the photo's lens differs from the intrinsics assumed for it."""
+
+    focal_factor: float
+    shift_x: float
+    """Of the principal point, in long sides of the image."""
+    shift_y: float
 
 
 class CameraOut(Model):
@@ -115,6 +125,8 @@ class Record(Model):
     stage: str
     world_from_camera: Matrix
     """4x4: the best pose so far, which would be the answer if the job were stopped here."""
+    lens: LensOut
+    """What goes with the pose where the photo's intrinsics are approximate."""
     elapsed_s: float
     """Wall time since the job's start."""
     cpu_s: float
@@ -208,6 +220,9 @@ class Result(Model):
     intrinsics: IntrinsicsOut
     """Used for the whole upright photo."""
     intrinsics_source: Literal["given", "exif", "guessed"]
+    """Unless they are `exact`, focal length and principal point were estimated from there."""
+    focal_sigma_px: float | None
+    """Standard deviation of the estimated focal length; null where it was given as exact."""
     inliers: int
     agreement: float
     """Correlation of the gradients of photo and render, -1..1."""

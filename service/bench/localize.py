@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, summary, units_of
+from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
 from service.bench.queries import BenchPhoto, find_photos, photo_bytes
 from service.bench.starts import require_kind, start_pose
 from service.estimators import ESTIMATORS
@@ -166,5 +166,9 @@ def _line(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) 
         "renders": estimate.renders,
         "latency_ms": outcome.latency_ms,
         "cpu_ms": outcome.cpu_ms,
+        "nees": nees(estimate, trial.truth.pose),
+        "covariance": None if verdict.covariance is None else verdict.covariance.tolist(),
+        "focal_error": estimate.intrinsics.fx / trial.truth.intrinsics.fx - 1.0,
+        "focal_sigma": verdict.focal_sigma,
         "stages_ms": {timing.stage: 1e3 * timing.wall_s for timing in estimate.timings},
     }

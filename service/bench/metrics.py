@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from service.geometry import pose_distance
+from service.geometry import pose_distance, se3_log
 from service.pose.focus import focus_of
-from service.types import Camera, Pose, Status
+from service.types import Camera, Pose, PoseEstimate, Status
 
 FOCUS_DISTANCE = 4.0
 """Median distance of the training cameras from the focus, in normalized units."""
@@ -67,6 +67,15 @@ def errors(estimate: Pose, truth: Pose, units: Units) -> tuple[float, float]:
     """Return the rotation error in degrees and the distance in normalized units."""
     angle, distance = pose_distance(estimate, truth)
     return angle, distance * units.units_per_scene_unit
+
+
+def nees(estimate: PoseEstimate, truth: Pose) -> float | None:
+    """Return the normalized error squared: 6 on average if the covariance is true. None without a covariance."""
+    covariance = estimate.verdict.covariance
+    if covariance is None:
+        return None
+    twist = se3_log(estimate.pose.camera_from_world @ truth.world_from_camera)
+    return float(twist @ np.linalg.solve(covariance, twist))
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, float | int]:

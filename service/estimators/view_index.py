@@ -21,6 +21,7 @@ from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Features, Tools
 from service.pose.alignment import align
+from service.pose.focal import WIDER, focal_resection, refine
 from service.pose.gate import verify
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.pnp import Resection, resection
@@ -35,7 +36,7 @@ from service.pose.views import (
     rendered_frame,
     rendered_view,
 )
-from service.types import Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Status
+from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Status
 
 MATCH_ERROR_PX = 4.0
 """At PHOTO_PX; XFeat's points scatter by 1.5 px."""
@@ -79,19 +80,24 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
-    answer: tuple[Pose, float] | None = None
+    answer: tuple[IterationRecord, float] | None = None
     for search in _searches(query, tools, options):
         last: IterationRecord | None = None
         for last in search:
-            yield last if answer is None else replace(last, pose=answer[0])
+            yield last if answer is None else _with_pose_of(answer[0], last)
         if last is None or (answer and last.stage != "align"):
             continue  # the search gave up
-        verdict = verify(query, last.pose, tools)
+        verdict = verify(query.corrected(last.lens), last.pose, tools)
         if answer is None or verdict.score > answer[1]:
-            answer = last.pose, verdict.score
-        yield IterationRecord("verify", answer[0], loss=1.0 - answer[1], num_inliers=verdict.inliers)
+            answer = last, verdict.score
+        final = IterationRecord("verify", last.pose, loss=1.0 - answer[1], num_inliers=verdict.inliers)
+        yield _with_pose_of(answer[0], final)
         if verdict.status is Status.LOCALIZED:
             return
+
+
+def _with_pose_of(answer: IterationRecord, record: IterationRecord) -> IterationRecord:
+    return replace(record, pose=answer.pose, lens=answer.lens)
 
 
 def _searches(query: Query, tools: Tools, options: Options) -> Iterator[Iterator[IterationRecord]]:
@@ -138,7 +144,7 @@ def _matched(
         found = _resected(seen[-1], query, MATCH_ERROR_PX, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        yield _match_record("match", best.pose if best else views[0].camera.pose, seen[-1], found, view.camera)
+        yield _match_record("match", best or views[0].camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
     pooled = Correspondences.pooled(seen)
@@ -147,7 +153,8 @@ def _matched(
         best = together
     if best is None:
         return None
-    yield IterationRecord("pool", best.pose, num_matches=len(pooled.photo_px), num_inliers=best.num_inliers)
+    count = len(pooled.photo_px)
+    yield IterationRecord("pool", best.pose, best.lens, num_matches=count, num_inliers=best.num_inliers)
     return best
 
 
@@ -155,15 +162,15 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
     """Render at the pose and match with that: a right pose gains matches, a chance one has none there."""
     photo = photo_features(query, tools)
     for _ in range(REMATCHES):
-        view, _ = rendered_view(found.pose, query, tools)
+        view, _ = rendered_view(found.pose, query.corrected(found.lens), tools)
         matches = correspondences(photo, view, tools.matcher)
-        again = _resected(matches, query, REMATCH_ERROR_PX, 500)
+        again = _resected(matches, query, REMATCH_ERROR_PX, 500, near=found)
         if again is None or again.num_inliers < CHANCE:
             return None
         step_deg, step_units = pose_distance(found.pose, again.pose)
         distance = np.median(np.linalg.norm(view.points_in_world - again.pose.position_in_world, axis=1))
         found = again
-        record = _match_record("rematch", found.pose, matches, found, view.camera)
+        record = _match_record("rematch", found, matches, found, view.camera)
         yield replace(record, step_deg=step_deg, step_units=step_units)
         if step_deg < SETTLED_DEG and step_units < SETTLED_SHARE * distance:
             break
@@ -172,21 +179,25 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
 
 def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Align on a render, render at the result, align again, until a new render would be the same."""
-    pose, camera = found.pose, None
+    pose, camera, lens = found.pose, None, found.lens
     for round_number in range(ALIGNMENTS):
-        frame, new_camera = rendered_frame(pose, query, tools, SETTLED_PX if camera else 1.0)
+        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, SETTLED_PX if camera else 1.0)
         if new_camera is camera:
             return
         camera = new_camera
+        size = camera.intrinsics
+        start = Camera(query.intrinsics.resized(size.width, size.height), pose)
         levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
-        result = align(photo_at(query, tools, camera.intrinsics), frame, camera, pose, levels)
+        photo = photo_at(query, tools, size)
+        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma)
         if not np.isfinite(result.loss):
             return
         step_deg, step_units = pose_distance(pose, result.pose)
-        pose = result.pose
+        pose, lens = result.pose, result.lens
         yield IterationRecord(
             "align",
             pose,
+            lens,
             result.loss,
             num_inliers=found.num_inliers,
             step_deg=step_deg,
@@ -194,18 +205,30 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
         )
 
 
-def _resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> Resection | None:
+def _resected(
+    matches: Correspondences, query: Query, max_error_px: float, max_trials: int, near: Resection | None = None
+) -> Resection | None:
+    """Resect with the photo's focal length, or with the best one if that is approximate; `near` saves the search."""
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
-    return resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, max_trials)
+    given = (matches.photo_px, matches.points_in_world)
+    if not query.focal_sigma:
+        return resection(*given, query.intrinsics, pixels, max_trials)
+    if near is None:
+        return focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
+    found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
+    if found is None:
+        return None
+    return refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
 
 
 def _match_record(
-    stage: str, pose: Pose, matches: Correspondences, found: Resection | None, camera: Camera
+    stage: str, best: Resection | Pose, matches: Correspondences, found: Resection | None, camera: Camera
 ) -> IterationRecord:
     inlier = found.inlier if found else np.zeros(len(matches.photo_px), bool)
     return IterationRecord(
         stage,
-        pose,
+        best if isinstance(best, Pose) else best.pose,
+        EXACT if isinstance(best, Pose) else best.lens,
         num_matches=len(inlier),
         num_inliers=int(inlier.sum()),
         matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),

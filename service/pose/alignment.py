@@ -5,10 +5,10 @@ For the pixels x of a render I (intensity, depth: the point X in the render's ca
     minimize  sum |r|,   r = P(project(T X)) - (gain I(x) + bias),   T = photo_camera_from_render_camera
 
 by inverse compositional steps (Baker and Matthews, IJCV 2004): the render is moved by a small twist, so its
-gradients and Jacobians are computed once; each step solves 8 normal equations (twist, gain, bias) with weights
-1 / max(|r|, DELTA) that fall to nothing at CUT times the median residual: what hides the scene has no say. Coarse
-to fine over an image pyramid. The render's own change with the pose (occlusion, highlights) is ignored: render
-again at the result and repeat.
+gradients and Jacobians are computed once; each step solves 8 normal equations (twist, gain, bias; 11 with the
+photo's lens, where that is approximate) with weights 1 / max(|r|, DELTA) that fall to nothing at CUT times the
+median residual: what hides the scene has no say. Coarse to fine over an image pyramid. The render's own change with
+the pose (occlusion, highlights) is ignored: render again at the result and repeat.
 
 Measured in the research: RGB, forward or symmetric gradients are no better on real photos; L2 is worst; two renders
 are enough; the basin with four levels is some 10 degrees. The cut, here: with a third of the photo hidden medians
@@ -17,16 +17,18 @@ halve, and clean photos of poor models gain as much; blurred ones lose a little.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 
 from service.geometry import moved, se3_exp, se3_log
 from service.interfaces import Frame
 from service.jit import kernel
-from service.types import Camera, Intrinsics, Pose
+from service.pose.focal import lens_precision, lens_state, stepped
+from service.types import EXACT, Camera, Intrinsics, Lens, Pose
 
 DELTA = 0.02
 """Residuals (0..1) below it are noise: they weigh like least squares."""
@@ -36,6 +38,9 @@ MAX_STEPS = 12
 SIGMA_PX = 0.7
 """Blur of photo and render at each level: renders are softer than photos."""
 MIN_ALPHA = 0.5
+BLOCK_PX = 16
+INFLATION = 2.5
+"""Of standard deviations: a model's own geometry errs beyond what the residuals show."""
 EDGE_PX = 2
 EDGE_JUMP = 0.06
 """Relative; a surface seen at 80 degrees from its normal changes by 0.02 over two pixels."""
@@ -44,77 +49,192 @@ MAX_PIXELS = 8_000
 MIN_PIXELS = 200
 FAR = np.float32(1e30)
 SETTLED_PX = 0.005
+CORRELATED = 50.0
+"""Neighbouring residuals err together: this many count as one observation against what is known of the lens."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
     pose: Pose
+    lens: Lens
+    """Beside the intrinsics that were given."""
     loss: float
     """Mean absolute residual (0..1) at the finest level; infinite where too few pixels overlap."""
 
 
-def align(photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, start: Pose, levels: int) -> Alignment:
+def align(
+    photo: UInt8[np.ndarray, "h w 3"],
+    frame: Frame,
+    camera: Camera,
+    start: Camera,
+    levels: int,
+    lens: Lens = EXACT,
+    focal_sigma: float = 0.0,
+) -> Alignment:
     """Move `start` until the photo agrees with the frame, which `camera` rendered.
 
-    The photo has the frame's size and intrinsics. `start` need not be the camera's pose.
+    The photo has the frame's size; `start` has the photo's intrinsics, without the `lens` to begin with, and its pose
+    need not be the camera's. The lens is estimated too unless `focal_sigma` (of the logarithm) is 0.
     """
-    photo_levels = _pyramid(_luma(photo), levels)
-    render_levels = _pyramid(_luma(frame.rgb), levels)
-    depth_levels = _depth_pyramid(_edge_owner_depth(frame), levels)
-    state = _State(start.camera_from_world @ camera.pose.world_from_camera)
+    state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma)
     loss = np.inf
-    for level in reversed(range(levels)):
-        height, width = photo_levels[level].shape
-        intrinsics = camera.intrinsics.resized(width, height)
-        loss = _align_level(photo_levels[level], render_levels[level], depth_levels[level], intrinsics, state)
+    for level in _levels(photo, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma)):
+        loss = _align_level(level, state)
         if not np.isfinite(loss):
-            return Alignment(start, loss)
+            return Alignment(start.pose, lens, loss)
     render_from_photo = np.linalg.inv(state.photo_from_render)
-    return Alignment(moved(camera.pose, se3_log(render_from_photo)), loss)
+    return Alignment(moved(camera.pose, se3_log(render_from_photo)), state.lens, loss)
 
 
 @dataclass(slots=True)
 class _State:
     photo_from_render: Float64[np.ndarray, "4 4"]
+    lens: Lens
+    focal_sigma: float
     gain: float = 1.0
     bias: float = 0.0
 
 
-def _align_level(
-    photo: Float32[np.ndarray, "h w"],
-    render: Float32[np.ndarray, "h w"],
-    depth: Float32[np.ndarray, "h w"],
-    intrinsics: Intrinsics,
-    state: _State,
-) -> float:
+@dataclass(frozen=True, slots=True)
+class _Level:
+    """One level of the pyramid, linearized."""
+
+    photo: Float32[np.ndarray, "h w"]
+    pixels: Int64[np.ndarray, "n"]
+    """Places in the render without its border."""
+    points: Float32[np.ndarray, "3 n"]
+    columns: Float32[np.ndarray, "k n"]
+    photo_lens: Intrinsics
+
+    def residuals(self, state: _State) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"], float]:
+        """Return residuals, weights (0 outside the photo), and the mean absolute residual, infinite if few overlap."""
+        residuals, weights = np.empty((2, len(self.pixels)), np.float32)
+        k = _parameters(self.photo_lens.corrected(state.lens))
+        total, count = _residuals(
+            self.photo, self.points, self.columns[6], state.photo_from_render, k,
+            state.gain, state.bias, DELTA, residuals, weights,
+        )  # fmt: skip
+        if count < MIN_PIXELS:
+            return residuals, weights, np.inf
+        return residuals, weights * _bisquare(residuals, weights), total / count
+
+
+def _levels(
+    photo: UInt8[np.ndarray, "h w 3"],
+    frame: Frame,
+    render_lens: Intrinsics,
+    photo_lens: Intrinsics,
+    levels: int,
+    lens_unknown: bool,
+) -> Iterator[_Level]:
+    """Linearize the levels of the pyramid, coarsest first; each only when it is asked for."""
+    photos, renders = _pyramid(_luma(photo), levels), _pyramid(_luma(frame.rgb), levels)
+    depths = _depth_pyramid(_edge_owner_depth(frame), levels)
+    for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):
+        height, width = render.shape
+        pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
+        pixels = np.ascontiguousarray(pixels[:: max(1, len(pixels) // MAX_PIXELS)])  # one layout: one compilation
+        points, columns = _linearize(render, depth, pixels, _parameters(render_lens.resized(width, height)))
+        columns = columns if lens_unknown else columns[:8]
+        yield _Level(photo_level, pixels, points, columns, photo_lens.resized(width, height))
+
+
+def _align_level(level: _Level, state: _State) -> float:
     """Run Gauss-Newton at one level, changing `state`; return the mean absolute residual."""
-    pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
-    pixels = np.ascontiguousarray(pixels[:: max(1, len(pixels) // MAX_PIXELS)])  # one layout: one compilation
-    if len(pixels) < MIN_PIXELS:
+    if len(level.pixels) < MIN_PIXELS:
         return np.inf
-    k = np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
-    points, columns = _linearize(render, depth, pixels, k)
-    typical_depth = float(np.median(points[2]))
-    residuals, weights = np.empty(len(pixels), np.float32), np.empty(len(pixels), np.float32)
+    typical_depth = float(np.median(level.points[2]))
     loss = np.inf
     for _ in range(MAX_STEPS):
-        total, count = _residuals(
-            photo, points, columns[6], state.photo_from_render, k, state.gain, state.bias, DELTA, residuals, weights
-        )
-        if count < MIN_PIXELS:
+        residuals, weights, loss = level.residuals(state)
+        if not np.isfinite(loss):
             return np.inf
-        loss = total / count
-        weights *= _bisquare(residuals, weights)
-        step = _solved(columns, residuals, weights, state.gain)
+        step = _solved(level.columns, residuals, weights, state, loss)
         if not np.all(np.isfinite(step)):
             return np.inf
         state.photo_from_render = state.photo_from_render @ se3_exp(-step[:6])
         state.gain += step[6]
         state.bias += step[7]
-        moved_px = intrinsics.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
-        if moved_px < SETTLED_PX:
+        if state.focal_sigma:
+            state.lens = stepped(state.lens, step[8:], state.focal_sigma)
+        lens = level.photo_lens
+        moved_px = lens.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
+        if moved_px + lens.long_side * np.abs(step[8:]).max() < SETTLED_PX:
             break
     return loss
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the pixels say of a pose."""
+
+    pull: Float64[np.ndarray, "6"]
+    """The twist (rad, scene units) by which alignment would still move the pose: true = pose @ exp(twist)."""
+    covariance: Float64[np.ndarray, "k k"]
+    """Of the twist; with an approximate lens also of its `lens_state`."""
+    focal_pull: float
+    """By how much the logarithm of the focal length would change if it were free..."""
+    focal_sigma: float
+    """...and the standard deviation of that."""
+
+
+def evidence(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, answer: Camera, focal_sigma: float
+) -> Evidence | None:
+    """Weigh an answer against the frame, which `camera` rendered nearby; None where too few pixels overlap.
+
+    Residuals of neighbours err together, and some regions err more than others: the covariance is the sandwich
+    estimator, clustered by blocks of the image (White 1980; Liang and Zeger 1986).
+    """
+    (level,) = _levels(photo, frame, camera.intrinsics, answer.intrinsics, 1, lens_unknown=True)
+    state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0)
+    before = state.photo_from_render
+    if not np.isfinite(_align_level(replace(level, columns=level.columns[:8]), state)):
+        return None
+    pull = se3_log(before @ np.linalg.inv(state.photo_from_render))
+    residuals, weights, _ = level.residuals(state)
+    factor = np.where((np.arange(11) == 6) | (np.arange(11) == 7), 1.0, state.gain)
+    columns = level.columns * factor[:, None].astype(np.float32)
+    scores = columns * (weights * residuals)
+    width = frame.alpha.shape[1] - 2
+    row, column = np.divmod(level.pixels, width)
+    block = row // BLOCK_PX * (width // BLOCK_PX + 1) + column // BLOCK_PX
+    summed = INFLATION * np.stack([np.bincount(block, weights=score) for score in scores])
+    # The loss is bent only near 0; the weights of the steps would overstate it.
+    hessian = ((columns * (weights * (np.abs(residuals) < DELTA))) @ columns.T).astype(np.float64)
+    covariance = _sandwich(hessian, summed)
+    free_focal = _sandwich(hessian[:9, :9], summed[:9])
+    if covariance is None or free_focal is None:
+        return None
+    focal_pull = float(np.linalg.solve(hessian[:9, :9], scores[:9].sum(1, dtype=np.float64))[8])
+    if focal_sigma:
+        keep = np.r_[0:6, 8:11]
+        information = np.linalg.inv(covariance[np.ix_(keep, keep)])
+        information[range(6, 9), range(6, 9)] += lens_precision(focal_sigma)
+        covariance = np.linalg.inv(information)
+    else:
+        covariance = _sandwich(hessian[:8, :8], summed[:8])
+        if covariance is None:
+            return None
+        covariance = covariance[:6, :6]
+    return Evidence(pull, covariance, focal_pull, float(np.sqrt(free_focal[8, 8])))
+
+
+def _sandwich(
+    hessian: Float64[np.ndarray, "k k"], scores: Float64[np.ndarray, "k blocks"]
+) -> Float64[np.ndarray, "k k"] | None:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
+    try:
+        inverse = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    except np.linalg.LinAlgError:
+        return None
+    half = inverse @ scores
+    covariance = half @ half.T
+    return covariance if np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0) else None
+
+
+def _parameters(lens: Intrinsics) -> Float64[np.ndarray, "4"]:
+    return np.array([lens.fx, lens.fy, lens.cx, lens.cy])
 
 
 def _bisquare(residuals: Float32[np.ndarray, "n"], weights: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
@@ -126,18 +246,28 @@ def _bisquare(residuals: Float32[np.ndarray, "n"], weights: Float32[np.ndarray, 
 
 
 def _solved(
-    columns: Float32[np.ndarray, "8 n"],
+    columns: Float32[np.ndarray, "k n"],
     residuals: Float32[np.ndarray, "n"],
     weights: Float32[np.ndarray, "n"],
-    gain: float,
-) -> Float64[np.ndarray, "8"]:
+    state: _State,
+    loss: float,
+) -> Float64[np.ndarray, "11"]:
     """Solve the weighted normal equations; each unknown is scaled, for they differ by orders of magnitude."""
+    size = len(columns)
     weighted = columns * weights
-    factor = np.where(np.arange(8) < 6, gain, 1.0)  # the photo shows the render's gradients times the gain
+    # The photo shows the render's gradients times the gain.
+    factor = np.where((np.arange(size) == 6) | (np.arange(size) == 7), 1.0, state.gain)
     hessian = (weighted @ columns.T).astype(np.float64) * np.outer(factor, factor)
+    right = factor * (weighted @ residuals)
+    if state.focal_sigma:
+        trust = CORRELATED * loss * lens_precision(state.focal_sigma)
+        hessian[range(8, 11), range(8, 11)] += trust
+        right[8:] -= trust * lens_state(state.lens)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    damped = hessian * np.outer(scale, scale) + 1e-6 * np.eye(8)
-    return scale * np.linalg.solve(damped, scale * factor * (weighted @ residuals))
+    damped = hessian * np.outer(scale, scale) + 1e-6 * np.eye(size)
+    step = np.zeros(11)
+    step[:size] = scale * np.linalg.solve(damped, scale * right)
+    return step
 
 
 def _luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
@@ -184,15 +314,16 @@ def _depth_pyramid(depth: Float32[np.ndarray, "h w"], levels: int) -> list[Float
 
 @kernel
 def _linearize(render, depth, pixels, k):
-    """Return the points in the render's camera frame, and the columns d value / d (twist, gain, bias).
+    """Return the points in the render's camera frame, and the columns d value / d (twist, gain, bias, lens).
 
-    The twist moves the points, the gain's column is the render's value.
+    The twist moves the points, the gain's column is the render's value. The lens (see `lens_state`) is the photo's.
     """
     fx, fy, cx, cy = k[0], k[1], k[2], k[3]
     inner = render.shape[1] - 2
     n = len(pixels)
     points = np.empty((3, n), np.float32)
-    columns = np.empty((8, n), np.float32)
+    columns = np.empty((11, n), np.float32)
+    side = max(render.shape)
     for i in range(n):
         row, column = pixels[i] // inner + 1, pixels[i] % inner + 1
         z = depth[row, column]
@@ -210,6 +341,9 @@ def _linearize(render, depth, pixels, k):
         columns[5, i] = -along / z
         columns[6, i] = render[row, column]
         columns[7, i] = 1.0
+        columns[8, i] = -along
+        columns[9, i] = -du / fx * side
+        columns[10, i] = -dv / fy * side
     return points, columns
 
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from service.geometry import transformed
 from service.interfaces import Frame, Tools
+from service.pose.alignment import Evidence, evidence
 from service.pose.pnp import reprojection_error_px
 from service.pose.views import (
     correspondences,
@@ -36,7 +36,6 @@ MIN_ALPHA = 0.5
 MAX_ERROR_PX = 4.0
 """At RENDER_PX. XFeat's points scatter by 1.5."""
 MIN_FEATURES = 30
-MIN_COVARIANCE_POINTS = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +57,16 @@ GRADIENTS = Scale(0.4, 0.65, 0.95)
 COLOURS = Scale(0.3, 0.62, 0.95)
 INLIERS = Scale(15.0, 50.0, 400.0)
 COVERAGE = Scale(0.02, 0.04, 0.3)
+FOCAL = Scale(0.25, 1.0, 10.0)
+ENOUGH_FOCAL_SIGMA = 0.008
+"""Of the logarithm: a focal length 1 % off moves the camera by 1 % of the distance."""
+CONTRADICTION = 0.02
+"""Of the logarithm, and six standard deviations."""
 
 
 def verify(query: Query, pose: Pose, tools: Tools) -> Verdict:
     """Judge a pose. Costs a render and its features unless the job has just made them (see pose/views.py)."""
-    key = ("verdict", pose.world_from_camera.tobytes())
+    key = ("verdict", pose.world_from_camera.tobytes(), query.intrinsics)
     if key not in tools.memo:
         tools.memo[key] = _verdict(query, pose, tools)
     return tools.memo[key]
@@ -79,11 +83,15 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     resized = photo_at(query, tools, intrinsics)
     agreement, colours = gradient_agreement(resized, frame), colour_agreement(resized, frame)
     coverage = float((frame.alpha > MIN_ALPHA).mean())
+    answer = Camera(query.intrinsics.resized(intrinsics.width, intrinsics.height), pose)
+    pixels = evidence(resized, frame, view.camera, answer, query.focal_sigma)
+    focal, covariance, focal_sigma = _of_lens(pixels, query.focal_sigma)
     score, reason = min(
         (GRADIENTS(agreement), Reason.RENDER_DISAGREES),
         (COLOURS(colours), Reason.RENDER_DISAGREES),
         (INLIERS(float(inliers)), Reason.FEW_INLIERS),
         (COVERAGE(coverage), Reason.LITTLE_SCENE_IN_VIEW),
+        focal,
     )
     status = Status.LOCALIZED if score >= 0.5 else Status.UNCERTAIN if score >= 0.25 else Status.NOT_LOCALIZED
     if status is Status.LOCALIZED:
@@ -92,8 +100,22 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
         reason = Reason.FEW_FEATURES
     elif status is Status.NOT_LOCALIZED and GRADIENTS(agreement) < 0.25 and INLIERS(float(inliers)) < 0.25:
         reason = Reason.NO_MATCHING_VIEW
-    covariance = covariance_of(found.points_in_world[inlier], error[inlier], Camera(query.intrinsics, pose))
-    return Verdict(status, reason, score, inliers, agreement, coverage, covariance)
+    return Verdict(status, reason, score, inliers, agreement, coverage, covariance, focal_sigma)
+
+
+def _of_lens(
+    pixels: Evidence | None, known_sigma: float
+) -> tuple[tuple[float, Reason], Float64[np.ndarray, "6 6"] | None, float]:
+    """Return what the lens does to the score, the pose's covariance, and that of the focal length's logarithm."""
+    if pixels is None:
+        return (1.0, Reason.AGREES), None, known_sigma
+    covariance = pixels.covariance[:6, :6] + np.outer(pixels.pull, pixels.pull)
+    if known_sigma:
+        sigma = max(float(np.sqrt(pixels.covariance[6, 6])), abs(pixels.focal_pull))  # a method may not estimate it
+        return (FOCAL(ENOUGH_FOCAL_SIGMA / sigma), Reason.FOCAL_UNCERTAIN), covariance, sigma
+    off = abs(pixels.focal_pull)
+    contradicted = off > CONTRADICTION and off > 3 * pixels.focal_sigma
+    return (0.4 if contradicted else 1.0, Reason.INTRINSICS_CONTRADICTED), covariance, 0.0
 
 
 def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
@@ -150,24 +172,3 @@ def _gradients(rgb: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float3
     along_x = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=1)
     along_y = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=1)
     return np.stack([along_x, along_y], 2)
-
-
-def covariance_of(
-    points_in_world: Float32[np.ndarray, "m 3"], error_px: Float64[np.ndarray, "m"], camera: Camera
-) -> Float64[np.ndarray, "6 6"] | None:
-    """Return the covariance of the twist from the inliers' reprojection: sigma^2 (J^T J)^-1."""
-    if len(points_in_world) < MIN_COVARIANCE_POINTS:
-        return None
-    x, y, z = transformed(camera.pose.camera_from_world, points_in_world).T
-    fx, fy, zero = camera.intrinsics.fx, camera.intrinsics.fy, np.zeros(len(z))
-    u, v = x / z, y / z
-    # d pixel / d twist, where the camera moves, not the points: X -> exp(-twist) X.
-    across = np.stack([fx * u * v, -fx * (1 + u * u), fx * v, -fx / z, zero, fx * u / z], 1)
-    down = np.stack([fy * (1 + v * v), -fy * u * v, -fy * u, zero, -fy / z, fy * v / z], 1)
-    normal = across.T @ across + down.T @ down
-    variance = float(np.sum(error_px**2)) / (2 * len(z) - 6)
-    try:
-        covariance = variance * np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        return None
-    return covariance if np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0) else None

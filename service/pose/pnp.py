@@ -9,7 +9,7 @@ import poselib
 from jaxtyping import Bool, Float
 
 from service.geometry import project, transformed
-from service.types import Intrinsics, Pose
+from service.types import EXACT, Intrinsics, Lens, Pose
 
 MIN_POINTS = 4
 
@@ -18,6 +18,8 @@ MIN_POINTS = 4
 class Resection:
     pose: Pose
     inlier: Bool[np.ndarray, "m"]
+    lens: Lens = EXACT
+    """Beside the intrinsics that were given."""
 
     @property
     def num_inliers(self) -> int:

@@ -118,11 +118,10 @@ def render_views(cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Mat
 
 def rendered_frame(pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0) -> tuple[Frame, Camera]:
     """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
-    intrinsics = sized(query.intrinsics, RENDER_PX)
+    camera = Camera(sized(query.intrinsics, RENDER_PX), pose)
     last: tuple[Frame, Camera] | None = tools.memo.get("last_frame")
-    if last and last[1].intrinsics == intrinsics and _nearly_seen(last[0], last[1], pose, tolerance_px):
+    if last and _nearly_seen(*last, camera, tolerance_px):
         return last
-    camera = Camera(intrinsics, pose)
     tools.memo["last_frame"] = tools.rasterizer.render([camera])[0], camera
     return tools.memo["last_frame"]
 
@@ -137,18 +136,20 @@ def rendered_view(pose: Pose, query: Query, tools: Tools) -> tuple[View, Frame]:
     return last, frame
 
 
-def _nearly_seen(frame: Frame, camera: Camera, pose: Pose, tolerance_px: float) -> bool:
-    """Would what the frame shows be seen from the pose within the tolerance of where it is?"""
-    if pose is camera.pose:
+def _nearly_seen(frame: Frame, camera: Camera, now: Camera, tolerance_px: float) -> bool:
+    """Would what the frame shows be seen by the camera of now within the tolerance of where it is?"""
+    if now.pose is camera.pose and now.intrinsics == camera.intrinsics:
         return True
     height, width = frame.alpha.shape
+    if (width, height) != (now.intrinsics.width, now.intrinsics.height):
+        return False
     row, column = (grid.ravel() for grid in np.mgrid[4:height:16, 4:width:16])
     depth = frame.median_depth[row, column]
     px = np.stack([column, row], 1)[depth > 0] + 0.5
     if len(px) == 0:
         return False
     points = transformed(camera.pose.world_from_camera, unproject(px, depth[depth > 0], camera.intrinsics))
-    error = reprojection_error_px(px, points, camera.intrinsics, pose)
+    error = reprojection_error_px(px, points, now.intrinsics, now.pose)
     return bool((error < tolerance_px).mean() > 0.9)
 
 

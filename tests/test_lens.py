@@ -1,0 +1,159 @@
+"""Approximate lenses, and what the pixels say of a pose: against planted truths, differences and simulations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.errors import InvalidIntrinsics
+from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
+from service.images import intrinsics_from
+from service.pose import alignment
+from service.pose.alignment import align, evidence
+from service.pose.focal import focal_resection, linearized
+from service.pose.views import to_uint8
+from service.types import EXACT, Camera, Intrinsics, Lens, Pose, Query
+from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose
+
+
+def planted(seed: int, lens: Lens, flat: bool, wrong_share: float) -> tuple[np.ndarray, np.ndarray, Pose]:
+    """Matches with a pixel of noise, seen through `lens` beside LENS; some are wrong."""
+    rng = np.random.default_rng(seed)
+    pose = true_pose(seed)
+    points = np.concatenate([rng.uniform(-1.3, 1.3, (150, 2)), rng.uniform(0.0, 0.0 if flat else 1.2, (150, 1))], 1)
+    px = project(transformed(pose.camera_from_world, points), LENS.corrected(lens)) + rng.normal(0, 0.3, (150, 2))
+    wrong = rng.random(150) < wrong_share
+    px[wrong] = rng.uniform([0, 0], [LENS.width, LENS.height], (wrong.sum(), 2))
+    return px, points, pose
+
+
+@pytest.mark.parametrize("factor", [0.45, 0.8, 1.15, 2.2])
+def test_the_focal_length_is_found_among_wrong_matches(factor: float) -> None:
+    px, points, pose = planted(3, Lens(factor), flat=False, wrong_share=0.4)
+    found = focal_resection(px, points, LENS, 0.5, 2.0)
+    assert found is not None
+    assert found.lens.focal_factor == pytest.approx(factor, rel=0.02)
+    angle, distance = pose_distance(found.pose, pose)
+    assert angle < 1.5
+    assert distance < 0.03 * 3.2
+    assert found.num_inliers >= 75
+
+
+def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
+    """A plane parallel to the image: any focal length fits as well with another distance."""
+    rng = np.random.default_rng(0)
+    pose = Pose(np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0] * 4, [0] * 4, [0, 0, 0, 3.0], [0] * 4]))
+    points = np.concatenate([rng.uniform(-1.2, 1.2, (100, 2)), np.zeros((100, 1))], 1)
+    px = project(transformed(pose.camera_from_world, points), LENS.corrected(Lens(1.3)))
+    found = focal_resection(px, points, LENS, 0.1, 2.0)
+    assert found is not None
+    assert found.num_inliers == 100
+    assert found.lens.focal_factor == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("column", range(9))
+def test_linearized_is_the_derivative_by_differences(column: int) -> None:
+    px, points, pose = planted(1, EXACT, flat=False, wrong_share=0.0)
+    jacobian, _ = linearized(px, points, LENS, pose)
+    step = np.zeros(9)
+    step[column] = 1e-6
+
+    def seen(step: np.ndarray) -> np.ndarray:
+        lens = Lens(float(np.exp(step[6])), float(step[7]), float(step[8]))
+        camera = pose.world_from_camera @ se3_exp(step[:6])
+        return project(transformed(np.linalg.inv(camera), points), LENS.corrected(lens))
+
+    difference = (seen(step) - seen(-step)) / 2e-6
+    assert np.allclose(jacobian[..., column], difference, rtol=1e-4, atol=1e-4)
+
+
+def test_alignment_finds_the_lens_with_the_pose() -> None:
+    truth, lens = true_pose(2), Lens(1.06, 0.008, -0.005)
+    rgb = photo_from(truth, LENS.corrected(lens)).rgb
+    pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), EXACT
+    for _ in range(4):
+        camera = Camera(LENS.corrected(found), pose)
+        result = align(rgb, PaintedWalls().render([camera])[0], camera, Camera(LENS, pose), 3, found, 0.5)
+        pose, found = result.pose, result.lens
+    assert found.focal_factor == pytest.approx(1.06, rel=0.004)
+    assert found.shift_x == pytest.approx(0.008, abs=0.003)
+    assert found.shift_y == pytest.approx(-0.005, abs=0.003)
+    angle, distance = pose_distance(pose, truth)
+    assert angle < 0.3
+    assert distance < 0.015
+
+
+def test_the_covariance_predicts_how_alignments_scatter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a simulation: many alignments of the same photo with fresh noise, white from pixel to pixel."""
+    monkeypatch.setattr(alignment, "INFLATION", 1.0)
+    truth = true_pose()
+    camera = Camera(LENS, truth)
+    frame = PaintedWalls().render([camera])[0]
+    rng = np.random.default_rng(0)
+    twists, predicted = [], []
+    for _ in range(60):
+        photo = to_uint8(frame.rgb + rng.normal(0, 0.1, frame.rgb.shape).astype(np.float32))
+        pose = align(photo, frame, camera, camera, 1).pose
+        twists.append(se3_log(truth.camera_from_world @ pose.world_from_camera))
+        found = evidence(photo, frame, camera, Camera(LENS, pose), 0.0)
+        assert found is not None
+        assert np.abs(found.pull).max() < 1e-4
+        predicted.append(found.covariance)
+    ratio = np.sqrt(np.diag(np.cov(np.array(twists).T)) / np.diag(np.mean(predicted, 0)))
+    assert np.all((ratio > 0.7) & (ratio < 1.5)), ratio
+
+
+def test_the_pull_tells_how_far_a_pose_is_off() -> None:
+    truth = true_pose()
+    off = np.array([0.004, -0.003, 0.002, 0.01, 0.005, -0.01])
+    camera = Camera(LENS, moved(truth, off))
+    found = evidence(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 0.0)
+    assert found is not None
+    assert np.allclose(found.pull, -off, atol=2e-3)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.05])
+def test_another_focal_length_than_given_shows(factor: float) -> None:
+    """The pose is the best one for the focal length given; the pixels still ask for another one."""
+    truth = true_pose(1)
+    rgb = photo_from(truth, LENS.corrected(Lens(factor))).rgb
+    pose = truth
+    for _ in range(3):
+        camera = Camera(LENS, pose)
+        frame = PaintedWalls().render([camera])[0]
+        pose = align(rgb, frame, camera, camera, 3).pose
+    found = evidence(rgb, frame, camera, Camera(LENS, pose), 0.0)
+    assert found is not None
+    if factor == 1.0:
+        assert abs(found.focal_pull) < 0.002
+    else:
+        assert found.focal_pull > 0.02
+        assert found.focal_pull > found.focal_sigma
+
+
+def test_corrected_is_undone_by_nothing_but_its_opposite() -> None:
+    lens = Lens(1.2, 0.01, -0.02)
+    there = LENS.corrected(lens)
+    back = there.corrected(Lens(1 / 1.2, -0.01, 0.02))
+    assert np.allclose([back.fx, back.fy, back.cx, back.cy], [LENS.fx, LENS.fy, LENS.cx, LENS.cy])
+    big = LENS.resized(2 * LENS.width, 2 * LENS.height).corrected(lens)
+    assert np.allclose([big.fx, big.cx, big.cy], 2 * np.array([there.fx, there.cx, there.cy]))
+
+
+def test_trust_is_read_and_checked() -> None:
+    given = {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240}
+    assert intrinsics_from(given).trust == "exact"
+    assert intrinsics_from(given | {"trust": "approximate"}).trust == "approximate"
+    with pytest.raises(InvalidIntrinsics, match="exact or approximate") as caught:
+        intrinsics_from(given | {"trust": "maybe"})
+    assert caught.value.where == "trust"
+
+
+def test_only_approximate_intrinsics_leave_the_focal_length_open() -> None:
+    rgb = np.zeros((LENS.height, LENS.width, 3), np.uint8)
+    loose: Intrinsics = replace(LENS, trust="approximate")
+    sigmas = [Query(rgb, lens, source, lens).focal_sigma for lens, source in ((LENS, "given"), (loose, "given"))]
+    assert sigmas[0] == 0.0
+    assert 0 < sigmas[1] < Query(rgb, loose, "guessed", loose).focal_sigma
