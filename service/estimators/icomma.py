@@ -86,7 +86,9 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
             adam.rate = options.rate * DECAY ** ((step - off_since + 1) / DECAY_STEPS)
         numbers = numbers - adam.step(pose_of.gradient(numbers, by_twist))
         reached = pose_of.pose(numbers)
-        record = replace(record, pose=reached, loss=value) if record else IterationRecord("compare", reached, value)
+        record = (
+            replace(record, pose=reached, loss=value) if record else IterationRecord("compare", reached, loss=value)
+        )
         yield record
 
 
