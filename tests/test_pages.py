@@ -7,11 +7,13 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Literal
 
 import httpx
 import numpy as np
 import pytest
-from browsing import NEEDS_CHROMIUM, free_port, launched, opened, served
+from axe_playwright_python.sync_playwright import Axe
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, free_port, launched, opened, served
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
 
@@ -30,7 +32,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     room = write_room(tmp_path_factory.mktemp("scenes") / "room")
     settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=None)
     with served(create_app(settings), port) as url:
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200)
+        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)  # kernels may be compiled
         yield url
 
 
@@ -238,6 +240,58 @@ def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
     expect(page.get_by_role("alert")).to_contain_text("no job 'nothing'")
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_view_has_an_accessibility_finding(page: Page, url: str, scheme: Literal["light", "dark"]) -> None:
+    page.emulate_media(color_scheme=scheme)
+    page.get_by_role("radio").first.wait_for()
+    page.get_by_text("Intrinsics, prior, estimator").click()
+    page.get_by_label("Seed").wait_for()
+    _audit(page)
+    page.set_input_files("#photo", PHOTO)
+    page.locator(".verdict .badge").wait_for()
+    first = page.url.rpartition("/")[2]
+    _audit(page)
+    page.goto(f"{url}/#/jobs")
+    page.locator("tbody tr").first.wait_for()
+    _audit(page)
+    page.goto(f"{url}/#/compare/{first}/{first}")
+    page.locator(".stack").nth(1).wait_for()
+    _audit(page)
+
+
+def _audit(page: Page) -> None:
+    page.evaluate("Promise.all(document.getAnimations().map(animation => animation.finished))")
+    found = Axe().run(page)
+    assert not found.violations_count, found.generate_report()
+
+
+def test_the_whole_way_goes_by_keyboard(page: Page) -> None:
+    page.get_by_role("radio").first.wait_for()
+    focused: list[str] = []
+    for _ in range(9):
+        page.keyboard.press("Tab")
+        focused.append(
+            page.evaluate(
+                "document.activeElement.id || document.activeElement.name || document.activeElement.textContent"
+            )
+        )
+    assert focused[0] == "splatfix"
+    assert {"Localize", "History", "photo", "scene"} <= set(focused)
+    with page.expect_file_chooser() as waited:
+        page.locator("#photo").focus()
+        page.keyboard.press("Enter")
+    waited.value.set_files(PHOTO)
+    page.locator(".badge.localized").wait_for()
+    assert page.evaluate("document.activeElement.id") == "main"
+    above, slider = page.locator(".stack .above"), page.get_by_role("slider")
+    for _ in range(30):
+        page.keyboard.press("Tab")
+        if slider.evaluate("slider => slider === document.activeElement"):
+            break
+    page.keyboard.press("Home")
+    expect(above).to_have_css("opacity", "0")
+
+
 def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> None:
     keys, port = KeyRing(tmp_path / "keys.json"), free_port()
     key = keys.make_passing("tester", "localize")
@@ -251,8 +305,12 @@ def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> N
 
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
-    page = opened(browser, f"{url}/", 360, 740)
+    context = browser.new_context(viewport={"width": 360, "height": 740}, has_touch=True, is_mobile=True)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE_MS)
+    page.goto(f"{url}/")
     page.get_by_role("radio").first.wait_for()
+    expect(page.get_by_label("Take a photo")).to_have_attribute("capture", "environment")
     page.get_by_text("Intrinsics, prior, estimator").click()
     page.get_by_label("Seed").wait_for()
     assert _overflow(page) <= 0
@@ -262,7 +320,7 @@ def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
     page.goto(f"{url}/#/jobs")
     page.locator("tbody tr").first.wait_for()
     assert _overflow(page) <= 0
-    page.close()
+    context.close()
 
 
 def _overflow(page: Page) -> int:

@@ -5,7 +5,7 @@ export function h(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(properties)) {
     if (value === null || value === undefined || value === false) continue;
-    if (name === "class" || name === "role" || name === "for" || name.includes("-")) element.setAttribute(name, value);
+    if (name === "class" || name === "role" || name === "for" || name === "capture" || name.includes("-")) element.setAttribute(name, value);
     else element[name] = value;
   }
   element.append(...children.flat().filter(child => child !== null && child !== undefined && child !== ""));

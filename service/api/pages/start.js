@@ -57,9 +57,9 @@ async function onlyScene() {
 }
 
 function picker() {
+  const hasCamera = navigator.maxTouchPoints > 0;  // a phone or tablet
   const pick = h("input", { type: "file", accept: "image/*,.heic,.heif", id: "photo", class: "sr" });
-  const shoot = h("input", { type: "file", accept: "image/*", id: "shoot", class: "sr" });
-  shoot.setAttribute("capture", "environment");
+  const shoot = h("input", { type: "file", accept: "image/*", id: "shoot", class: "sr", capture: "environment" });
   for (const input of [pick, shoot]) {
     input.addEventListener("change", async () => {
       const file = input.files[0];
@@ -71,7 +71,7 @@ function picker() {
     h("p", {}, h("strong", {}, "Drop a photo here"), ", paste it, or"),
     h("div", { class: "buttons" },
       pick, h("label", { for: "photo", class: "button primary" }, "Choose a photo"),
-      shoot, h("label", { for: "shoot", class: "button touch" }, "Take a photo")));
+      ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : [])));
 }
 
 function more() {
