@@ -44,7 +44,7 @@ DISTORTION_COUNTS = {
     "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4,
 }  # fmt: skip
 """COLMAP's camera models -> number of parameters after focal lengths and principal point."""
-_ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before we
 # check.
@@ -155,7 +155,7 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
             f"{model} has {DISTORTION_COUNTS[model]} parameters after the principal point, here are {count}.",
             where="distortion",
         )
-    if model in _ONE_FOCAL and values["fx"] != values["fy"]:
+    if model in ONE_FOCAL and values["fx"] != values["fy"]:
         raise InvalidIntrinsics(f"{model} has one focal length: fy must equal fx.", where="fy")
     return Intrinsics(
         width=int(values["width"]),

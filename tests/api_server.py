@@ -91,8 +91,8 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
         listener.close()
 
 
-def until(condition) -> None:
-    deadline = time.monotonic() + 20
+def until(condition, seconds: float = 20) -> None:
+    deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, "waited for too long"
         time.sleep(0.005)

@@ -23,7 +23,7 @@ from service.errors import QueueFull, RateLimited, SplatfixError
 
 SMALL_BODY = 1_000_000
 """Of requests without a file; also what a body with one may have beyond the file."""
-_WORK = ("/localize",)
+_WORK = ("/localize", "/geopose")
 
 
 class Admission:

@@ -10,6 +10,7 @@ from typing import Literal
 
 from service.api.schemas import IntrinsicsOut, Result
 from service.errors import NoGeoAnchor
+from service.images import ONE_FOCAL
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "geopose"]
 EXPORT_TYPES: dict[ExportFormat, str] = {
@@ -40,8 +41,7 @@ def _colmap(name: str, created: datetime, result: Result) -> str:
 
 
 def _colmap_parameters(k: IntrinsicsOut) -> list[float]:
-    one_focal = k.model.startswith("SIMPLE") or k.model.startswith("RADIAL")
-    return [*([k.fx] if one_focal else [k.fx, k.fy]), k.cx, k.cy, *k.distortion]
+    return [*([k.fx] if k.model in ONE_FOCAL else [k.fx, k.fy]), k.cx, k.cy, *k.distortion]
 
 
 # nerfstudio's names of COLMAP's parameters after the principal point.

@@ -137,7 +137,7 @@ def needed_role(method: str, path: str) -> Role | None:
         return None
     if method in _SAFE or path == "/tokens" or (method == "POST" and path.endswith("/render")):
         return "read"
-    return "localize" if path == "/localize" or path.startswith("/jobs/") else "admin"
+    return "localize" if path in ("/localize", "/geopose") or path.startswith("/jobs/") else "admin"
 
 
 def allowed_hosts(listens_on: str, given: Sequence[str], *, open_to_all: bool) -> tuple[str, ...]:

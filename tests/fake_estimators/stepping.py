@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -22,6 +23,8 @@ class Options:
     steps: int = 3
     """Records to yield."""
     hold: bool = False
+    pause_s: float = 0.0
+    """After each record."""
     fail: str = ""
     """`fault` is an error of ours, anything else a bug's."""
 
@@ -35,6 +38,7 @@ def run(query: Query, tools: Tools, options: Any) -> Iterator[IterationRecord]:
     matches = MatchVectors.sample(points, points + 1, np.array([True, False]), camera)
     for step in range(options.steps):
         yield IterationRecord("step", pose, loss=1.0 / (1 + step), num_matches=2, matches=matches)
+        time.sleep(options.pause_s)
         if options.hold:
             assert GO_ON.wait(20)
         if options.fail == "fault":

@@ -1,6 +1,7 @@
 """The routes: thin. Each takes validated values, asks the jobs or the scenes, and returns a model.
 
 POST   /localize                              202 + Location (200 with `Prefer: wait=N` when done in time)
+POST   /geopose                               the same for GeoPoseProtocol clients: on Earth, one answer
 GET    /jobs                                  newest first, filtered, in pages
 GET    /jobs/{id}                             state, result or error
 DELETE /jobs/{id}                             cancel; takes effect between two records
@@ -21,8 +22,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.api.routes import jobs, localize, scenes, system
+from service.api.routes import geopose, jobs, localize, scenes, system
 
 router = APIRouter()
-for part in (localize, jobs, scenes, system):
+for part in (localize, geopose, jobs, scenes, system):
     router.include_router(part.router)

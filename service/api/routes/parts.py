@@ -75,6 +75,7 @@ MEANINGS = {
     413: "The body is too large",
     415: "Neither a multipart form nor JSON",
     422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",
+    504: "There was no answer in time",
     501: "What was asked for can't run on this machine",
     503: "Too much work is waiting, or the scene is still loading; see Retry-After",
 }

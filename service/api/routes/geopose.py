@@ -1,0 +1,61 @@
+"""AR clients that speak GeoPoseProtocol: `POST /geopose`."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Query, Request, Response
+
+from service.api import documents, gpp
+from service.api.admission import client_of
+from service.api.intake import Body
+from service.api.jobs import Order
+from service.api.requests import LocalizeFields
+from service.api.routes.parts import PartsOf, errors
+from service.errors import DeadlineExceeded, NoGeoAnchor
+
+GEOPOSE = "application/geopose+json"
+
+router = APIRouter()
+
+
+@router.post(
+    "/geopose",
+    tags=["localize"],
+    responses={200: {"model": gpp.GeoPoseResponse, "description": "The pose", "content": {GEOPOSE: {}}}}
+    | errors(400, 404, 408, 409, 413, 422, 503, 504),
+)
+async def geopose(
+    wanted: gpp.GeoPoseRequest,
+    request: Request,
+    parts: PartsOf,
+    scene: Annotated[str | None, Query(description="Left out: the nearest that has a place on Earth.")] = None,
+    accept: Annotated[str, Header(description=f"`{GEOPOSE}`: only the pose, as OGC GeoPose 1.0 has it")] = "",
+) -> Response:
+    """Find where a photo was taken, in Open AR Cloud's GeoPoseProtocol: one request, one answer, on Earth.
+
+    Camera axes are +x right, +y up, +z backwards (WebXR's). The search is a job like any other; it takes at most
+    as long as `Prefer: wait` may.
+    """
+    photo, intrinsics = gpp.image_of(wanted)
+    entry = parts.scenes.entry(scene or gpp.nearest_scene(parts.scenes.entries(), wanted))
+    anchor = parts.scenes.get(entry.id).scene.info.geo_anchor
+    if anchor is None:
+        raise NoGeoAnchor(f"scene '{entry.id}' has no place on Earth.", where="scene")
+    wait_s = parts.settings.max_wait_s
+    fields = LocalizeFields(scene=entry.id, intrinsics=intrinsics, deadline_s=wait_s)
+    order = Order(Body(photo, "", {}), fields, client_of(request.scope), None, hashlib.sha256(photo).hexdigest())
+    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
+    if live := parts.jobs.live(job.id):
+        await live.wait(wait_s)
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    if not job.ended:
+        await to_thread.run_sync(parts.jobs.cancel, job)
+        raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
+    _, _, result = documents.answer(job)
+    answer = gpp.response_of(wanted, result, anchor)
+    if GEOPOSE in accept:
+        return Response(answer.geopose.model_dump_json(), media_type=GEOPOSE)
+    return Response(answer.model_dump_json(), media_type="application/json")
