@@ -14,6 +14,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -34,6 +35,8 @@ MAX_PIXELS = 64 * 1024 * 1024
 """A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
 LONG_SIDE = 1600
 """Of `Query.rgb`; matching uses 512 and alignment 400 pixels, the rest is for close looks."""
+OPAQUE = 128
+"""Of 255: what is more transparent is unknown."""
 MIN_SIDE = 32
 """Of `Query.rgb`; the features need more anyway."""
 GUESSED_FOCAL = 0.78
@@ -77,8 +80,9 @@ def read_query(
 ) -> Query:
     """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
 
-    `intrinsics` refer to the upright photo in its full size. Transparent parts are filled with
-    `background_rgb` (0..1): pass the scene's, then a cut-out object looks as it does in a render.
+    `intrinsics` refer to the upright photo in its full size. Transparent parts are unknown: nothing is expected
+    there. They are filled with `background_rgb` (0..1): pass the scene's, then a cut-out object has the edges that
+    it has in a render.
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb)
@@ -98,8 +102,12 @@ def read_query(
         focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
         size = decoded.width, decoded.height
         intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
-    rgb, pinhole = undistorted(decoded.rgb, decoded.camera(intrinsics))
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
+    camera = decoded.camera(intrinsics)
+    rgb, pinhole, seen = undistorted(decoded.rgb, camera)
+    known = decoded.known
+    if seen is not None and not seen.all():
+        known = seen if known is None else seen & (undistorted(known.astype(np.uint8), camera)[0] > 0)
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), known)
 
 
 def encode_image(
@@ -168,23 +176,36 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
 
 
 def undistorted(
-    rgb: UInt8[np.ndarray, "h w 3"], intrinsics: Intrinsics
-) -> tuple[UInt8[np.ndarray, "h w 3"], Intrinsics]:
-    """Return the image as a pinhole of the same focal length and size sees it; black where it sees more."""
+    image: UInt8[np.ndarray, "h w *channels"], intrinsics: Intrinsics
+) -> tuple[UInt8[np.ndarray, "h w *channels"], Intrinsics, Bool[np.ndarray, "h w"] | None]:
+    """Return the image as a pinhole of the same focal length and size sees it, black where it sees more.
+
+    The last value says where it does not; None if nothing had to be done.
+    """
     pinhole = replace(intrinsics, model="PINHOLE", distortion=())
-    fisheye = "FISHEYE" in intrinsics.model
-    if not fisheye and not any(intrinsics.distortion):
-        return rgb, pinhole
+    if "FISHEYE" not in intrinsics.model and not any(intrinsics.distortion):
+        return image, pinhole, None
+    x, y, seen = _undistortion(intrinsics)
+    straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    straight[~seen] = 0
+    return straight, pinhole, seen
+
+
+@lru_cache(maxsize=4)
+def _undistortion(
+    intrinsics: Intrinsics,
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return where each pixel of the pinhole lies in the photo, and whether it does; made once for a camera."""
+    pinhole, fisheye = replace(intrinsics, model="PINHOLE", distortion=()), "FISHEYE" in intrinsics.model
     coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
     coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
     # cv2 counts pixels from the centre of the first one.
     matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
     make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     size = (pinhole.width, pinhole.height)
-    maps = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-    straight = cv2.remap(rgb, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    straight[_folded(pinhole, coefficients, fisheye)] = 0
-    return straight, pinhole
+    x, y = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    inside = (x > -0.5) & (y > -0.5) & (x < pinhole.width - 0.5) & (y < pinhole.height - 0.5)
+    return x, y, inside & ~_folded(pinhole, coefficients, fisheye)
 
 
 def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:
@@ -216,6 +237,7 @@ def _fisheye(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "4"]) -> Float6
 class _Decoded:
     rgb: UInt8[np.ndarray, "h w 3"]
     """Upright, reduced."""
+    known: Bool[np.ndarray, "h w"] | None
     width: int
     """Of the upright photo in its full size."""
     height: int
@@ -280,7 +302,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
             step = (raw_size[0] / drafted[1][2], raw_size[1] / drafted[1][3])
     try:
         photo.load()
-        pixels, warnings = _rgb(photo, background_rgb)
+        pixels, alpha, warnings = _rgb(photo, background_rgb)
     except Exception as error:
         raise InvalidImage(
             f"the {name} can't be decoded, it is truncated or damaged: {_short(error)}.",
@@ -290,16 +312,19 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     covered = (pixels.shape[1] * step[0], pixels.shape[0] * step[1])
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
+    layers = [pixels] if alpha is None else [pixels, alpha]
     if pixels.shape[:2] != (target[1], target[0]):
-        pixels = cv2.resize(pixels, target, interpolation=cv2.INTER_AREA)
+        layers = [cv2.resize(layer, target, interpolation=cv2.INTER_AREA) for layer in layers]
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
     transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
     if transpose:
-        pixels, scale, beyond, raw_size = pixels.transpose(1, 0, 2), scale[::-1], beyond[::-1], raw_size[::-1]
-    pixels = pixels[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]
+        layers = [layer.swapaxes(0, 1) for layer in layers]
+        scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
+    turned = [np.ascontiguousarray(layer[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]) for layer in layers]
     return _Decoded(
-        np.ascontiguousarray(pixels),
+        turned[0],
+        turned[1] >= OPAQUE if len(turned) > 1 else None,
         *raw_size,
         scale=(scale[0], scale[1]),
         offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
@@ -309,18 +334,20 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
 
 def _rgb(
     photo: Image.Image, background_rgb: tuple[float, float, float]
-) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, list[str]]:
+    """Return colours, opacity unless all is opaque, and warnings."""
     if photo.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
         gray = (np.asarray(photo).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
-        return np.repeat(gray[:, :, None], 3, axis=2), []
+        return np.repeat(gray[:, :, None], 3, axis=2), None, []
     if photo.has_transparency_data:
         rgba = photo.convert("RGBA")
         alpha = rgba.getchannel("A")
         canvas = Image.new("RGB", photo.size, tuple(round(255 * c) for c in background_rgb))
         canvas.paste(rgba, mask=alpha)
-        opaque = alpha.getextrema()[0] == 255
-        return np.array(canvas), [] if opaque else ["Transparent parts were filled with one colour."]
-    return np.array(photo.convert("RGB")), []
+        if alpha.getextrema()[0] == 255:
+            return np.array(canvas), None, []
+        return np.array(canvas), np.array(alpha), ["Transparent parts of the photo are ignored."]
+    return np.array(photo.convert("RGB")), None, []
 
 
 def _orientation(photo: Image.Image) -> int:

@@ -102,7 +102,7 @@ class Matcher(Protocol):
         ...
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
-        """Return pairs of indices into `a` and `b`; each index at most once."""
+        """Return pairs of indices into `a` and `b`, the surest first; each index at most once."""
         ...
 
 

@@ -248,9 +248,13 @@ class Query:
     """Of the whole upright photo in its own resolution, with its distortion: what results report."""
     prior: Pose | None = None
     warnings: tuple[str, ...] = ()
+    known: Bool[np.ndarray, "h w"] | None = None
+    """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+        if self.known is not None:
+            object.__setattr__(self, "known", frozen(self.known, np.bool_))
 
     @property
     def focal_sigma(self) -> float:

@@ -12,13 +12,14 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.interfaces import Frame, Tools
 from service.pose.alignment import Evidence, evidence
 from service.pose.pnp import reprojection_error_px
 from service.pose.views import (
     correspondences,
+    known_at,
     photo_at,
     photo_features,
     rendered_view,
@@ -80,11 +81,11 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     error = reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
     inlier = error * (intrinsics.long_side / query.intrinsics.long_side) < MAX_ERROR_PX
     inliers = int(inlier.sum())
-    resized = photo_at(query, tools, intrinsics)
-    agreement, colours = gradient_agreement(resized, frame), colour_agreement(resized, frame)
+    resized, known = photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics)
+    agreement, colours = gradient_agreement(resized, frame, known), colour_agreement(resized, frame, known)
     coverage = float((frame.alpha > MIN_ALPHA).mean())
     answer = Camera(query.intrinsics.resized(intrinsics.width, intrinsics.height), pose)
-    pixels = evidence(resized, frame, view.camera, answer, query.focal_sigma)
+    pixels = evidence(resized, frame, view.camera, answer, query.focal_sigma, known)
     focal, covariance, focal_sigma = _of_lens(pixels, query.focal_sigma)
     score, reason = min(
         (GRADIENTS(agreement), Reason.RENDER_DISAGREES),
@@ -118,8 +119,10 @@ def _of_lens(
     return (0.4 if contradicted else 1.0, Reason.INTRINSICS_CONTRADICTED), covariance, 0.0
 
 
-def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
-    """Return how well the gradients correlate, -1..1, block by block, where the scene is opaque.
+def gradient_agreement(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Return how well the gradients correlate, -1..1, block by block, where scene and photo are known.
 
     Blocks weigh by what the render has in them. Those that agree best and hold three quarters of the weight count:
     a passer-by spoils a few blocks, a wrong pose all.
@@ -127,7 +130,9 @@ def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float
     height, width = frame.alpha.shape
     factor = GRADIENTS_PX / max(height, width)
     size = (max(BLOCK_PX, round(width * factor)), max(BLOCK_PX, round(height * factor)))
-    opaque = cv2.resize(frame.alpha, size, interpolation=cv2.INTER_AREA) > MIN_ALPHA
+    opaque = cv2.resize(_both_known(frame, known), size, interpolation=cv2.INTER_AREA) > MIN_ALPHA
+    if known is not None:  # the gradients along the unknown's edge are its own
+        opaque = cv2.erode(opaque.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     a, b = (_gradients(image, size) * opaque[..., None] for image in (photo, to_uint8(frame.rgb)))
     ab, aa, weight = _block_sums(a * b), _block_sums(a * a), _block_sums(b * b)
     correlation = ab / np.sqrt(aa * weight + 1e-6)
@@ -137,15 +142,22 @@ def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float
     return float(correlation[kept] @ weight[kept] / max(weight[kept].sum(), 1e-6))
 
 
-def colour_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
-    """Return the correlation of the colours of two thumbnails, -1..1, where the scene is opaque.
+def _both_known(frame: Frame, known: Bool[np.ndarray, "h w"] | None) -> Float32[np.ndarray, "h w"]:
+    return frame.alpha if known is None else frame.alpha * known
+
+
+def colour_agreement(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Return the correlation of the colours of two thumbnails, -1..1, where scene and photo are known.
 
     Each channel has its own gain and offset (exposure, white balance); the quarter that fits them worst is left out.
     """
     height, width = frame.alpha.shape
     factor = COLOUR_PX / max(height, width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (photo, to_uint8(frame.rgb), frame.alpha)]
+    layers = (photo, to_uint8(frame.rgb), _both_known(frame, known))
+    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in layers]
     opaque = small[2] > MIN_ALPHA
     a, b = (image[opaque].astype(np.float64) for image in small[:2])
     if len(a) < 8:
