@@ -39,6 +39,7 @@ IntrinsicsOption = Annotated[
     str,
     typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
 ]
+MatcherOption = Annotated[str, typer.Option("--matcher", help="Of local features; `splatfix doctor` lists them.")]
 
 
 def main() -> None:
@@ -96,6 +97,7 @@ def localize(
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
+    matcher: MatcherOption = "",
     seed: int = 0,
     budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
@@ -112,7 +114,7 @@ def localize(
     given |= {"intrinsics": _json(intrinsics, "intrinsics"), "prior": _json(prior, "prior")}
     fields = read_fields({name: value for name, value in given.items() if value is not None})
     bodies = [Body(_bytes(photo), str(photo), {}) for photo in photos]
-    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR)
+    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         task, query = make_task(body, fields, loaded)
@@ -178,6 +180,7 @@ def render(
 def bench_localize(
     folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
     estimator: str = "view_index",
+    matcher: MatcherOption = "",
     start: Annotated[Literal["none", "easy", "hard", "inplace", "random"], typer.Option()] = "none",
     trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
     seed: int = 0,
@@ -192,12 +195,14 @@ def bench_localize(
     """Localize a scene's test photos and compare with the truth."""
     from service.api.intake import options_from
     from service.bench.localize import Budget, run
+    from service.localize import DEFAULT_MATCHER
 
     _tell_machine()
     with _progress() as progress:
         outcome = run(
             folder,
             estimator=estimator,
+            matcher=matcher or DEFAULT_MATCHER,
             start=start,
             trials=trials,
             seed=seed,
@@ -342,12 +347,13 @@ def _bytes(path: Path) -> bytes:
         raise InvalidRequest(f"{error.strerror}.", where=str(path)) from error
 
 
-def _loaded(scene: Path, estimator: str | None = None) -> LoadedScene:
+def _loaded(scene: Path, estimator: str | None = None, matcher: str = "") -> LoadedScene:
     """Load a scene and, if an estimator is to use it, make what that prepares for it."""
     from service.localize import LoadedScene
 
     with err.status(f"reading {scene}") as status:
-        loaded = LoadedScene.load(scene, cache_dir=_settings({}).cache_dir)
+        settings = _settings({"matcher": matcher} if matcher else {})
+        loaded = LoadedScene.load(scene, cache_dir=settings.cache_dir, matcher=settings.matcher)
         if estimator:
             status.update("preparing")
             loaded.prepare(estimator)

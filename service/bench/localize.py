@@ -21,7 +21,7 @@ from service.bench.queries import BenchPhoto, find_photos, photo_bytes
 from service.bench.starts import require_kind, start_pose
 from service.estimators import ESTIMATORS
 from service.images import read_query
-from service.localize import LoadedScene, Request, localize
+from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.pose.focus import centre_depth
 from service.scene_formats import load_scene
 from service.types import Camera, Pose, PoseEstimate
@@ -42,6 +42,7 @@ def run(
     folder: Path,
     *,
     estimator: str = "view_index",
+    matcher: str = DEFAULT_MATCHER,
     start: str = "none",
     trials: int = 1,
     seed: int = 0,
@@ -62,7 +63,7 @@ def run(
     chosen, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
     folder = Path(folder)
     photos = find_photos(folder)
-    loaded, training = _loaded(folder, photos, cameras, cache_dir)
+    loaded, training = _loaded(folder, photos, cameras, matcher, cache_dir)
     began = time.perf_counter()
     loaded.prepare(estimator)
     prepare_s = time.perf_counter() - began
@@ -77,7 +78,7 @@ def run(
         return localize(query, loaded, Request(estimator=estimator, options=chosen, seed=seed, **limits))
 
     outcomes, per_query = measure(todo, answer, units, progress)
-    asked = {"estimator": estimator, "start": start, "trials": trials, "seed": seed}
+    asked = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
     asked |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
     asked |= {"options": dataclasses.asdict(chosen), "budget": dataclasses.asdict(budget)}
     facts = {"photos": len(photos), "training_cameras": len(training), "gaussians": loaded.scene.count}
@@ -116,7 +117,7 @@ def measure(
 
 
 def _loaded(
-    folder: Path, photos: Sequence[BenchPhoto], cameras: str, cache_dir: Path | None
+    folder: Path, photos: Sequence[BenchPhoto], cameras: str, matcher: str, cache_dir: Path | None
 ) -> tuple[LoadedScene, list[Camera]]:
     """Return the scene without the test photos, and its training cameras; the truth's if there are none."""
     held_back = [name for photo in photos for name in photo.names]
@@ -124,7 +125,7 @@ def _loaded(
     training = [named.camera for named in scene.cameras] or [photo.camera for photo in photos]
     if cameras == "ignored":
         scene = load_scene(folder, without_photos=held_back, cameras=False)
-    return LoadedScene.of(scene, cache_dir=cache_dir), training
+    return LoadedScene.of(scene, cache_dir=cache_dir, matcher=matcher), training
 
 
 def _trials(

@@ -38,6 +38,8 @@ from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.types import Camera, Candidates, IterationRecord, Pose, Query
 
+MATCHES_IMAGES = True
+"""It works with matchers that have no features of one image."""
 SCENE_JITTER_DEG, SCENE_JITTER_SHARE = 10.0, 0.05
 """About each of the scene's viewpoints, where there is no prior."""
 LEVEL_VIEWS, LEVEL_PX = 24, 384
