@@ -178,15 +178,21 @@ def render(
 
 @bench_app.command("localize")
 def bench_localize(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses, or a scene file.")],
+    data: Annotated[Path | None, typer.Option(help="The data set's folder, if it isn't the scene's.")] = None,
+    layout: Annotated[
+        str, typer.Option(help="auto, nerf_synthetic, llff, mipnerf360, deep_blending, nerfstudio or scene.")
+    ] = "auto",
+    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
     estimator: str = "view_index",
     matcher: MatcherOption = "",
-    start: Annotated[Literal["none", "easy", "hard", "inplace", "random"], typer.Option()] = "none",
+    start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
     trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
     seed: int = 0,
     intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
@@ -201,6 +207,9 @@ def bench_localize(
     with _progress() as progress:
         outcome = run(
             folder,
+            data=data,
+            layout=layout,
+            background=background,
             estimator=estimator,
             matcher=matcher or DEFAULT_MATCHER,
             start=start,
@@ -209,6 +218,7 @@ def bench_localize(
             intrinsics=intrinsics,
             cameras=cameras,
             modify=tuple(modify or ()),
+            occluders=occluders,
             options=options_from(estimator, _json(options, "options") or {}),
             budget=Budget(budget_s, budget_renders),
             progress=_counter(progress, "photos"),

@@ -153,13 +153,15 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
 
     monkeypatch.setattr(service.bench.localize, "run", run)
     flags = "--estimator view_index --start hard --trials 3 --seed 4 --intrinsics withheld --cameras ignored"
-    flags += " --budget-renders 9 --matcher sift"
+    flags += " --budget-renders 9 --matcher sift --background white"
     written = tmp_path / "out.json"
     code, told, complaint = splatfix(
         "bench",
         "localize",
         tmp_path,
         *flags.split(),
+        "--occluders",
+        tmp_path,
         "--modify",
         "blur=2",
         "--options",
@@ -175,6 +177,7 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
     assert asked == {
         "folder": tmp_path, "estimator": "view_index", "matcher": "sift", "start": "hard", "trials": 3, "seed": 4,
         "intrinsics": "withheld", "cameras": "ignored", "modify": ("blur=2",),
+        "data": None, "layout": "auto", "background": "white", "occluders": tmp_path,
     }  # fmt: skip
     assert json.loads(written.read_text())["per_query"] == [{"photo": "a"}]
     assert "success_5deg_0p05" in told
