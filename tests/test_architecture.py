@@ -57,6 +57,7 @@ WRAPPED = {
     "websockets": {"service/api/relay.py"},
     "httpx": {"service/api/relay.py", "viewer/client.py"},
     "uvicorn": {"service/serve.py"},
+    "matplotlib": {"service/bench/paper/figures.py"},
     "typer": {"service/__main__.py"},
     "rich": {"service/__main__.py", "service/serve.py"},
     "viser": {"viewer"},
