@@ -37,6 +37,9 @@ STARTS = {
 }
 
 
+ERRORS = ("rotation_deg", "translation_units")
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
     name: str
@@ -74,8 +77,10 @@ def start_note(lines: Sequence[Line]) -> str:
         begun = [line for line in lines if line["protocol"] == protocol and line["start_rotation_deg"] is not None]
         # A start that several methods share counts once.
         each = {(line["scene"], line["study"], line["photo"], line["trial"]): line for line in begun}.values()
-        mean = [np.mean([line[key] for line in each]) for key in ("start_rotation_deg", "start_translation_units")]
-        errors = f"; mean start error {mean[0]:.1f} deg, {mean[1]:.2f} units ({len(each)} starts)" if each else ""
+        errors = ""
+        if each:
+            degrees, units = (np.mean([line[f"start_{key}"] for line in each]) for key in ERRORS)
+            errors = f"; mean start error {degrees:.1f} deg, {units:.2f} units ({len(each)} starts)"
         told.append(f"Start '{protocol}': {STARTS.get(protocol, protocol)}{errors}.")
     return " ".join(told)
 
