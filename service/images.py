@@ -111,19 +111,27 @@ def read_query(
 
 
 def encode_image(
-    rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
+    rgb: UInt8[np.ndarray, "h w c"] | Float32[np.ndarray, "h w c"],
     kind: Literal["jpg", "png"] = "jpg",
     *,
     quality: int = 90,
 ) -> bytes:
-    """Return an image (uint8, or a render's float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100."""
+    """Return an image (uint8, or float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100; a PNG may be RGBA."""
     if rgb.dtype != np.uint8:
         rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpg" else []
-    encoded, data = cv2.imencode(f".{kind}", rgb[:, :, ::-1], options)
+    order = [2, 1, 0, *range(3, rgb.shape[2])]
+    encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(rgb[:, :, order]), options)
     if not encoded:
         raise ValueError(f"an image of shape {rgb.shape} can't be {kind}")
     return data.tobytes()
+
+
+def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float32[np.ndarray, "height width 3"]:
+    """Resample: area averages where it shrinks, so nothing aliases; else bilinear."""
+    shrinks = width * height < rgb.shape[0] * rgb.shape[1]
+    mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=mode), np.float32)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
