@@ -237,7 +237,7 @@ def match_view(photo_px: np.ndarray, render_px: np.ndarray, camera: Camera) -> m
     """Matches that all agree, as they are seen by the camera that they refer to."""
     found = MatchVectors(photo_px, render_px, np.ones(len(photo_px), bool), camera)
     depth = np.ones((camera.intrinsics.height, camera.intrinsics.width), np.float32)
-    return measure.seen(measure.lifted(found, depth, 0), camera.pose, camera.intrinsics, 0)
+    return measure.seen(measure.lifted(found, depth, 0), camera, 0)
 
 
 def test_colours_tell_inliers_and_residuals() -> None:
@@ -315,7 +315,7 @@ def test_lifted_matches_come_back_to_their_pixels(share: float, depth: float, tu
     np.testing.assert_allclose(project(in_camera, camera.intrinsics), px[known], atol=1e-3)
     # Seen from another pose by another step, residuals are what the renderer's own projection says.
     other = orbit(share + turn)
-    view = measure.seen(found, other, PHOTO, 7)
+    view = measure.seen(found, Camera(PHOTO, other), 7)
     assert view.carried_from == 3
     there = transformed(other.camera_from_world, found.points_in_world[known])
     before = there[:, 2] > 0
