@@ -80,7 +80,7 @@ class PoseField {
       ["world_from_camera opengl", "world from camera, OpenGL axes (Blender, nerfstudio)"],
       ["camera_from_world opencv", "camera from world, OpenCV axes (COLMAP)"],
     ]);
-    this.element = h("div", {}, h("div", { class: "grid" }, field("Given as", this.kind)), field("Matrix", this.matrix));
+    this.element = h("div", {}, field("Given as", this.kind), field("Matrix", this.matrix));
   }
 
   value() {

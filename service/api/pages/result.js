@@ -68,10 +68,15 @@ function numbers(job, scene) {
     ["σ of position", covariance && length(covariance.sigma_units, scale)],
     ["Error of rotation", job.truth && degrees(angle)],
     ["Error of position", job.truth && length(distance, scale)],
-    ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${result.intrinsics_source}`],
+    ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${lens(result)}`],
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(
     result.timings.map(t => [words(t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
+}
+
+function lens({ intrinsics, intrinsics_source: source }) {
+  const from = source === "exif" ? "from EXIF" : source;
+  return intrinsics.trust === "approximate" ? `${from}, then estimated with the pose` : from;
 }
 
 function taking(job) {
