@@ -269,6 +269,17 @@ def test_overlays_compare_pixel_by_pixel() -> None:
     assert [draw.decode(base64.b64decode(data))[5, 5, 0] for data in both] == [100, 180]
 
 
+def test_arrows_go_from_the_renders_point_to_the_photos() -> None:
+    camera = Camera(Intrinsics(400, 300, 300, 300, 200, 150), orbit(0))
+    view = match_view(np.float32([[300, 100]]), np.float32([[100, 200]]), camera)
+    picture = draw.flow(np.zeros((150, 200, 3), np.uint8), view, np.uint8([draw.INLIER]))
+    rows, columns = np.nonzero(picture[..., 1] > 150)  # 800 wide: all at twice the photo's pixels
+    assert (columns.min(), columns.max()) == (pytest.approx(200, abs=4), pytest.approx(600, abs=4))
+    assert (rows.min(), rows.max()) == (pytest.approx(200, abs=8), pytest.approx(400, abs=4))
+    at_photo, at_render = (np.hypot(columns - x, rows - y) < 14 for x, y in ((600, 200), (200, 400)))
+    assert at_photo.sum() > 2 * at_render.sum()  # the dot and the arrow's tip
+
+
 def test_decoding_and_scaling() -> None:
     image = draw.decode(fake_service.jpeg((200, 100, 50)))
     assert np.abs(image.reshape(-1, 3).mean(0) - [200, 100, 50]).max() < 3  # RGB, not BGR
