@@ -150,7 +150,7 @@ function card(scene, choose) {
     ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
     : h("span", { class: "nopicture" });
   const size = ready
-    ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)} cameras · ${bytes(scene.memory_bytes)}`
+    ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)}`
     : scene.error?.detail ?? "";
   return h("label", { class: "card" }, radio, picture,
     h("span", { class: "name" }, scene.name),
