@@ -150,6 +150,7 @@ def test_a_pasted_photo_that_shows_nothing_is_refused_with_reason_and_hint(page:
     expect(lead).to_contain_text(result["hint"])
     expect(page.get_by_text("The best guess")).to_be_visible()
     expect(page.get_by_role("link", name="COLMAP")).to_have_count(0)
+    _audit(page)
 
 
 def test_the_answer_can_be_copied_and_taken_along(page: Page, url: str) -> None:
@@ -190,6 +191,7 @@ def test_a_running_job_can_be_watched_and_cancelled(page: Page) -> None:
     expect(page.get_by_role("link", name="Watch it in the viewer")).to_have_attribute(
         "href", re.compile("/viewer/jobs/")
     )
+    _audit(page)
     page.get_by_role("button", name="Cancel").click()
     page.locator(".badge.cancelled").wait_for()
 

@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import signal
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -130,6 +129,7 @@ def samples(minutes: float, every: float) -> dict[str, list[dict[str, float]]]:
             one_round(visitor, url, float(np.random.default_rng(k).uniform(0, 6.28)))
             measured = {"service": of_process(pid), "viewer": of_process(viewer)}
             measured |= {name: of_page(session) for name, session in sessions.items()}
+            print(json.dumps({"round": k, **measured}), file=sys.stderr, flush=True)
             for name, figures in measured.items():
                 taken.setdefault(name, []).append(figures)
             time.sleep(max(0.0, began + every - time.monotonic()))
@@ -137,7 +137,7 @@ def samples(minutes: float, every: float) -> dict[str, list[dict[str, float]]]:
 
 
 def quarters(values: list[float]) -> list[float]:
-    return [round(statistics.median(part), 1) for part in np.array_split(np.array(values), 4)]
+    return [round(float(np.median(part)), 1) for part in np.array_split(values, 4)]
 
 
 def main() -> int:
