@@ -331,6 +331,32 @@ def _progress_table(progress: Progress) -> Table:
     return table
 
 
+@bench_app.command("gate")
+def bench_gate(
+    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
+    seed: int = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a reliability plot, a .png.")] = None,
+) -> None:
+    """Test the verification gate on right, wrong and foreign poses, leaving one scene out of its fit in turn."""
+    from service.bench.gate import run
+
+    _tell_machine()
+    if len(folders) < 2:
+        raise InvalidRequest("needs two scenes or more, to test on another one than it fits on.", where="folders")
+    with _progress() as progress:
+        outcome = run(folders, seed=seed, progress=_counter(progress, "photos"), cache_dir=_settings({}).cache_dir)
+    _write_json(json_file, outcome)
+    if plot:
+        from service.bench.paper.figures import reliability
+
+        plot.write_bytes(reliability({name: outcome[name]["reliability"] for name in ("with_matches", "by_pixels")}))
+    for name in ("with_matches", "by_pixels"):
+        for key, value in outcome[name].items():
+            if key not in ("reliability", "by_kind"):
+                out.print(f"{name:13} {key:30} {value}", markup=False, highlight=False, soft_wrap=True)
+
+
 @bench_app.command("render")
 def bench_render(
     repeats: Annotated[int, typer.Option(min=1, help="Of each picture; the least time counts.")] = 30,

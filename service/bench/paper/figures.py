@@ -118,6 +118,27 @@ def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "
     place.legend(fontsize=7)
 
 
+def reliability(models: Mapping[str, Sequence[Mapping[str, float]]]) -> bytes:
+    """Draw what share of poses came true against the probability that was said, and how many poses that were.
+
+    Each model has rows of `said`, `true`, `count`, `from`, `to`.
+    """
+    figure = Figure(figsize=(6.0, 5.4), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    above.plot([0, 1], [0, 1], color="#999999", linestyle=":", label="calibrated")
+    for (name, rows), colour in zip(models.items(), (GREEN, COLOURS["mc_do"]), strict=False):
+        said, true = [row["said"] for row in rows], [row["true"] for row in rows]
+        above.plot(said, true, "o-", color=colour, label=name.replace("_", " "))
+        middles = [0.5 * (row["from"] + row["to"]) for row in rows]
+        below.bar(middles, [row["count"] for row in rows], 0.08, color=colour, alpha=0.5)
+    above.set(
+        ylabel="share that was right", xlim=(0, 1), ylim=(-0.02, 1.02), title="The gate on scenes it was not fitted on"
+    )
+    above.legend()
+    below.set(xlabel="probability that was said", ylabel="poses", yscale="log")
+    return _png(figure)
+
+
 def _png(figure: Figure) -> bytes:
     stream = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(stream, dpi=DPI, format="png")

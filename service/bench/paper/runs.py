@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-import service
 from service.bench.localize import Subject, Trial, answered, line_of, subject, trials_of
 from service.bench.metrics import Outcome, errors
 from service.bench.paper.plan import SLOW, STEP_CURVES, Cell
