@@ -20,11 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from service.bench.localize import Subject, subject
 from service.bench.metrics import COARSE, errors, nees
-from service.bench.queries import sent
+from service.bench.queries import BenchPhoto, sent
 from service.estimators.view_index import Options
 from service.geometry import moved
 from service.images import encode_image, read_query, resized
@@ -48,6 +48,8 @@ MOVED_UNITS, MOVED_DEG = (0.06, 1.5), 8.0
 FOREIGN = 8
 """Photos of each other scene."""
 GARBAGE = 8
+OCCLUDERS = 2
+"""Photos of each other scene that rectangles are cut from."""
 PENALTY = 0.02
 """On the squared weights, against certainty that few samples don't give."""
 BINS = 10
@@ -81,12 +83,14 @@ def run(
     for one in subjects:
         one.loaded.prepare("view_index")
         rng = np.random.default_rng(seed)
+        others = [other for other in subjects if other is not one]
+        cut = [_pixels(photo) for other in others for photo in other.photos[:OCCLUDERS]]
         for photo in one.photos:
-            samples += _of_photo(one, photo, rng)
+            samples += _of_photo(one, photo, cut, rng)
             done += 1
             if progress:
                 progress(done, total)
-        samples += _foreign(one, [other for other in subjects if other is not one])
+        samples += _foreign(one, others)
     return summary(samples) | {"samples": [_line(sample) for sample in samples]}
 
 
@@ -95,10 +99,16 @@ def _line(sample: Sample) -> dict[str, Any]:
     return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
 
 
-def _of_photo(one: Subject, photo: Any, rng: np.random.Generator) -> Iterator[Sample]:
+def _pixels(photo: BenchPhoto) -> Float32[np.ndarray, "h w 3"]:
+    return read_query(photo.path.read_bytes()).rgb.astype(np.float32) / 255
+
+
+def _of_photo(
+    one: Subject, photo: BenchPhoto, occluders: Sequence[Float32[np.ndarray, "_ _ 3"]], rng: np.random.Generator
+) -> Iterator[Sample]:
     """Yield the samples of one test photo."""
     for modify in (*WITHIN_REASON, *BEYOND):
-        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)))
+        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)), occluders)
         query = read_query(file.data, intrinsics=file.told, background_rgb=one.background_rgb)
         kind = ("beyond " if modify in BEYOND else "") + ("clean" if not modify else modify[0])
         yield _localized(one, kind, photo.name, query, file.truth.pose)
