@@ -10,6 +10,7 @@ import os
 import re
 import shutil
 import zipfile
+import zlib
 from collections.abc import AsyncIterator
 from pathlib import Path, PurePosixPath
 from typing import IO
@@ -97,6 +98,9 @@ class Uploads:
                     raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
                 top = _common_top([m.filename for m in members])
                 for member in members:
+                    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                        # LZMA takes as much memory as the archive says, up to 4 GB.
+                        raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
                     name = _wanted(PurePosixPath(member.filename).relative_to(top))
                     if name is not None:
                         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -135,9 +139,17 @@ def _wanted(path: PurePosixPath) -> str | None:
     return None
 
 
+def _read(source: IO[bytes]) -> bytes:
+    """Read some of a file in an archive. Raises CorruptScene."""
+    try:
+        return source.read(_COPY_BYTES)
+    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError) as error:
+        raise CorruptScene(f"the archive is damaged: {str(error)[:200]}.", where="archive") from error
+
+
 def _copied(source: IO[bytes], target: IO[bytes], left: int) -> int:
     """Copy at most `left` bytes; return how many more there may be. Raises CorruptScene."""
-    while chunk := source.read(_COPY_BYTES):
+    while chunk := _read(source):
         left -= len(chunk)
         if left < 0:
             raise CorruptScene("the archive holds more than the service takes.", where="archive")
