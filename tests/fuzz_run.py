@@ -186,7 +186,9 @@ def archive_target() -> Target:
             opened.writestr("room/scene.ply", ply(1, 0))
             opened.writestr("room/transforms.json", json.dumps({"frames": []}))
         seeds[name] = buffer.getvalue()
-    return Target(run, seeds, 8192, 128 * MB, ("../", "scene.ply", "sparse/0/cameras.bin", "scene.json", "PK\\x01\\x02"))
+    return Target(
+        run, seeds, 8192, 128 * MB, ("../", "scene.ply", "sparse/0/cameras.bin", "scene.json", "PK\\x01\\x02")
+    )
 
 
 def photo_target(kind: str) -> Target:

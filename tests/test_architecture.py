@@ -47,6 +47,7 @@ WRAPPED = {
     "anyio": {"service/api"},
     "annotated_types": {"service/api/requests.py"},
     "pydantic": {"service/api", "service/__main__.py"},
+    "pydantic_core": {"service/api/intake.py"},
     "pydantic_settings": {"service/api/settings.py"},
     "limits": {"service/api/admission.py"},
     "prometheus_client": {"service/api/metrics.py"},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -107,22 +107,32 @@ def _problem(status: int, code: str, detail: str, instance: str, where: str = ""
         type=f"urn:splatfix:error:{code}",
         title=code.replace("_", " ").capitalize(),
         status=status,
-        detail=detail,
-        instance=instance,
+        detail=_sendable(detail),
+        instance=_sendable(instance),
         code=code,
-        where=where,
-        hint=hint,
+        where=_sendable(where),
+        hint=_sendable(hint),
     )
+
+
+def _sendable(text: str) -> str:
+    """Replace what isn't Unicode text: halves of surrogate pairs, which JSON lets callers send."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def problem_response(error: Exception, path: str) -> Response:
     """Answer with the error's problem document."""
-    problem = problem_of(error, path)
     headers = dict(getattr(error, "headers", None) or {})
-    if problem.status in (429, 503):
-        wait_s = error.retry_after_s if isinstance(error, SplatfixError) else None
-        headers.setdefault("Retry-After", str(wait_s or RETRY_AFTER_S))
-    return Response(problem.model_dump_json(), problem.status, headers, MEDIA_TYPE)
+    if isinstance(error, SplatfixError) and error.retry_after_s:
+        headers["Retry-After"] = str(error.retry_after_s)
+    return problem_answer(problem_of(error, path), path, headers)
+
+
+def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Answer with a problem document, as concerns `path`."""
+    told = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
+    problem = problem.model_copy(update={"instance": path})
+    return Response(problem.model_dump_json(), problem.status, {**told, **(headers or {})}, MEDIA_TYPE)
 
 
 def install(app: FastAPI) -> None:
@@ -139,7 +149,6 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, answer)
     app.add_exception_handler(ClientDisconnect, answer)  # nobody hears it, but it is no failure of ours
     app.add_exception_handler(RequestValidationError, answer_validation)
-    app.add_exception_handler(Exception, answer)
 
 
 def described(errors: Sequence[Any]) -> tuple[str, str]:

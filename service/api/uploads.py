@@ -17,7 +17,15 @@ from typing import IO
 
 from anyio import to_thread
 
-from service.errors import CorruptScene, InvalidRequest, SceneExists, StorageFailed, UnsupportedFormat
+from service.errors import (
+    CorruptScene,
+    InvalidRequest,
+    SceneError,
+    SceneExists,
+    SceneNotFound,
+    StorageFailed,
+    UnsupportedFormat,
+)
 from service.scene_formats import load_scene
 from service.scene_formats.folder import COLMAP_FOLDER, SCENE_SUFFIXES
 from service.scene_formats.manifest import MANIFEST
@@ -44,7 +52,7 @@ class Uploads:
         """Store a scene file, or an archive of a scene folder. Raises InvalidRequest, SceneError, StorageFailed."""
         check_scene_id(scene_id)
         if (self._folder / scene_id).exists():
-            raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+            raise _exists(scene_id)
         draft = self._incoming / f"{scene_id}.{os.urandom(4).hex()}"
         try:
             draft.mkdir()
@@ -53,6 +61,8 @@ class Uploads:
             target = self._folder / scene_id
             await to_thread.run_sync(draft.rename, target)
         except OSError as error:
+            if (self._folder / scene_id).exists():  # sent twice at once, and the other came first
+                raise _exists(scene_id) from error
             raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
         finally:
             await to_thread.run_sync(lambda: shutil.rmtree(draft, ignore_errors=True))
@@ -77,8 +87,8 @@ class Uploads:
         if zipfile.is_zipfile(upload):
             self._unpack(upload, draft)
             upload.unlink()
-            if not any(draft.iterdir()):
-                raise UnsupportedFormat("the archive holds no scene.", where="archive")
+            if not any(path.suffix.lower() in SCENE_SUFFIXES for path in draft.iterdir()):
+                raise UnsupportedFormat("the archive holds no scene file (.ply, .splat).", where="archive")
         else:
             suffix = Path(file_name).suffix.lower()
             if suffix not in SCENE_SUFFIXES:
@@ -86,7 +96,11 @@ class Uploads:
                     "say what kind of file it is: `scene.ply` or `scene.splat`, or send a ZIP.", where="query.file"
                 )
             upload.rename(draft / f"scene{suffix}")
-        load_scene(draft)
+        try:
+            load_scene(draft)
+        except SceneError as error:
+            error.where = error.where.replace(str(draft), "archive")  # our folders are nobody's business
+            raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
     def _unpack(self, archive: Path, folder: Path) -> None:
         """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat."""
@@ -110,6 +124,10 @@ class Uploads:
             raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
         except FileExistsError as error:
             raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+
+
+def _exists(scene_id: str) -> SceneExists:
+    return SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
 
 
 def check_scene_id(scene_id: str) -> None:
