@@ -453,6 +453,9 @@ def test_the_document_shows_the_examples():
 def test_what_belongs_to_no_operation_is_a_problem_document_too(shared):
     assert_problem(shared.get("/nowhere"), 404, "not_found")
     assert_problem(shared.put("/localize"), 405, "method_not_allowed")
+    refused = shared.patch("/jobs/x")
+    assert_problem(refused, 405, "method_not_allowed")
+    assert refused.headers["allow"] == "DELETE, GET"
 
 
 def test_a_viewer_that_is_gone_is_told(stepping):

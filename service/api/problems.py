@@ -11,6 +11,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
 
 from service.api.schemas import Problem
 from service.errors import (
@@ -139,7 +140,10 @@ def install(app: FastAPI) -> None:
     """Make every error of the app a problem document."""
 
     async def answer(request: Request, error: Exception) -> Response:
-        return problem_response(error, request.url.path)
+        response = problem_response(error, request.url.path)
+        if response.status_code == 405:
+            response.headers["Allow"] = ", ".join(sorted(_allowed(request)))
+        return response
 
     async def answer_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
@@ -149,6 +153,15 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, answer)
     app.add_exception_handler(ClientDisconnect, answer)  # nobody hears it, but it is no failure of ours
     app.add_exception_handler(RequestValidationError, answer_validation)
+
+
+def _allowed(request: Request) -> set[str]:
+    """Return the methods of an address; the router tells those of the first route that fits only."""
+    methods: set[str] = set()
+    for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT"):
+        scope = {**request.scope, "method": method}
+        methods |= {method for route in request.app.routes if route.matches(scope)[0] is Match.FULL}
+    return methods
 
 
 def described(errors: Sequence[Any]) -> tuple[str, str]:

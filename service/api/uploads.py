@@ -11,7 +11,8 @@ import re
 import shutil
 import zipfile
 import zlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
 
@@ -33,6 +34,8 @@ from service.scene_formats.manifest import MANIFEST
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _MAX_MEMBERS = 20_000
 _COPY_BYTES = 1 << 20
+_MAX_NAME_BYTES = 255
+"""On all usual file systems."""
 
 
 class Uploads:
@@ -103,27 +106,34 @@ class Uploads:
             raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
     def _unpack(self, archive: Path, folder: Path) -> None:
-        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat."""
+        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat, OSError."""
         left = self._max_bytes
-        try:
-            with zipfile.ZipFile(archive) as opened:
-                members = [m for m in opened.infolist() if not m.is_dir()]
-                if len(members) > _MAX_MEMBERS:
-                    raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
-                top = _common_top([m.filename for m in members])
-                for member in members:
-                    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                        # LZMA takes as much memory as the archive says, up to 4 GB.
-                        raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
-                    name = _wanted(PurePosixPath(member.filename).relative_to(top))
-                    if name is not None:
-                        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                        with opened.open(member) as source, (folder / name).open("xb") as target:
-                            left = _copied(source, target, left)
-        except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
-            raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
-        except FileExistsError as error:
-            raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+        with _reading():
+            opened = zipfile.ZipFile(archive)
+        with opened:
+            members = [m for m in opened.infolist() if not m.is_dir()]
+            if len(members) > _MAX_MEMBERS:
+                raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
+            top = _common_top([m.filename for m in members])
+            for member in members:
+                if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    # LZMA takes as much memory as the archive says, up to 4 GB.
+                    raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
+                name = _wanted(PurePosixPath(member.filename).relative_to(top))
+                if name is not None:
+                    with _reading():
+                        source = opened.open(member)
+                    with source:
+                        left = _copied(source, folder / name, left)
+
+
+@contextmanager
+def _reading() -> Iterator[None]:
+    """Blame the archive, not our disk. Raises CorruptScene."""
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, ValueError, OSError) as error:
+        raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
 
 
 def _exists(scene_id: str) -> SceneExists:
@@ -151,25 +161,26 @@ def _wanted(path: PurePosixPath) -> str | None:
     if path.parts == (name,) and (
         Path(name).suffix.lower() in SCENE_SUFFIXES or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
     ):
-        return name if re.fullmatch(r"[\w. -]{1,200}", name) else None
-    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"\w+\.(bin|txt)", name):
+        return name if re.fullmatch(r"[\w. -]+", name) and len(name.encode()) <= _MAX_NAME_BYTES else None
+    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"[a-z]{1,40}\.(bin|txt)", name):
         return str(path)
     return None
 
 
-def _read(source: IO[bytes]) -> bytes:
-    """Read some of a file in an archive. Raises CorruptScene."""
+def _copied(source: IO[bytes], path: Path, left: int) -> int:
+    """Copy at most `left` bytes into a new file; return how many more there may be. Raises CorruptScene, OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        return source.read(_COPY_BYTES)
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OSError) as error:
-        raise CorruptScene(f"the archive is damaged: {str(error)[:200]}.", where="archive") from error
-
-
-def _copied(source: IO[bytes], target: IO[bytes], left: int) -> int:
-    """Copy at most `left` bytes; return how many more there may be. Raises CorruptScene."""
-    while chunk := _read(source):
-        left -= len(chunk)
-        if left < 0:
-            raise CorruptScene("the archive holds more than the service takes.", where="archive")
-        target.write(chunk)
-    return left
+        target = path.open("xb")
+    except FileExistsError as error:
+        raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+    with target:
+        while True:
+            with _reading():
+                chunk = source.read(_COPY_BYTES)
+            if not chunk:
+                return left
+            left -= len(chunk)
+            if left < 0:
+                raise CorruptScene("the archive holds more than the service takes.", where="archive")
+            target.write(chunk)
