@@ -11,8 +11,13 @@ their EXIF in messengers.
 
 from __future__ import annotations
 
+import base64
+import json
 import logging
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -22,7 +27,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
-from pi_heif import HeifImageFile
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -57,8 +61,10 @@ _DECODERS = (
     ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
     ("PNG", PngImageFile, MAX_PIXELS_WHOLE, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
     ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
-    ("HEIC", HeifImageFile, MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
+    ("HEIC", lambda file: _heic(file.read()), MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
 )
+_HEIC_S = 30
+"""Wall time; 64 megapixels take two seconds."""
 _JPEG_MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")
 """Not a stuffed byte, nor a restart within a scan."""
 _BAND_PX = 1 << 21
@@ -274,6 +280,32 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
     return name, photo
 
 
+def _heic(data: bytes) -> Image.Image:
+    """Decode in another process, which may crash. Raises ValueError."""
+    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(MAX_PIXELS)]
+    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    try:
+        told = subprocess.run(command, input=data, capture_output=True, timeout=_HEIC_S, check=True, env=kept).stdout
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        raise ValueError(f"its decoder crashed or took too long ({type(error).__name__})") from error
+    line, _, pixels = told.partition(b"\n")
+    head = json.loads(line)
+    if "error" in head:
+        raise ValueError(head["error"])
+    size = head["width"], head["height"]
+    photo = Image.frombuffer(head["mode"], size, pixels) if pixels else _Large(*size)
+    photo.info["exif"] = base64.b64decode(head["exif"])
+    return photo
+
+
+class _Large(Image.Image):
+    """Of a photo that wasn't decoded: nothing but its size, to be refused."""
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__()
+        self._size = width, height
+
+
 def _scans(data: bytes) -> int:
     """Count a JPEG's scans, up to its end: phones put videos behind it."""
     at, scans = 2, 0
@@ -357,9 +389,7 @@ def _band_rgb(band: Image.Image, background_rgb: tuple[float, float, float]) -> 
 
 
 def _orientation(photo: Image.Image) -> int:
-    """Return 1 to 8; 1, upright, for what is missing or unreadable. HEIC is turned by its decoder."""
-    if isinstance(photo, HeifImageFile):
-        return 1
+    """Return 1 to 8; 1, upright, for what is missing or unreadable. A HEIC's decoder turns it, and says 1."""
     value = _exif(photo).get(ExifTags.Base.Orientation, 1)
     return value if value in _ORIENTATIONS else 1
 

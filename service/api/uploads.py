@@ -111,7 +111,7 @@ class Uploads:
         with _reading():
             opened = zipfile.ZipFile(archive)
         with opened:
-            members = [m for m in opened.infolist() if not m.is_dir()]
+            members = [m for m in opened.infolist() if not m.filename.endswith("/")]
             if len(members) > _MAX_MEMBERS:
                 raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
             top = _common_top([m.filename for m in members])
