@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -12,6 +14,7 @@ from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
+from starlette.types import Message, Receive, Scope, Send
 
 from service.api.schemas import Problem
 from service.errors import (
@@ -47,6 +50,7 @@ _log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 5
+_LINGER_S = 2.0
 
 # The first class that fits decides; SplatfixError itself, hence EstimatorFault, is our mistake.
 _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
@@ -134,6 +138,23 @@ def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | Non
     told = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
     problem = problem.model_copy(update={"instance": path})
     return Response(problem.model_dump_json(), problem.status, {**told, **(headers or {})}, MEDIA_TYPE)
+
+
+async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer before the body was read, and wait a moment for what of it is on its way.
+
+    A connection that is closed while data comes in is reset, and a client that still sends then loses the answer.
+    """
+
+    async def held_open(message: Message) -> None:
+        await send({**message, "more_body": True} if message["type"] == "http.response.body" else message)
+
+    await response(scope, receive, held_open)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_LINGER_S):
+            while (await receive()).get("more_body"):
+                pass
+    await send({"type": "http.response.body", "body": b""})
 
 
 def install(app: FastAPI) -> None:
