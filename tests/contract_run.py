@@ -81,7 +81,7 @@ def run(url: str, folder: Path, phases: str, examples: int, seed: int) -> int:
         *(str(Path(sys.executable).parent / "schemathesis"), "run", str(HERE.parent / "openapi.yaml"), "--url", url),
         *("--checks", ",".join(CHECKS), "--phases", phases, "--continue-on-failure"),
         *("--max-examples", str(examples), "--seed", str(seed), "--request-timeout", "30"),
-        *("--suppress-health-check", "all", "--workers", "2", "--no-shrink", "--warnings", "off"),
+        *("--suppress-health-check", "all", "--no-shrink", "--warnings", "off"),
         *("--report", "ndjson", "--report-ndjson-path", str(folder / "events.ndjson")),
     ]
     path = f"{HERE}{os.pathsep}{HERE.parent}"

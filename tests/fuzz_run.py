@@ -24,10 +24,12 @@ import time
 import zipfile
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
+from typing import BinaryIO, NoReturn
 
 HERE = Path(__file__).parent
 MAX_S = 1.0
@@ -52,31 +54,36 @@ class Target:
 # ------------------------------------------------------------------ scenes
 
 
-def scene_target(name: str, seeds: Mapping[str, bytes], words: tuple[str, ...] = (), beside: str = "") -> Target:
-    """Read a folder in which one file is hostile. With `beside`, a scene file lies in it, and is harmless."""
+def scene_target(
+    name: str,
+    seeds: Mapping[str, bytes],
+    words: tuple[str, ...] = (),
+    *,
+    beside: Mapping[str, bytes] | None = None,
+    read: Callable[[Path], object] | None = None,
+) -> Target:
+    """Read a folder in which one file is hostile; those `beside` it are not. `read`: not the whole scene."""
     from service.errors import SceneError
     from service.scene_formats import load_scene
 
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     file = folder / name
     file.parent.mkdir(parents=True, exist_ok=True)
-    if beside:
-        (folder / "scene.ply").write_bytes(ply())
-        if beside != "scene.ply":
-            (folder / beside).write_bytes(seeds["twin"])
+    for other, data in (beside or {}).items():
+        (folder / other).write_bytes(data)
 
     def run(data: bytes) -> None:
         file.write_bytes(data)
-        try:
+        with suppress(SceneError):
+            if read:
+                read(folder)
+                return
             scene = load_scene(folder)
-        except SceneError:
-            return
-        arrays = scene.means, scene.quats, scene.scales, scene.opacities, scene.sh
-        assert len({len(array) for array in arrays}) == 1
+            arrays = scene.means, scene.quats, scene.scales, scene.opacities, scene.sh
+            assert len({len(array) for array in arrays}) == 1
 
-    fed = {key: value for key, value in seeds.items() if key != "twin"}
     # A scene is held several times while it is activated, in float64 for a moment.
-    return Target(run, fed, 8192, 64 * MB, words)
+    return Target(run, seeds, 8192, 64 * MB, words)
 
 
 def ply(count: int = 2, degree: int = 1, kind: str = "float", order: str = "little") -> bytes:
@@ -132,9 +139,8 @@ def manifest_target() -> Target:
     example = text[text.index("{") : text.index("Every key")].replace("scene.ply", "scene.ply")
     keys = re.findall(r'"(\w+)":', example)
     small = b'{"up": [0, 0, 1], "training_size": [64, 48]}'
-    return scene_target(
-        "scene.json", {"all": example.encode(), "small": small}, (*_JSON_WORDS, *keys), beside="scene.ply"
-    )
+    seeds = {"all": example.encode(), "small": small}
+    return scene_target("scene.json", seeds, (*_JSON_WORDS, *keys), beside={"scene.ply": ply()})
 
 
 def transforms_target() -> Target:
@@ -145,7 +151,12 @@ def transforms_target() -> Target:
     sizeless = {"fl_x": 9, "frames": [_FRAME]}
     named = {"nerfstudio": nerfstudio, "blender": blender, "sizeless": sizeless}
     seeds = {name: json.dumps(value).encode() for name, value in named.items()}
-    return scene_target("transforms.json", seeds, words, beside="scene.ply")
+    from service.scene_formats.folder import _training
+    from service.scene_formats.manifest import Manifest
+
+    return scene_target(
+        "transforms.json", seeds, words, read=lambda folder: _training(folder, Manifest(), lambda name: True)
+    )
 
 
 _BIN_CAMERAS = struct.pack("<QiiQQ4d", 1, 1, 1, 96, 64, 80, 80, 48, 32)
@@ -155,8 +166,16 @@ _TXT_IMAGES = b"# images\n1 1 0 0 0 0 0 0 1 a.jpg\n1.0 2.0 -1\n2 1 0 0 0 1 2 3 2
 
 
 def colmap_target(fed: str, seed: bytes, beside: str, twin: bytes) -> Target:
-    seeds = {"one": seed, "twin": twin}
-    return scene_target(f"sparse/0/{fed}", seeds, ("PINHOLE", "FULL_OPENCV", "nan", "1e400"), f"sparse/0/{beside}")
+    from service.scene_formats.colmap import read_cameras
+
+    words = ("PINHOLE", "FULL_OPENCV", "nan", "1e400")
+    return scene_target(
+        f"sparse/0/{fed}",
+        {"one": seed},
+        words,
+        beside={f"sparse/0/{beside}": twin},
+        read=lambda folder: read_cameras(folder / "sparse" / "0", lambda name: True),
+    )
 
 
 # ------------------------------------------------------------------ archives and photos
@@ -193,28 +212,44 @@ def archive_target() -> Target:
     )
 
 
-def in_a_fork(*_: object, input: bytes, **__: object) -> SimpleNamespace:
-    """Do what heic_child.py does, without starting Python each time. A crash of the decoder is no finding."""
-    from service import heic_child
-    from service.images import MAX_PIXELS
+class HeicChild:
+    """Does what heic_child.py does, without starting Python each time. A crash of the decoder is no finding."""
 
-    ours, theirs = os.pipe()
-    child = os.fork()
-    if not child:
-        with os.fdopen(theirs, "wb") as out:
-            signal.signal(signal.SIGSEGV, signal.SIG_DFL)
-            signal.signal(signal.SIGABRT, signal.SIG_DFL)
+    def __init__(self) -> None:
+        self._process: tuple[int, BinaryIO, BinaryIO] | None = None
+
+    def run(self, *_: object, input: bytes, **__: object) -> SimpleNamespace:
+        pid, asked, told = self._process = self._process or self._started()
+        asked.write(struct.pack("<I", len(input)) + input)
+        asked.flush()
+        head = told.read(4)
+        if len(head) < 4:
+            _, status = os.waitpid(pid, 0)
+            self._process = None
+            raise subprocess.CalledProcessError(status, "heic_child")
+        return SimpleNamespace(stdout=told.read(*struct.unpack("<I", head)))
+
+    def _started(self) -> tuple[int, BinaryIO, BinaryIO]:
+        (asked, ask), (told, tell) = os.pipe(), os.pipe()
+        pid = os.fork()
+        if not pid:
+            os.close(ask), os.close(told)
+            self._serve(os.fdopen(asked, "rb"), os.fdopen(tell, "wb"))
+        os.close(asked), os.close(tell)
+        return pid, os.fdopen(ask, "wb"), os.fdopen(told, "rb")
+
+    def _serve(self, asked: BinaryIO, tell: BinaryIO) -> NoReturn:
+        from service import heic_child
+        from service.images import MAX_PIXELS
+
+        for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS):
+            signal.signal(number, signal.SIG_DFL)
+        while head := asked.read(4):
             signal.alarm(_HANG_S)
-            out.write(b"".join(heic_child.decoded(input, MAX_PIXELS)))
-            out.flush()
-            os._exit(0)
-    os.close(theirs)
-    with os.fdopen(ours, "rb") as told:
-        data = told.read()
-    _, status = os.waitpid(child, 0)
-    if status:
-        raise subprocess.CalledProcessError(status, "heic_child")
-    return SimpleNamespace(stdout=data)
+            answer = b"".join(heic_child.decoded(asked.read(*struct.unpack("<I", head)), MAX_PIXELS))
+            tell.write(struct.pack("<I", len(answer)) + answer)
+            tell.flush()
+        os._exit(0)
 
 
 def photo_target(kind: str) -> Target:
@@ -224,7 +259,7 @@ def photo_target(kind: str) -> Target:
 
     if kind == "heic":
         service.images.subprocess = SimpleNamespace(
-            run=in_a_fork,
+            run=HeicChild().run,
             CalledProcessError=subprocess.CalledProcessError,
             TimeoutExpired=subprocess.TimeoutExpired,
         )

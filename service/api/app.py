@@ -87,7 +87,7 @@ def create_app(
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
             app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
-            _show(metrics, known, jobs)
+            _show(metrics, known, jobs, settings.workers)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -152,10 +152,11 @@ def door(settings: Settings, keys: KeyRing) -> Door:
     return Door(keys, is_open, hosts, settings.cors_origins)
 
 
-def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs) -> None:
+def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
     """Put the service's state among the metrics."""
     metrics.gauge("jobs_queued", "Jobs that wait", (), lambda: {(): jobs.waiting()})
     metrics.gauge("jobs_running", "Jobs that run", (), lambda: {(): jobs.running()})
+    metrics.gauge("workers", "Threads that run jobs", (), lambda: {(): workers})
     metrics.gauge("workers_stuck", "Abandoned workers", (), lambda: {(): jobs.stuck_workers()})
     metrics.gauge("scene_bytes", "Memory of a scene", ("scene",), scenes.memory)
 

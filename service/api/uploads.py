@@ -114,12 +114,13 @@ class Uploads:
             members = [m for m in opened.infolist() if not m.filename.endswith("/")]
             if len(members) > _MAX_MEMBERS:
                 raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
-            top = _common_top([m.filename for m in members])
-            for member in members:
+            paths = [PurePosixPath(m.filename.lstrip("/")) for m in members]
+            top = _common_top(paths)
+            for member, path in zip(members, paths, strict=True):
                 if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
                     # LZMA takes as much memory as the archive says, up to 4 GB.
                     raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
-                name = _wanted(PurePosixPath(member.filename).relative_to(top))
+                name = _wanted(path.relative_to(top))
                 if name is not None:
                     with _reading():
                         source = opened.open(member)
@@ -146,10 +147,10 @@ def check_scene_id(scene_id: str) -> None:
         raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
 
 
-def _common_top(names: list[str]) -> PurePosixPath:
+def _common_top(paths: list[PurePosixPath]) -> PurePosixPath:
     """Return the folder that all files are in, if there is one: many pack the folder, others what is in it."""
-    tops = {PurePosixPath(name).parts[:1] for name in names}
-    nested = all(len(PurePosixPath(name).parts) > 1 for name in names)
+    tops = {path.parts[:1] for path in paths}
+    nested = all(len(path.parts) > 1 for path in paths)
     if len(tops) == 1 and nested and tops != {COLMAP_FOLDER.parts[:1]}:
         return PurePosixPath(*tops.pop())
     return PurePosixPath()

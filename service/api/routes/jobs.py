@@ -149,7 +149,7 @@ async def job_render(
     seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
     loaded = parts.scenes.get(job.scene)
     render = partial(_rendered_jpeg, loaded, seen_by)
-    return Response(await to_thread.run_sync(render, limiter=parts.rendering), media_type="image/jpeg")
+    return Response(await parts.drawn(job.scene, render), media_type="image/jpeg")
 
 
 def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
 import anyio
+from anyio import to_thread
 from fastapi import Depends, Path, Request
 
 from service.api.jobs import Jobs
@@ -31,6 +34,13 @@ class Parts:
     """Photos decoded at once: each may take 450 MB for a moment."""
     rendering: anyio.CapacityLimiter
     """Pictures rendered at once for looking at: a renderer's thread keeps working memory."""
+
+    async def drawn(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
+        """Render something for looking at, off the event loop."""
+        began = time.perf_counter()
+        picture = await to_thread.run_sync(draw, limiter=self.rendering)
+        self.metrics.rendered(scene_id, time.perf_counter() - began)
+        return picture
 
 
 def _parts(request: Request) -> Parts:

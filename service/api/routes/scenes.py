@@ -116,7 +116,7 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
 async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
     """Return a small picture of the scene, as its middle training camera sees it."""
     draw = partial(thumbnail, parts.scenes.get(scene_id))
-    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type="image/jpeg")
+    return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
 
 
 @router.get(
@@ -156,4 +156,4 @@ async def scene_splats(
 async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
     """Render a scene from any pose: a picture, or the depth of what is seen there."""
     draw = partial(picture, parts.scenes.get(scene_id), wanted)
-    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type=PICTURE_TYPES[wanted.format])
+    return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])
