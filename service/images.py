@@ -369,23 +369,23 @@ def _rgb(
     rows = max(1, _BAND_PX // photo.width)
     for top in range(0, photo.height, rows):
         band = photo.crop((0, top, photo.width, min(top + rows, photo.height)))
-        rgb[top : top + rows], alpha = _band_rgb(band, background_rgb)
-        opaque = opaque and alpha == 255
+        rgb[top : top + rows], band_is_opaque = _band_rgb(band, background_rgb)
+        opaque = opaque and band_is_opaque
     return rgb, [] if opaque else ["Transparent parts were filled with one colour."]
 
 
-def _band_rgb(band: Image.Image, background_rgb: tuple[float, float, float]) -> tuple[np.ndarray, int]:
-    """Return the pixels, and the least opacity (0..255) among them."""
+def _band_rgb(band: Image.Image, background_rgb: tuple[float, float, float]) -> tuple[np.ndarray, bool]:
+    """Return the pixels, and whether all are opaque."""
     if band.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
         gray = (np.asarray(band).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
-        return np.repeat(gray[:, :, None], 3, axis=2), 255
+        return np.repeat(gray[:, :, None], 3, axis=2), True
     if not band.has_transparency_data:
-        return np.asarray(band.convert("RGB")), 255
+        return np.asarray(band.convert("RGB")), True
     rgba = band.convert("RGBA")
     alpha = rgba.getchannel("A")
     canvas = Image.new("RGB", band.size, tuple(round(255 * c) for c in background_rgb))
     canvas.paste(rgba, mask=alpha)
-    return np.asarray(canvas), int(alpha.getextrema()[0])
+    return np.asarray(canvas), alpha.getextrema()[0] == 255
 
 
 def _orientation(photo: Image.Image) -> int:
