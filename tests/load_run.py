@@ -44,6 +44,8 @@ class Seen:
     health_s: list[float] = field(default_factory=list)
     memory: list[tuple[float, int]] = field(default_factory=list)
     """Seconds since the start of the load, resident bytes."""
+    cpu: list[tuple[float, float]] = field(default_factory=list)
+    """Seconds since 1970, seconds of CPU that the service has had."""
 
 
 def encoded(photo: Path) -> tuple[bytes, str]:
@@ -97,8 +99,8 @@ async def send(client: httpx.AsyncClient, body: tuple[bytes, str], seen: Seen, p
         seen.without_retry_after += 1
 
 
-async def capacity(client: httpx.AsyncClient, bodies: list, seconds: float) -> float:
-    """Return the jobs per second that are done while two are always there."""
+async def capacity(client: httpx.AsyncClient, bodies: list, seconds: float, pid: int) -> tuple[float, float]:
+    """Return the jobs per second that are done while two are always there, and the CPU time of each."""
     seen, endless = Seen(), cycle(bodies)
 
     async def one_after_another(until: float) -> None:
@@ -107,10 +109,10 @@ async def capacity(client: httpx.AsyncClient, bodies: list, seconds: float) -> f
 
     for duration in (5.0, seconds):  # the first ones warm up
         seen.accepted.clear()
-        began = time.monotonic()
+        began, cpu_s = time.monotonic(), used(pid)
         await asyncio.gather(*(one_after_another(began + duration) for _ in range(2)))
         took = time.monotonic() - began
-    return len(seen.accepted) / took
+    return len(seen.accepted) / took, (used(pid) - cpu_s) / len(seen.accepted)
 
 
 async def load(client: httpx.AsyncClient, bodies: list, rate: float, seconds: float, pid: int) -> Seen:
@@ -132,12 +134,19 @@ async def watch(client: httpx.AsyncClient, seen: Seen, began: float, pid: int) -
                 answer = await other.get(path)
                 seen.health_s.append(time.monotonic() - asked if answer.status_code == 200 else float("inf"))
             seen.memory.append((time.monotonic() - began, resident(pid)))
+            seen.cpu.append((time.time(), used(pid)))
             await asyncio.sleep(0.2)
 
 
 def resident(pid: int) -> int:
     text = Path(f"/proc/{pid}/status").read_text()
     return 1024 * int(text[text.index("VmRSS:") + 6 :].split(maxsplit=1)[0])
+
+
+def used(pid: int) -> float:
+    """Return the CPU time of a process with its threads."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
 
 
 async def jobs_of(client: httpx.AsyncClient, accepted: set[str]) -> list[dict]:
@@ -156,12 +165,15 @@ def between(job: dict, first: str, last: str) -> float:
     return (datetime.fromisoformat(job[last]) - datetime.fromisoformat(job[first])).total_seconds()
 
 
-def judged(seen: Seen, jobs: list[dict], free_rate: float, rate: float, seconds: float) -> dict:
+def judged(seen: Seen, jobs: list[dict], free: tuple[float, float], rate: float, seconds: float) -> dict:
+    free_rate, free_cpu_s = free
     ended = sorted(datetime.fromisoformat(job["finished"]).timestamp() for job in jobs)
     begun = datetime.fromisoformat(min(job["created"] for job in jobs)).timestamp()
     # From when the queue is full until the load ends.
     steady = [at for at in ended if begun + seconds / 6 <= at <= begun + seconds]
     loaded_rate = len(steady) / (seconds * 5 / 6)
+    cpu = [used_s for at, used_s in seen.cpu if begun + seconds / 6 <= at <= begun + seconds]
+    loaded_cpu_s = (cpu[-1] - cpu[0]) / len(steady)
     latencies = [between(job, "created", "finished") for job in jobs]
     bound_s = (QUEUE_SIZE + 2) / loaded_rate
     minute = seconds / 3
@@ -180,6 +192,8 @@ def judged(seen: Seen, jobs: list[dict], free_rate: float, rate: float, seconds:
         "statuses": dict(Counter(str(job["status"]) for job in jobs)),
         "loaded_rate_per_s": loaded_rate,
         "loaded_over_free": loaded_rate / free_rate,
+        # What doesn't depend on who else uses the machine: the core is the service's limit in both parts.
+        "cpu_ms_per_job": {"free": 1e3 * free_cpu_s, "loaded": 1e3 * loaded_cpu_s, "ratio": free_cpu_s / loaded_cpu_s},
         "latency_s": {"median": quantiles(latencies, n=2)[0], "max": max(latencies), "bound": bound_s},
         "health_ms": {"median": 1e3 * health[49], "p99": 1e3 * health[98], "max": 1e3 * max(seen.health_s)},
         "memory_mb": {"minute_1": first / 1e6, "minute_3": last / 1e6, "growth": last / first - 1},
@@ -204,11 +218,11 @@ async def measured(process: subprocess.Popen, url: str, arguments: argparse.Name
     limits = httpx.Limits(max_connections=200, max_keepalive_connections=50)
     async with httpx.AsyncClient(base_url=url, timeout=120, trust_env=False, limits=limits) as client:
         await ready(client)
-        free_rate = await capacity(client, bodies, 20 * arguments.minutes)
-        seconds, rate = 60 * arguments.minutes, arguments.times * free_rate
+        free = await capacity(client, bodies, 20 * arguments.minutes, process.pid)
+        seconds, rate = 60 * arguments.minutes, arguments.times * free[0]
         seen = await load(client, bodies, rate, seconds, process.pid)
         jobs = await jobs_of(client, set(seen.accepted))
-    return judged(seen, jobs, free_rate, rate, seconds)
+    return judged(seen, jobs, free, rate, seconds)
 
 
 def main() -> int:
