@@ -11,7 +11,13 @@ their EXIF in messengers.
 
 from __future__ import annotations
 
+import base64
+import json
 import logging
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,7 +28,6 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
-from pi_heif import HeifImageFile
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -33,6 +38,10 @@ from service.types import Intrinsics, Pose, Query
 
 MAX_PIXELS = 64 * 1024 * 1024
 """A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
+MAX_PIXELS_WHOLE = 25 * 1024 * 1024
+"""Of PNG and WebP: they can't be decoded at a reduced size, and some kilobytes may hold any number of pixels."""
+MAX_SCANS = 24
+"""Of a progressive JPEG. Each is a walk over all pixels, for which an attacker needs 100 bytes; encoders make 10."""
 LONG_SIDE = 1600
 """Of `Query.rgb`; matching uses 512 and alignment 400 pixels, the rest is for close looks."""
 OPAQUE = 128
@@ -52,11 +61,17 @@ ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before we
 # check.
 _DECODERS = (
-    ("JPEG", JpegImageFile, lambda d: d.startswith(b"\xff\xd8\xff")),
-    ("PNG", PngImageFile, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
-    ("WebP", WebPImageFile, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
-    ("HEIC", HeifImageFile, lambda d: d[4:8] == b"ftyp"),
+    ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
+    ("PNG", PngImageFile, MAX_PIXELS_WHOLE, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
+    ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
+    ("HEIC", lambda file: _heic(file.read()), MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
 )
+_HEIC_S = 30
+"""Wall time; 64 megapixels take two seconds."""
+_JPEG_MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")
+"""Not a stuffed byte, nor a restart within a scan."""
+_BAND_PX = 1 << 21
+"""Converted at once: the whole photo is in memory once as it was decoded, and once as RGB."""
 _ORIENTATIONS = {
     1: (False, False, False),
     2: (False, True, False),
@@ -273,24 +288,64 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
     """Read the header and check the size. Raises InvalidImage."""
     if not data:
         raise InvalidImage("the photo is empty (0 bytes).", where="photo")
-    fitting = [(name, decoder) for name, decoder, fits in _DECODERS if fits(data)]
+    fitting = [(name, decoder, limit) for name, decoder, limit, fits in _DECODERS if fits(data)]
     if not fitting:
         raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
-    name, decoder = fitting[0]
+    name, decoder, limit = fitting[0]
     try:
         photo = decoder(BytesIO(data))
     except Image.DecompressionBombError as error:
         raise InvalidImage(f"too many pixels: {error}", where="photo") from None
     except Exception as error:  # decoders raise almost anything on a broken file
         raise InvalidImage(f"the {name} header is broken: {_short(error)}.", where="photo") from None
-    if photo.width * photo.height > MAX_PIXELS:
+    if photo.width * photo.height > limit:
         raise InvalidImage(
             f"{photo.width} x {photo.height} are {photo.width * photo.height / 1e6:.0f} megapixels; "
-            f"the limit is {MAX_PIXELS / 1e6:.0f}.",
+            f"the limit is {limit / 1e6:.0f} for {name}.",
             where="photo",
             hint="Send it smaller: more than about 2 megapixels don't help.",
         )
+    if isinstance(photo, JpegImageFile) and (scans := _scans(data)) > MAX_SCANS:
+        raise InvalidImage(f"a JPEG of {scans} scans; the limit is {MAX_SCANS}.", where="photo", hint="Save it again.")
     return name, photo
+
+
+def _heic(data: bytes) -> Image.Image:
+    """Decode in another process, which may crash. Raises ValueError."""
+    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(MAX_PIXELS)]
+    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    try:
+        told = subprocess.run(command, input=data, capture_output=True, timeout=_HEIC_S, check=True, env=kept).stdout
+    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
+        raise ValueError(f"its decoder crashed or took too long ({type(error).__name__})") from error
+    line, _, pixels = told.partition(b"\n")
+    head = json.loads(line)
+    if "error" in head:
+        raise ValueError(head["error"])
+    size = head["width"], head["height"]
+    photo = Image.frombuffer(head["mode"], size, pixels) if pixels else _Large(*size)
+    photo.info["exif"] = base64.b64decode(head["exif"])
+    return photo
+
+
+class _Large(Image.Image):
+    """Of a photo that wasn't decoded: nothing but its size, to be refused."""
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__()
+        self._size = width, height
+
+
+def _scans(data: bytes) -> int:
+    """Count a JPEG's scans, up to its end: phones put videos behind it."""
+    at, scans = 2, 0
+    while found := _JPEG_MARKER.search(data, at):
+        kind, at = found[0][-1], found.end()
+        if kind == 0xD9:
+            break
+        scans += kind == 0xDA
+        at += int.from_bytes(data[at : at + 2])  # the segment's length
+    return scans
 
 
 def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float]) -> _Decoded:
@@ -344,24 +399,37 @@ def _rgb(
     photo: Image.Image, background_rgb: tuple[float, float, float]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, list[str]]:
     """Return colours, opacity unless all is opaque, and warnings."""
-    if photo.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
-        gray = (np.asarray(photo).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
-        return np.repeat(gray[:, :, None], 3, axis=2), None, []
-    if photo.has_transparency_data:
-        rgba = photo.convert("RGBA")
-        alpha = rgba.getchannel("A")
-        canvas = Image.new("RGB", photo.size, tuple(round(255 * c) for c in background_rgb))
-        canvas.paste(rgba, mask=alpha)
-        if alpha.getextrema()[0] == 255:
-            return np.array(canvas), None, []
-        return np.array(canvas), np.array(alpha), ["Transparent parts of the photo are ignored."]
-    return np.array(photo.convert("RGB")), None, []
+    rgb = np.empty((photo.height, photo.width, 3), np.uint8)
+    opacity = np.full(rgb.shape[:2], 255, np.uint8) if photo.has_transparency_data else None
+    rows = max(1, _BAND_PX // photo.width)
+    for top in range(0, photo.height, rows):
+        band = photo.crop((0, top, photo.width, min(top + rows, photo.height)))
+        rgb[top : top + rows], alpha = _band_rgb(band, background_rgb)
+        if opacity is not None and alpha is not None:
+            opacity[top : top + rows] = alpha
+    if opacity is None or opacity.min(initial=255) == 255:
+        return rgb, None, []
+    return rgb, opacity, ["Transparent parts of the photo are ignored."]
+
+
+def _band_rgb(
+    band: Image.Image, background_rgb: tuple[float, float, float]
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
+    """Return colours, and opacity if there is any."""
+    if band.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
+        gray = (np.asarray(band).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
+        return np.repeat(gray[:, :, None], 3, axis=2), None
+    if not band.has_transparency_data:
+        return np.asarray(band.convert("RGB")), None
+    rgba = band.convert("RGBA")
+    alpha = rgba.getchannel("A")
+    canvas = Image.new("RGB", band.size, tuple(round(255 * c) for c in background_rgb))
+    canvas.paste(rgba, mask=alpha)
+    return np.asarray(canvas), np.asarray(alpha)
 
 
 def _orientation(photo: Image.Image) -> int:
-    """Return 1 to 8; 1, upright, for what is missing or unreadable. HEIC is turned by its decoder."""
-    if isinstance(photo, HeifImageFile):
-        return 1
+    """Return 1 to 8; 1, upright, for what is missing or unreadable. A HEIC's decoder turns it, and says 1."""
     value = _exif(photo).get(ExifTags.Base.Orientation, 1)
     return value if value in _ORIENTATIONS else 1
 

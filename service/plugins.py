@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -26,12 +27,7 @@ class PluginFolder:
         self._marker = f"\ndef {marker}("
 
     def names(self) -> tuple[str, ...]:
-        found = pkgutil.iter_modules(importlib.import_module(self.package).__path__)
-        return tuple(sorted(info.name for info in found if not info.ispkg and self._is_plugin(info)))
-
-    def _is_plugin(self, info: pkgutil.ModuleInfo) -> bool:
-        source = Path(info.module_finder.path, f"{info.name}.py")  # type: ignore[union-attr]
-        return self._marker in source.read_text("utf-8")
+        return _modules_with(self._marker, tuple(importlib.import_module(self.package).__path__))
 
     def missing(self, name: str) -> str | None:
         """Return why the plug-in can't run on this machine, or None if it can."""
@@ -51,3 +47,11 @@ class PluginFolder:
             kind = self.package.rsplit(".", 1)[-1]
             raise UnknownName(f"there is no '{name}'; known: {', '.join(self.names())}.", where=kind)
         return importlib.import_module(f"{self.package}.{name}")
+
+
+@cache
+def _modules_with(marker: str, folders: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the modules whose source has the marker; read once, since every request asks."""
+    found = (info for info in pkgutil.iter_modules(folders) if not info.ispkg)
+    sources = {i.name: Path(i.module_finder.path, f"{i.name}.py") for i in found}  # type: ignore[union-attr]
+    return tuple(sorted(name for name, source in sources.items() if marker in source.read_text("utf-8")))

@@ -117,8 +117,9 @@ class Pose:
         if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
             raise InvalidPrior("a pose is a 4x4 matrix of finite numbers.", where="world_from_camera")
         rotation = matrix[:3, :3]
-        # 1e-3: poses printed with 3 or 4 digits pass, scaled or sheared ones don't.
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        # 1e-3: poses printed with 3 or 4 digits pass, scaled or sheared ones don't. First the size: squares overflow.
+        is_large = np.abs(rotation).max() > 2
+        if is_large or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
             raise InvalidPrior(
                 "the upper left 3x3 is not a rotation (orthonormal, determinant +1).",
                 where="world_from_camera",

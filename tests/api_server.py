@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import re
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -82,7 +84,8 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
     thread.start()
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
-        with httpx.Client(base_url=url, timeout=20, trust_env=False) as client:
+        hooks = {"response": [assert_documented]}
+        with httpx.Client(base_url=url, timeout=20, trust_env=False, event_hooks=hooks) as client:
             until(lambda: server.started)
             yield client
     finally:
@@ -145,6 +148,39 @@ def events(text: str) -> list[tuple[str, str, dict]]:
         if fields:
             found.append((fields["event"], fields["id"], json.loads(fields["data"])))
     return found
+
+
+@cache
+def operations() -> list[tuple[str, re.Pattern[str], dict]]:
+    """Method, path and description of each documented operation."""
+    found = create_app(Settings(scenes=[], viewer=False)).openapi()["paths"]
+    return [
+        (method.upper(), re.compile(re.sub(r"\{\w+\}", "[^/]+", path)), operation)
+        for path, methods in found.items()
+        for method, operation in methods.items()
+    ]
+
+
+def documented(operation: dict) -> dict[str, set[str]]:
+    """Return the codes that an operation says it may give, by status."""
+    contents = {status: r.get("content", {}) for status, r in operation["responses"].items()}
+    return {
+        status: set(content["application/problem+json"]["examples"])
+        for status, content in contents.items()
+        if "application/problem+json" in content
+    }
+
+
+def assert_documented(answer: httpx.Response) -> None:
+    """Every error that any test meets must be in the API's description."""
+    if answer.headers.get("content-type") != "application/problem+json":
+        return
+    answer.read()
+    request, problem = answer.request, answer.json()
+    for method, path, operation in operations():
+        if request.method == method and path.fullmatch(request.url.path):
+            told = documented(operation).get(str(problem["status"]), set())
+            assert problem["code"] in told, f"{operation['operationId']} does not tell of {problem}"
 
 
 PROBLEM = {"type", "title", "status", "detail", "instance", "code", "where", "hint"}

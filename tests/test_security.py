@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import logging
 import os
+import re
 import socket
 import stat
+import threading
 import time
 
 import httpx
 import pytest
+import uvicorn
 from api_server import assert_problem, finished, make_scene, photo, post, serving, settings, until
+from rich.console import Console
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -23,6 +28,7 @@ from service.api.gate import needed_role
 from service.api.keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
 from service.api.metrics import Metrics
 from service.errors import InvalidRequest, QueueFull
+from service.serve import run
 
 
 @pytest.fixture
@@ -138,6 +144,36 @@ def test_listening_beyond_this_machine_needs_keys_or_a_word():
     ring = KeyRing(None)
     ring.make_passing("start", "admin")
     create_app(settings(host="0.0.0.0", keys_file=None), keys=ring)
+
+
+def test_serve_beyond_this_machine_makes_a_key_and_prints_it_in_the_url(stepping, tmp_path, monkeypatch):
+    """On loopback, which is taken for something else: a test opens no door."""
+    servers, out = [], io.StringIO()
+
+    class Server(uvicorn.Server):
+        def __init__(self, config: uvicorn.Config) -> None:
+            super().__init__(config)
+            servers.append(self)
+
+    monkeypatch.setattr("service.serve.uvicorn.Server", Server)
+    for place in ("service.serve", "service.api.app"):
+        monkeypatch.setattr(f"{place}.is_loopback", lambda host: False)
+    chosen = settings(port=0, keys_file=tmp_path / "none.json", data_dir=tmp_path / "data", log_json=False)
+    consoles = Console(file=out, width=200), Console(file=io.StringIO())
+    thread = threading.Thread(target=run, args=(chosen, *consoles))
+    thread.start()
+    try:
+        until(lambda: "start page" in out.getvalue())
+        found = re.search(r"(http://127\.0\.0\.1:\d+)/\?key=(sfx_\S+)", out.getvalue())
+        assert found
+        url, key = found.groups()
+        with httpx.Client(base_url=url, trust_env=False) as client:
+            assert_problem(client.get("/jobs"), 401, "unauthorized")
+            assert client.get("/jobs", headers=bearer(key)).status_code == 200
+            assert client.get(f"/?key={key}").headers["set-cookie"]
+    finally:
+        servers[0].should_exit = True
+        thread.join()
 
 
 # ------------------------------------------------------------------ browsers
@@ -391,7 +427,8 @@ def test_the_photos_own_name_reaches_no_path(client, tmp_path, monkeypatch):
 
 
 def test_metrics_tell_what_happened(client, stepping):
-    finished(client, post(client, prefer="").headers["location"])
+    job = finished(client, post(client, prefer="").headers["location"])
+    client.get(job["links"]["render"])
     text = client.get("/metrics").text
     samples = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
     assert float(samples['splatfix_jobs_total{estimator="stepping",state="succeeded",status="not_localized"}']) == 1
@@ -399,5 +436,8 @@ def test_metrics_tell_what_happened(client, stepping):
     assert float(samples['splatfix_stage_seconds_count{estimator="stepping",stage="step"}']) == 1
     assert float(samples["splatfix_job_wait_seconds_count"]) == 1
     assert float(samples["splatfix_jobs_queued"]) == 0
+    assert float(samples["splatfix_workers"]) == 1
+    assert float(samples['splatfix_render_seconds_count{scene="room"}']) == 1
+    assert float(samples['splatfix_renders_total{estimator="stepping"}']) == 0  # the stand-in makes none
     assert float(samples['splatfix_scene_bytes{scene="room"}']) == make_scene().nbytes
     assert "process_resident_memory_bytes" in samples

@@ -17,7 +17,7 @@ from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.problems import problem_response
+from service.api.problems import problem_response, refuse
 from service.api.settings import Settings
 from service.errors import QueueFull, RateLimited, SplatfixError
 
@@ -49,7 +49,7 @@ class Admission:
             if self._uploads >= self._settings.max_uploads:
                 raise QueueFull(f"{self._uploads} uploads are under way.", hint="Try again later.")
         except (SplatfixError, HTTPException) as error:
-            await problem_response(error, scope["path"])(scope, receive, send)
+            await refuse(problem_response(error, scope["path"]), scope, receive, send)
             return
         self._uploads += 1
         # A second for each megabyte that it may have: a slow line is no crime, a stalled one is.

@@ -25,10 +25,12 @@ from starlette.middleware.cors import CORSMiddleware
 
 from service import __version__
 from service.api.admission import Admission
+from service.api.catalog import example_components
 from service.api.edge import Edge
 from service.api.gate import Door, Gate, allowed_hosts, is_loopback
 from service.api.jobs import Jobs
 from service.api.keys import KeyRing
+from service.api.links import add_links
 from service.api.metrics import Metrics
 from service.api.problems import install
 from service.api.relay import Relay
@@ -88,7 +90,7 @@ def create_app(
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
             app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
-            _show(metrics, known, jobs)
+            _show(metrics, known, jobs, settings.workers)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -153,10 +155,11 @@ def door(settings: Settings, keys: KeyRing) -> Door:
     return Door(keys, is_open, hosts, settings.cors_origins)
 
 
-def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs) -> None:
+def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
     """Put the service's state among the metrics."""
     metrics.gauge("jobs_queued", "Jobs that wait", (), lambda: {(): jobs.waiting()})
     metrics.gauge("jobs_running", "Jobs that run", (), lambda: {(): jobs.running()})
+    metrics.gauge("workers", "Threads that run jobs", (), lambda: {(): workers})
     metrics.gauge("workers_stuck", "Abandoned workers", (), lambda: {(): jobs.stuck_workers()})
     metrics.gauge("scene_bytes", "Memory of a scene", ("scene",), scenes.memory)
 
@@ -181,10 +184,25 @@ def openapi(app: FastAPI) -> dict[str, Any]:
             [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
             ref_template="#/components/schemas/{model}",
         )
-        components = schema.setdefault("components", {}).setdefault("schemas", {})
+        models = schema.setdefault("components", {}).setdefault("schemas", {})
+        models |= {name: model for name, model in extra["$defs"].items() if name not in models}
+        schema["components"]["examples"] = example_components()
+        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
+        schema["security"] = [{"key": []}, {}]
+        _drop_default_validation(schema)
+        add_links(schema)
         app.openapi_schema = schema
-        components |= {name: model for name, model in extra["$defs"].items() if name not in components}
     return app.openapi_schema
+
+
+def _drop_default_validation(schema: dict[str, Any]) -> None:
+    """Take out what FastAPI says of its own validation: ours answers with a problem document of 400."""
+    for operations in schema["paths"].values():
+        for operation in operations.values():
+            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schema["components"]["schemas"].pop(name, None)
 
 
 def openapi_yaml() -> str:
@@ -197,10 +215,13 @@ def openapi_yaml() -> str:
     )
 
 
+_KEYS = "An API key, or a token from `/tokens`; a service without keys needs none."
 _SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
 _DESCRIPTION = """
 Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
 camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
 are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
-Every error is a problem document (RFC 9457).
+Every error is a problem document (RFC 9457) with a stable `code`; each operation lists those it may give, each with
+an example. An address that isn't here is answered with `not_found`, another method with `method_not_allowed`.
+A job that ended without a result has a problem document as its `error`.
 """

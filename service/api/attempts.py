@@ -75,6 +75,7 @@ class Attempts:
             estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
             for timing in estimate.timings:
                 desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
+            desk.metrics.renders(job.estimator, estimate.renders)
             return _success(estimate, live.task, loaded)
         except Cancelled:
             stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled

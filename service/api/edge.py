@@ -1,4 +1,4 @@
-"""The outermost layer: sub-path, request id, security headers, slow readers, log and metrics."""
+"""The outermost layer: sub-path, request id, security headers, slow readers, bugs, log and metrics."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.metrics import Metrics
+from service.api.problems import problem_response
 from service.logs import bound
 
 _log = logging.getLogger(__name__)
@@ -50,10 +51,14 @@ class Edge:
         with bound(request_id=answer.request_id):
             try:
                 await self._app(scope, receive, answer.send)
-            except Exception:
-                if not answer.dropped:
+            except Exception as error:
+                if answer.dropped:
+                    _log.info("a client took no more of its answer, and was dropped: %s", scope["path"])
+                elif answer.begun:  # it can only be broken off
                     raise
-                _log.info("a client took no more of its answer, and was dropped: %s", scope["path"])
+                else:
+                    _log.exception("%s %s failed", scope["method"], scope["path"])
+                    await problem_response(error, scope["path"])(scope, receive, answer.send)
             finally:
                 self._tell(scope, answer.status, time.perf_counter() - began)
 
@@ -73,13 +78,13 @@ class _Answer:
         given = Headers(scope=scope).get(REQUEST_ID, "")
         self.request_id = given if re.fullmatch(r"[\w.-]{1,64}", given) else secrets.token_hex(8)
         self.status = 499  # nginx's word for a client that left before the answer
-        self.dropped = False
+        self.begun = self.dropped = False
         path = scope["path"].removeprefix(scope.get("root_path", ""))
         self._own_page = path == "/" or path.startswith("/ui/")
 
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
-            self.status = message["status"]
+            self.status, self.begun = message["status"], True
             headers = MutableHeaders(scope=message)
             headers[REQUEST_ID] = self.request_id
             for name, value in _HEADERS.items():

@@ -17,7 +17,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.api.keys import Caller, KeyRing, Role
-from service.api.problems import problem_response
+from service.api.problems import problem_response, refuse
 from service.errors import Forbidden, Unauthorized
 
 COOKIE = "splatfix_session"
@@ -160,4 +160,4 @@ async def _refuse(error: Unauthorized | Forbidden, scope: Scope, receive: Receiv
     response = problem_response(error, scope["path"])
     if isinstance(error, Unauthorized):
         response.headers["WWW-Authenticate"] = "Bearer"
-    await response(scope, receive, send)
+    await refuse(response, scope, receive, send)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import json
 import threading
 import time
 from collections.abc import Iterable, Mapping
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from anyio import to_thread
 from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.requests import Request as HttpRequest
@@ -107,8 +107,8 @@ def _refuse_unknown(names: Iterable[str]) -> None:
 def parsed_json(text: str | bytes, where: str) -> Any:
     """Parse JSON from outside. Raises the error that belongs to the field `where`."""
     try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
+        return from_json(text)  # unlike json.loads it refuses halves of surrogate pairs, and bounds the depth
+    except ValueError as error:
         raise _ERRORS.get(where, InvalidRequest)(f"not JSON: {error}.", where=where) from error
 
 

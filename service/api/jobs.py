@@ -154,12 +154,13 @@ class Jobs:
         raise kind(f"the job has {len(records)} records and is {job.state}.", where="iterations")
 
     def photo(self, job: StoredJob) -> bytes:
-        """Return the photo as the estimator sees it, as JPEG. Raises PhotoGone."""
+        """Return the photo as the estimator sees it, as JPEG. Raises PhotoGone, JobNotReady."""
         live = self._live.get(job.id)
         if live is None:
             return self._photos.kept(job.id)
-        query = live.query or self._desk.decoded(job, self._scenes.get(job.scene))[1]
-        return encode_image(query.rgb)
+        if live.query is None:
+            raise JobNotReady("after a restart the photo is read again when the job starts.", where="photo")
+        return encode_image(live.query.rgb)
 
     def waiting(self) -> int:
         return self._store.count("queued")

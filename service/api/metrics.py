@@ -43,8 +43,13 @@ class Metrics:
         self._stage_s = Histogram(
             "splatfix_stage_seconds", "Of a job, by stage", ["estimator", "stage"], buckets=_SECONDS, registry=registry
         )
+        self._renders = Counter("splatfix_renders", "Renders that jobs made", ["estimator"], registry=registry)
         self._render_s = Histogram(
-            "splatfix_render_seconds", "Pictures for looking at", ["scene"], buckets=_SECONDS, registry=registry
+            "splatfix_render_seconds",
+            "Pictures for looking at, with their wait",
+            ["scene"],
+            buckets=_SECONDS,
+            registry=registry,
         )
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:
@@ -62,6 +67,9 @@ class Metrics:
 
     def stage(self, estimator: str, stage: str, seconds: float) -> None:
         self._stage_s.labels(estimator, stage).observe(seconds)
+
+    def renders(self, estimator: str, count: int) -> None:
+        self._renders.labels(estimator).inc(count)
 
     def rendered(self, scene: str, seconds: float) -> None:
         self._render_s.labels(scene).observe(seconds)

@@ -37,8 +37,11 @@ class Photos:
     def settle(self, job_id: str, jpeg: bytes | None) -> None:
         """Replace what was sent by a JPEG for looking at, or by nothing."""
         if jpeg is not None:
-            with suppress(OSError):  # a full disk: the photo isn't kept
-                (self._folder / f"{job_id}.jpg").write_bytes(jpeg)
+            path = self._folder / f"{job_id}.jpg"
+            try:
+                write_durably(path, jpeg)
+            except OSError:  # a full disk: the photo isn't kept
+                path.unlink(missing_ok=True)
         (self._folder / f"{job_id}.upload").unlink(missing_ok=True)
 
     def kept(self, job_id: str) -> bytes:

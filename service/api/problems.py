@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -11,6 +13,8 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match
+from starlette.types import Message, Receive, Scope, Send
 
 from service.api.schemas import Problem
 from service.errors import (
@@ -46,6 +50,7 @@ _log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 5
+_LINGER_S = 2.0
 
 # The first class that fits decides; SplatfixError itself, hence EstimatorFault, is our mistake.
 _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
@@ -107,29 +112,59 @@ def _problem(status: int, code: str, detail: str, instance: str, where: str = ""
         type=f"urn:splatfix:error:{code}",
         title=code.replace("_", " ").capitalize(),
         status=status,
-        detail=detail,
-        instance=instance,
+        detail=_sendable(detail),
+        instance=_sendable(instance),
         code=code,
-        where=where,
-        hint=hint,
+        where=_sendable(where),
+        hint=_sendable(hint),
     )
+
+
+def _sendable(text: str) -> str:
+    """Replace what isn't Unicode text: halves of surrogate pairs, which JSON lets callers send."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def problem_response(error: Exception, path: str) -> Response:
     """Answer with the error's problem document."""
-    problem = problem_of(error, path)
     headers = dict(getattr(error, "headers", None) or {})
-    if problem.status in (429, 503):
-        wait_s = error.retry_after_s if isinstance(error, SplatfixError) else None
-        headers.setdefault("Retry-After", str(wait_s or RETRY_AFTER_S))
-    return Response(problem.model_dump_json(), problem.status, headers, MEDIA_TYPE)
+    if isinstance(error, SplatfixError) and error.retry_after_s:
+        headers["Retry-After"] = str(error.retry_after_s)
+    return problem_answer(problem_of(error, path), path, headers)
+
+
+def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | None = None) -> Response:
+    """Answer with a problem document, as concerns `path`."""
+    told = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
+    problem = problem.model_copy(update={"instance": path})
+    return Response(problem.model_dump_json(), problem.status, {**told, **(headers or {})}, MEDIA_TYPE)
+
+
+async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer before the body was read, and wait a moment for what of it is on its way.
+
+    A connection that is closed while data comes in is reset, and a client that still sends then loses the answer.
+    """
+
+    async def held_open(message: Message) -> None:
+        await send({**message, "more_body": True} if message["type"] == "http.response.body" else message)
+
+    await response(scope, receive, held_open)
+    with suppress(TimeoutError):
+        async with asyncio.timeout(_LINGER_S):
+            while (await receive()).get("more_body"):
+                pass
+    await send({"type": "http.response.body", "body": b""})
 
 
 def install(app: FastAPI) -> None:
     """Make every error of the app a problem document."""
 
     async def answer(request: Request, error: Exception) -> Response:
-        return problem_response(error, request.url.path)
+        response = problem_response(error, request.url.path)
+        if response.status_code == 405:
+            response.headers["Allow"] = ", ".join(sorted(_allowed(request)))
+        return response
 
     async def answer_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
@@ -139,7 +174,15 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, answer)
     app.add_exception_handler(ClientDisconnect, answer)  # nobody hears it, but it is no failure of ours
     app.add_exception_handler(RequestValidationError, answer_validation)
-    app.add_exception_handler(Exception, answer)
+
+
+def _allowed(request: Request) -> set[str]:
+    """Return the methods of an address; the router tells those of the first route that fits only."""
+    methods: set[str] = set()
+    for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT"):
+        scope = {**request.scope, "method": method}
+        methods |= {method for route in request.app.routes if route.matches(scope)[0] is Match.FULL}
+    return methods
 
 
 def described(errors: Sequence[Any]) -> tuple[str, str]:

@@ -233,6 +233,8 @@ class Scenes:
                     return
                 unexpected = not isinstance(error, SplatfixError)
                 _log.error("scene %s can't be used: %s", entry.id, error, exc_info=unexpected)
+                if isinstance(error, SplatfixError) and entry.path:  # the operator's folders are nobody's business
+                    error.where = error.where.replace(str(entry.path), entry.id)
                 entry.error, entry.state = error, "failed"
             self._settle(entry)
 

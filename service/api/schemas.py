@@ -302,6 +302,8 @@ class JobOut(JobSummary):
     """As it was sent; no part of the search."""
     result: Result | None
     error: Problem | None
+    """`code`: `deadline_exceeded`, `estimator_fault` or `internal_error` of a failed job; of an interrupted one
+    `interrupted` or what is wrong with the scene."""
 
 
 class JobList(Model):

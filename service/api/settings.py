@@ -89,7 +89,7 @@ class Settings(BaseSettings):
     """A client that takes nothing of its answer for so long is dropped."""
     rate_limit: str = "30/second"
     """Requests of one client that make work, e.g. 10/second or 600/minute; empty: any number."""
-    max_wait_s: float = Field(default=60.0, gt=0)
+    max_wait_s: float = Field(default=60.0, gt=0, le=3600)
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
     """Where view indexes are kept between runs; None: nowhere."""

@@ -10,13 +10,23 @@ import os
 import re
 import shutil
 import zipfile
-from collections.abc import AsyncIterator
+import zlib
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO
 
 from anyio import to_thread
 
-from service.errors import CorruptScene, InvalidRequest, SceneExists, StorageFailed, UnsupportedFormat
+from service.errors import (
+    CorruptScene,
+    InvalidRequest,
+    SceneError,
+    SceneExists,
+    SceneNotFound,
+    StorageFailed,
+    UnsupportedFormat,
+)
 from service.scene_formats import load_scene
 from service.scene_formats.folder import COLMAP_FOLDER, SCENE_SUFFIXES
 from service.scene_formats.manifest import MANIFEST
@@ -24,6 +34,8 @@ from service.scene_formats.manifest import MANIFEST
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _MAX_MEMBERS = 20_000
 _COPY_BYTES = 1 << 20
+_MAX_NAME_BYTES = 255
+"""On all usual file systems."""
 
 
 class Uploads:
@@ -43,7 +55,7 @@ class Uploads:
         """Store a scene file, or an archive of a scene folder. Raises InvalidRequest, SceneError, StorageFailed."""
         check_scene_id(scene_id)
         if (self._folder / scene_id).exists():
-            raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+            raise _exists(scene_id)
         draft = self._incoming / f"{scene_id}.{os.urandom(4).hex()}"
         try:
             draft.mkdir()
@@ -52,6 +64,8 @@ class Uploads:
             target = self._folder / scene_id
             await to_thread.run_sync(draft.rename, target)
         except OSError as error:
+            if (self._folder / scene_id).exists():  # sent twice at once, and the other came first
+                raise _exists(scene_id) from error
             raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
         finally:
             await to_thread.run_sync(lambda: shutil.rmtree(draft, ignore_errors=True))
@@ -76,8 +90,8 @@ class Uploads:
         if zipfile.is_zipfile(upload):
             self._unpack(upload, draft)
             upload.unlink()
-            if not any(draft.iterdir()):
-                raise UnsupportedFormat("the archive holds no scene.", where="archive")
+            if not any(path.suffix.lower() in SCENE_SUFFIXES for path in draft.iterdir()):
+                raise UnsupportedFormat("the archive holds no scene file (.ply, .splat).", where="archive")
         else:
             suffix = Path(file_name).suffix.lower()
             if suffix not in SCENE_SUFFIXES:
@@ -85,27 +99,46 @@ class Uploads:
                     "say what kind of file it is: `scene.ply` or `scene.splat`, or send a ZIP.", where="query.file"
                 )
             upload.rename(draft / f"scene{suffix}")
-        load_scene(draft)
+        try:
+            load_scene(draft)
+        except SceneError as error:
+            error.where = error.where.replace(str(draft), "archive")  # our folders are nobody's business
+            raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
     def _unpack(self, archive: Path, folder: Path) -> None:
-        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat."""
+        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat, OSError."""
         left = self._max_bytes
-        try:
-            with zipfile.ZipFile(archive) as opened:
-                members = [m for m in opened.infolist() if not m.is_dir()]
-                if len(members) > _MAX_MEMBERS:
-                    raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
-                top = _common_top([m.filename for m in members])
-                for member in members:
-                    name = _wanted(PurePosixPath(member.filename).relative_to(top))
-                    if name is not None:
-                        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                        with opened.open(member) as source, (folder / name).open("xb") as target:
-                            left = _copied(source, target, left)
-        except (zipfile.BadZipFile, NotImplementedError, EOFError, RuntimeError, ValueError) as error:
-            raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
-        except FileExistsError as error:
-            raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+        with _reading():
+            opened = zipfile.ZipFile(archive)
+        with opened:
+            members = [m for m in opened.infolist() if not m.filename.endswith("/")]
+            if len(members) > _MAX_MEMBERS:
+                raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
+            paths = [PurePosixPath(m.filename.lstrip("/")) for m in members]
+            top = _common_top(paths)
+            for member, path in zip(members, paths, strict=True):
+                if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                    # LZMA takes as much memory as the archive says, up to 4 GB.
+                    raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
+                name = _wanted(path.relative_to(top))
+                if name is not None:
+                    with _reading():
+                        source = opened.open(member)
+                    with source:
+                        left = _copied(source, folder / name, left)
+
+
+@contextmanager
+def _reading() -> Iterator[None]:
+    """Blame the archive, not our disk. Raises CorruptScene."""
+    try:
+        yield
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, ValueError, OSError) as error:
+        raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
+
+
+def _exists(scene_id: str) -> SceneExists:
+    return SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
 
 
 def check_scene_id(scene_id: str) -> None:
@@ -114,10 +147,10 @@ def check_scene_id(scene_id: str) -> None:
         raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
 
 
-def _common_top(names: list[str]) -> PurePosixPath:
+def _common_top(paths: list[PurePosixPath]) -> PurePosixPath:
     """Return the folder that all files are in, if there is one: many pack the folder, others what is in it."""
-    tops = {PurePosixPath(name).parts[:1] for name in names}
-    nested = all(len(PurePosixPath(name).parts) > 1 for name in names)
+    tops = {path.parts[:1] for path in paths}
+    nested = all(len(path.parts) > 1 for path in paths)
     if len(tops) == 1 and nested and tops != {COLMAP_FOLDER.parts[:1]}:
         return PurePosixPath(*tops.pop())
     return PurePosixPath()
@@ -129,17 +162,26 @@ def _wanted(path: PurePosixPath) -> str | None:
     if path.parts == (name,) and (
         Path(name).suffix.lower() in SCENE_SUFFIXES or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
     ):
-        return name if re.fullmatch(r"[\w. -]{1,200}", name) else None
-    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"\w+\.(bin|txt)", name):
+        return name if re.fullmatch(r"[\w. -]+", name) and len(name.encode()) <= _MAX_NAME_BYTES else None
+    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"[a-z]{1,40}\.(bin|txt)", name):
         return str(path)
     return None
 
 
-def _copied(source: IO[bytes], target: IO[bytes], left: int) -> int:
-    """Copy at most `left` bytes; return how many more there may be. Raises CorruptScene."""
-    while chunk := source.read(_COPY_BYTES):
-        left -= len(chunk)
-        if left < 0:
-            raise CorruptScene("the archive holds more than the service takes.", where="archive")
-        target.write(chunk)
-    return left
+def _copied(source: IO[bytes], path: Path, left: int) -> int:
+    """Copy at most `left` bytes into a new file; return how many more there may be. Raises CorruptScene, OSError."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target = path.open("xb")
+    except FileExistsError as error:
+        raise CorruptScene("two files of the archive have the same name.", where="archive") from error
+    with target:
+        while True:
+            with _reading():
+                chunk = source.read(_COPY_BYTES)
+            if not chunk:
+                return left
+            left -= len(chunk)
+            if left < 0:
+                raise CorruptScene("the archive holds more than the service takes.", where="archive")
+            target.write(chunk)

@@ -65,6 +65,8 @@ def _check_layout(header: PlyHeader, path: Path) -> None:
         raise CorruptScene("a compressed PLY needs the elements 'chunk' and 'vertex'.", where=path.name)
     require_count(vertex.count, path.name)
     bounds = [f"{end}_{p}{axis}" for p in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
+    if "min_r" in (chunk.dtype.names or ()):
+        bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
     for element, names in ((chunk, bounds), (vertex, _PACKED)):
         missing = [n for n in names if n not in ((element.dtype and element.dtype.names) or ())]
         if missing:

@@ -24,6 +24,8 @@ from service.types import GeoAnchor
 
 MANIFEST = "scene.json"
 MAX_JSON_BYTES = 64 * 1024 * 1024
+_MAX_NAME_BYTES = 255
+"""Of a file, on all usual file systems."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +66,10 @@ def read_json(path: Path) -> dict[str, Any]:
     if path.stat().st_size > MAX_JSON_BYTES:
         raise CorruptScene(f"larger than {MAX_JSON_BYTES} bytes.", where=path.name)
     try:
-        data = json.loads(path.read_text("utf-8"))
+        text = path.read_text("utf-8")
+        data = json.loads(text)
+        if "\\ud" in text.lower():  # half of a surrogate pair is no text that could be sent or stored
+            json.dumps(data, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
         raise CorruptScene(f"not JSON: {str(error)[:200]}.", where=path.name) from None
     if not isinstance(data, dict):
@@ -78,7 +83,7 @@ def numbers(
     """Return finite numbers in the given shape from nested lists; raises `error`."""
     try:
         result = np.asarray(value, np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         result = np.empty(0)
     if result.shape != shape or not np.all(np.isfinite(result)):
         raise error(f"must be {' x '.join(map(str, shape)) or 'one'} finite number(s).", where=where)
@@ -100,7 +105,7 @@ def _text(key: str, value: Any) -> str:
 
 
 def _file(key: str, value: Any) -> str:
-    if _text(key, value) != Path(value).name:
+    if _text(key, value) != Path(value).name or len(value.encode()) > _MAX_NAME_BYTES:
         raise CorruptScene("must be the name of a file in the folder.", where=f"{MANIFEST}: {key}")
     return value
 

@@ -116,8 +116,11 @@ class TransformsFile:
     def photo_file(self, photo: str) -> Path | None:
         """Return the photo if it is there, within the folder."""
         folder = self.path.parent.resolve()
-        files = [(folder / (photo + suffix)).resolve() for suffix in _SUFFIXES]
-        return next((f for f in files if f.is_relative_to(folder) and f.is_file()), None)
+        try:
+            files = [(folder / (photo + suffix)).resolve() for suffix in _SUFFIXES]
+            return next((f for f in files if f.is_relative_to(folder) and f.is_file()), None)
+        except (OSError, ValueError):  # too long a name, or no name that a file could have
+            return None
 
 
 def transforms_path(folder: Path) -> Path | None:

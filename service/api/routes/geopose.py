@@ -10,10 +10,13 @@ from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.api import documents, gpp
 from service.api.admission import client_of
+from service.api.catalog import SCENE, errors
 from service.api.intake import Body
 from service.api.jobs import Order
+from service.api.problems import problem_answer
 from service.api.requests import LocalizeFields
-from service.api.routes.parts import PartsOf, errors
+from service.api.routes.parts import PartsOf
+from service.api.schemas import Problem
 from service.errors import DeadlineExceeded, NoGeoAnchor
 
 GEOPOSE = "application/geopose+json"
@@ -25,7 +28,19 @@ router = APIRouter()
     "/geopose",
     tags=["localize"],
     responses={200: {"model": gpp.GeoPoseResponse, "description": "The pose", "content": {GEOPOSE: {}}}}
-    | errors(400, 404, 408, 409, 413, 422, 503, 504),
+    | errors(
+        *("invalid_request", "bad_request", "request_timeout", *SCENE, "no_geo_anchor"),
+        *(
+            "invalid_image",
+            "invalid_intrinsics",
+            "no_pose",
+            "deadline_exceeded",
+            "interrupted",
+            "estimator_fault",
+            "storage_failed",
+        ),
+        body=True,
+    ),
 )
 async def geopose(
     wanted: gpp.GeoPoseRequest,
@@ -54,6 +69,8 @@ async def geopose(
     if not job.ended:
         await to_thread.run_sync(parts.jobs.cancel, job)
         raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
+    if job.error:
+        return problem_answer(Problem.model_validate_json(job.error), request.url.path)
     _, _, result = documents.answer(job)
     answer = gpp.response_of(wanted, result, anchor)
     if GEOPOSE in accept:

@@ -14,9 +14,10 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
 
 from service.api import documents
+from service.api.catalog import SCENE, errors
 from service.api.convert import record_camera
 from service.api.exports import EXPORT_TYPES, ExportFormat, exported
-from service.api.routes.parts import JPEG, JobOf, PartsOf, RootOf, errors
+from service.api.routes.parts import JPEG, JobOf, PartsOf, RootOf
 from service.api.schemas import JobList, JobOut, JobState, PhotoOut, Record, Trace
 from service.api.store import JobFilter
 from service.images import encode_image
@@ -26,7 +27,7 @@ from service.types import Camera, Status
 router = APIRouter()
 
 
-@router.get("/jobs", tags=["jobs"], responses=errors())
+@router.get("/jobs", tags=["jobs"], responses=errors("invalid_request"))
 def list_jobs(
     parts: PartsOf,
     root: RootOf,
@@ -35,7 +36,9 @@ def list_jobs(
     state: JobState | None = None,
     status: Annotated[Status | None, Query(description="Of the result.")] = None,
     photo: Annotated[str | None, Query(description="sha256 of the photo's file.")] = None,
-    before: Annotated[int | None, Query(description="Where the page starts: take it from `next`.")] = None,
+    before: Annotated[
+        int | None, Query(ge=0, lt=2**63, description="Where the page starts: take it from `next`.")
+    ] = None,
     limit: Annotated[int, Query(ge=1, le=500)] = 100,
 ) -> JobList:
     """List the jobs that are remembered, newest first; those that fit, where a filter is given."""
@@ -52,13 +55,13 @@ def list_jobs(
     )
 
 
-@router.get("/jobs/{job_id}", tags=["jobs"], responses=errors(404))
+@router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
 def get_job(job: JobOf, root: RootOf) -> JobOut:
     """Say how a job stands; with its result or its error when it has ended."""
     return documents.job_document(job, root)
 
 
-@router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors(404))
+@router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
 def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     """Cancel: at once if the job waits, after its current step if it runs, without effect if it has ended."""
     parts.jobs.cancel(job)
@@ -69,7 +72,7 @@ def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     "/jobs/{job_id}/events",
     tags=["jobs"],
     response_class=EventSourceResponse,
-    responses=errors(404),
+    responses=errors("job_not_found"),
 )
 async def job_events(
     job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
@@ -105,14 +108,19 @@ def _resumed(last_event_id: str) -> tuple[int, int]:
     return (int(found[1]), int(found[2]) + 1) if found else (0, 0)
 
 
-@router.get("/jobs/{job_id}/photo", tags=["jobs"], response_class=Response, responses=JPEG | errors(404))
+@router.get(
+    "/jobs/{job_id}/photo",
+    tags=["jobs"],
+    response_class=Response,
+    responses=JPEG | errors("job_not_found", "photo_gone", "job_not_ready"),
+)
 async def job_photo(job: JobOf, parts: PartsOf) -> Response:
     """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced. For a while, or if kept."""
     photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
     return Response(photo, media_type="image/jpeg")
 
 
-@router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors(404))
+@router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors("job_not_found"))
 def job_trace(job: JobOf, parts: PartsOf) -> Trace:
     """Return all records so far, of the latest attempt."""
     return documents.job_trace(job, parts.jobs.records(job))
@@ -122,7 +130,7 @@ def job_trace(job: JobOf, parts: PartsOf) -> Trace:
     "/jobs/{job_id}/iterations/{index}/render.jpg",
     tags=["jobs"],
     response_class=Response,
-    responses=JPEG | errors(404, 409),
+    responses=JPEG | errors("invalid_request", "job_not_found", "record_not_found", "job_not_ready", *SCENE),
 )
 async def job_render(
     job: JobOf,
@@ -141,7 +149,7 @@ async def job_render(
     seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
     loaded = parts.scenes.get(job.scene)
     render = partial(_rendered_jpeg, loaded, seen_by)
-    return Response(await to_thread.run_sync(render, limiter=parts.rendering), media_type="image/jpeg")
+    return Response(await parts.drawn(job.scene, render), media_type="image/jpeg")
 
 
 def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
@@ -158,7 +166,7 @@ def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
             "content": {kind: {} for kind in EXPORT_TYPES.values()},
         }
     }
-    | errors(404, 409),
+    | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
 )
 def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
     """Return the pose as other programs read it; not of a job that found none.

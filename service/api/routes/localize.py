@@ -11,10 +11,11 @@ from fastapi import APIRouter, Header, Request, Response
 
 from service.api import documents
 from service.api.admission import client_of
+from service.api.catalog import SCENE, errors
 from service.api.intake import read_body, read_fields
 from service.api.jobs import Order
 from service.api.requests import LocalizeFields, LocalizeIn
-from service.api.routes.parts import PartsOf, RootOf, errors
+from service.api.routes.parts import PartsOf, RootOf
 from service.api.schemas import JobOut
 
 router = APIRouter()
@@ -63,7 +64,13 @@ _ACCEPTED = {
     status_code=202,
     tags=["localize"],
     response_model=JobOut,
-    responses=_ACCEPTED | errors(400, 404, 413, 415, 422, 501, 503),
+    responses=_ACCEPTED
+    | errors(
+        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE),
+        *("invalid_image", "invalid_intrinsics", "invalid_prior", "invalid_options", "unknown_name"),
+        *("backend_missing", "idempotency_conflict", "storage_failed"),
+        body=True,
+    ),
     openapi_extra=_BODY,
 )
 async def localize_photo(

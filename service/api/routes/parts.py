@@ -1,17 +1,19 @@
-"""What the routes share: the app's parts as dependencies, and how errors are documented."""
+"""What the routes share: the app's parts as dependencies."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import anyio
+from anyio import to_thread
 from fastapi import Depends, Path, Request
 
 from service.api.jobs import Jobs
 from service.api.keys import Caller, KeyRing
 from service.api.metrics import Metrics
-from service.api.problems import MEDIA_TYPE
 from service.api.scenes import Scenes
 from service.api.settings import Settings
 from service.api.store import StoredJob
@@ -29,9 +31,16 @@ class Parts:
     keys: KeyRing
     metrics: Metrics
     decoding: anyio.CapacityLimiter
-    """Photos decoded at once: each may take 200 MB for a moment."""
+    """Photos decoded at once: each may take 450 MB for a moment."""
     rendering: anyio.CapacityLimiter
     """Pictures rendered at once for looking at: a renderer's thread keeps working memory."""
+
+    async def drawn(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
+        """Render something for looking at, off the event loop."""
+        began = time.perf_counter()
+        picture = await to_thread.run_sync(draw, limiter=self.rendering)
+        self.metrics.rendered(scene_id, time.perf_counter() - began)
+        return picture
 
 
 def _parts(request: Request) -> Parts:
@@ -56,27 +65,4 @@ RootOf = Annotated[str, Depends(_root)]
 JobOf = Annotated[StoredJob, Depends(_job)]
 
 
-def errors(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """Document the problem documents that a route may answer with."""
-    return {status: {"description": MEANINGS[status], "content": _PROBLEM} for status in statuses} | {
-        "default": {"description": "Any other error", "content": _PROBLEM}
-    }
-
-
-_PROBLEM = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}}}
-MEANINGS = {
-    401: "An API key is needed, or it is not valid",
-    403: "The key's role doesn't allow it, or another site's page asks",
-    400: "The request can't be understood",
-    404: "There is no such thing",
-    409: "Not yet, not any more, or there is nothing to give",
-    408: "The body took too long",
-    429: "Too many requests of yours; see Retry-After",
-    413: "The body is too large",
-    415: "Neither a multipart form nor JSON",
-    422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",
-    504: "There was no answer in time",
-    501: "What was asked for can't run on this machine",
-    503: "Too much work is waiting, or the scene is still loading; see Retry-After",
-}
 JPEG = {200: {"description": "JPEG", "content": {"image/jpeg": {}}}}

@@ -9,9 +9,10 @@ from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
 
 from service.api import documents, splats
+from service.api.catalog import SCENE, errors
 from service.api.pictures import PICTURE_TYPES, picture, thumbnail
 from service.api.requests import RenderIn
-from service.api.routes.parts import JPEG, PartsOf, RootOf, errors
+from service.api.routes.parts import JPEG, PartsOf, RootOf
 from service.api.schemas import SceneList, SceneOut, SceneSummary
 from service.errors import SceneExists, SceneInUse
 
@@ -26,7 +27,7 @@ async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
     return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
 
 
-@router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors(404))
+@router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Describe a scene, with its training cameras."""
     return documents.scene_document(parts.scenes.entry(scene_id), root)
@@ -36,7 +37,11 @@ def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     "/scenes/{scene_id}",
     status_code=201,
     tags=["scenes"],
-    responses=errors(400, 408, 409, 413, 422, 503),
+    responses=errors(
+        *("invalid_request", "request_timeout", "scene_exists", "corrupt_scene", "unsupported_format"),
+        "storage_failed",
+        body=True,
+    ),
     openapi_extra={
         "requestBody": {
             "required": True,
@@ -62,7 +67,9 @@ async def upload_scene(
     return documents.scene_document(entry, root)
 
 
-@router.post("/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors(404))
+@router.post(
+    "/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors("scene_not_found", body=True)
+)
 def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Load a scene into memory, and make it ready; again, if that failed before."""
     entry = parts.scenes.entry(scene_id)
@@ -70,7 +77,12 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     return documents.scene_summary(entry, root)
 
 
-@router.post("/scenes/{scene_id}/unload", status_code=202, tags=["scenes"], responses=errors(404, 422))
+@router.post(
+    "/scenes/{scene_id}/unload",
+    status_code=202,
+    tags=["scenes"],
+    responses=errors("scene_not_found", "bad_input", body=True),
+)
 def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Drop a scene from memory when the last job on it has ended; it takes no more, until it is loaded again."""
     entry = parts.scenes.entry(scene_id)
@@ -78,7 +90,12 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     return documents.scene_summary(entry, root)
 
 
-@router.delete("/scenes/{scene_id}", status_code=204, tags=["scenes"], responses=errors(404, 409))
+@router.delete(
+    "/scenes/{scene_id}",
+    status_code=204,
+    tags=["scenes"],
+    responses=errors("scene_not_found", "scene_in_use", "storage_failed", body=True),
+)
 def delete_scene(scene_id: str, parts: PartsOf) -> None:
     """Delete an uploaded scene with its files; not one that the operator named, nor one that jobs use."""
     entry = parts.scenes.entry(scene_id)
@@ -94,12 +111,12 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
     "/scenes/{scene_id}/thumbnail.jpg",
     tags=["scenes"],
     response_class=Response,
-    responses=JPEG | errors(404, 503),
+    responses=JPEG | errors(*SCENE),
 )
 async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
     """Return a small picture of the scene, as its middle training camera sees it."""
     draw = partial(thumbnail, parts.scenes.get(scene_id))
-    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type="image/jpeg")
+    return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
 
 
 @router.get(
@@ -112,7 +129,7 @@ async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
             "content": {splats.BINARY: {"schema": {"type": "string", "format": "binary"}}},
         }
     }
-    | errors(404, 422, 503),
+    | errors("invalid_request", *SCENE),
 )
 async def scene_splats(
     scene_id: str,
@@ -131,9 +148,12 @@ async def scene_splats(
     responses={
         200: {"description": "The picture", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
     }
-    | errors(400, 404, 413, 422, 503),
+    | errors(
+        *("invalid_request", "bad_request", "request_timeout", *SCENE, "invalid_intrinsics", "invalid_prior"),
+        body=True,
+    ),
 )
 async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
     """Render a scene from any pose: a picture, or the depth of what is seen there."""
     draw = partial(picture, parts.scenes.get(scene_id), wanted)
-    return Response(await to_thread.run_sync(draw, limiter=parts.rendering), media_type=PICTURE_TYPES[wanted.format])
+    return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])

@@ -5,12 +5,14 @@ from __future__ import annotations
 from fastapi import APIRouter, Response
 
 from service.api import documents
+from service.api.catalog import errors
 from service.api.metrics import METRICS_TYPE
-from service.api.routes.parts import CallerOf, PartsOf, errors
+from service.api.routes.parts import CallerOf, PartsOf
 from service.api.schemas import Capabilities, Liveness, Readiness, Token
 from service.errors import NoKeys
 
 TOKEN_S = 300.0
+_CANNOT_FAIL = ("unauthorized", "forbidden")
 
 router = APIRouter()
 
@@ -21,13 +23,13 @@ def get_capabilities(parts: PartsOf) -> Capabilities:
     return documents.capabilities(parts.settings)
 
 
-@router.get("/version", tags=["service"], responses=errors())
+@router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))
 def get_version() -> dict[str, str]:
     """Return the versions of this service and of what its results depend on."""
     return documents.versions()
 
 
-@router.get("/livez", tags=["service"], responses=errors())
+@router.get("/livez", tags=["service"], responses=errors(always=_CANNOT_FAIL))
 async def live() -> Liveness:
     """Answer, as long as the process can."""
     return Liveness()
@@ -54,7 +56,7 @@ def get_metrics(parts: PartsOf) -> Response:
     return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
 
 
-@router.post("/tokens", tags=["service"], responses=errors(409))
+@router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))
 def make_token(parts: PartsOf, caller: CallerOf) -> Token:
     """Make a token that stands for the caller's key for some minutes, to open a page with: `/viewer/?token=…`."""
     if caller is None:

@@ -1,0 +1,28 @@
+"""OpenAPI links: where the id that one operation returns is used by others."""
+
+from __future__ import annotations
+
+from typing import Any
+
+_JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose")
+_SCENE = ("get_scene", "scene_thumbnail", "scene_splats", "render_scene", "load_scene", "unload_scene", "delete_scene")
+
+# (operation, status) -> parameter, where it is found, the operations that take it.
+_LINKS = {
+    ("localize_photo", "200"): ("job_id", "$response.body#/id", _JOB),
+    ("localize_photo", "202"): ("job_id", "$response.body#/id", _JOB),
+    ("list_jobs", "200"): ("job_id", "$response.body#/jobs/0/id", _JOB),
+    ("upload_scene", "201"): ("scene_id", "$response.body#/id", _SCENE),
+    ("list_scenes", "200"): ("scene_id", "$response.body#/scenes/0/id", _SCENE),
+}
+
+
+def add_links(schema: dict[str, Any]) -> None:
+    """Put the links into an OpenAPI document."""
+    for operations in schema["paths"].values():
+        for operation in operations.values():
+            for status, response in operation["responses"].items():
+                found = _LINKS.get((operation["operationId"], status))
+                if found:
+                    name, place, targets = found
+                    response["links"] = {t: {"operationId": t, "parameters": {name: place}} for t in targets}

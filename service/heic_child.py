@@ -1,0 +1,51 @@
+"""Decodes one HEIC photo in a process of its own: its decoders are known to crash on hostile files.
+
+    python -I heic_child.py MAX_PIXELS < photo.heic
+
+Writes a line of JSON, {"error"} or {"width", "height", "mode", "exif" (base64)}, and then the pixels, unless there are
+more than MAX_PIXELS. Started by `images` only; imports nothing of the service. The only file with pi_heif.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import resource
+import sys
+from io import BytesIO
+
+from pi_heif import HeifImageFile
+
+_MEMORY_BYTES = 2 << 30
+"""64 megapixels take 1 GB: as they are stored, as RGB, and on their way out."""
+_CPU_S = 20
+
+
+def main() -> None:
+    """Decode what stdin has."""
+    for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CPU, _CPU_S), (resource.RLIMIT_CORE, 0)):
+        resource.setrlimit(limit, (value, value))
+    for part in decoded(sys.stdin.buffer.read(), int(sys.argv[1])):
+        sys.stdout.buffer.write(part)
+
+
+def decoded(data: bytes, max_pixels: int) -> list[bytes]:
+    """Return the line, and the pixels as far as they are wanted."""
+    try:
+        photo = HeifImageFile(BytesIO(data))
+        fits = photo.width * photo.height <= max_pixels
+        if fits:
+            photo.load()
+    except Exception as error:  # decoders raise almost anything on a broken file
+        return [_line(error=str(error) or type(error).__name__)]
+    exif = base64.b64encode(photo.info.get("exif") or b"").decode()
+    head = _line(width=photo.width, height=photo.height, mode=photo.mode, exif=exif)
+    return [head, photo.tobytes()] if fits else [head]
+
+
+def _line(**values: object) -> bytes:
+    return json.dumps(values).encode() + b"\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,486 @@
+"""Every error that the API says it may give is given, by every operation that says so; and no other is."""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import httpx
+import pytest
+from api_server import (
+    PROBLEM,
+    TURNED,
+    assert_problem,
+    documented,
+    fake_estimators,
+    finished,
+    make_scene,
+    operations,
+    photo,
+    post,
+    serving,
+    settings,
+    until,
+)
+from test_scenes import TRANSFORMS, ply
+
+import service.api.photos
+import service.api.uploads
+from service.api.app import create_app
+from service.api.catalog import EXAMPLES
+from service.api.keys import add_key
+from service.errors import BadInput, SceneError, SplatfixError
+from service.localize import LoadedScene
+
+OPERATIONS = {operation["operationId"]: (method, path, operation) for method, path, operation in operations()}
+PAIRS = [
+    (name, code)
+    for name, (_, _, operation) in OPERATIONS.items()
+    for codes in documented(operation).values()
+    for code in sorted(codes)
+]
+EYE = [[float(i == j) for j in range(4)] for i in range(4)]
+ANCHOR = {"latitude": 1, "longitude": 2, "height": 3, "enu_from_world": EYE}
+
+
+# ------------------------------------------------------------------ services in trouble
+
+
+@pytest.fixture(scope="module")
+def stepping() -> Iterator:
+    with fake_estimators() as plugin:
+        yield plugin
+
+
+def write_scenes(folder: Path) -> None:
+    """One that is well, and one for each thing that can be wrong; all but `plain` have a place on Earth."""
+    broken = {"torn": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "odd": b"?"}
+    for name in ("good", "plain", "away", "slow", "fat", *broken):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "scene.ply").write_bytes(broken.get(name) or ply(20_000 if name == "fat" else 50))
+        (folder / name / "transforms.json").write_text(json.dumps(TRANSFORMS))
+        if name != "plain":
+            (folder / name / "scene.json").write_text(json.dumps({"geo_anchor": ANCHOR}))
+
+
+@pytest.fixture(scope="module")
+def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
+    """A service of which each part is in a state that some error tells of; with jobs of all kinds."""
+    folder = tmp_path_factory.mktemp("troubled")
+    write_scenes(folder / "scenes")
+    with pytest.MonkeyPatch.context() as patch:
+        load = LoadedScene.load.__func__
+
+        def held(cls, path: Path, **options) -> LoadedScene:
+            while path.name == "slow" and not stop:
+                until(lambda: stop, 100)
+            return load(cls, path, **options)
+
+        stop: list[bool] = []
+        patch.setattr(LoadedScene, "load", classmethod(held))
+        size = LoadedScene.load(folder / "scenes" / "good").nbytes
+        changes = {
+            **{"scenes": [folder / "scenes"], "cache_dir": None, "data_dir": folder / "data", "queue_size": 50},
+            **{"preload": ["good", "plain", "torn", "odd", "fat"], "scene_memory_bytes": int(5 * size)},
+            **{"rate_limit": "", "photo_grace_s": 0, "max_wait_s": 1, "workers": 3, "shutdown_s": 0},
+        }
+        app = create_app(settings(**changes))
+        with serving(app) as client:
+            until(lambda: not client.get("/readyz").json()["awaited"], 100)
+            client.post("/scenes/away/unload")
+            client.post("/scenes/slow/load")
+            done = post(client, scene="good").json()
+            waiting = post(client, prefer="", scene="good", options={"steps": 10**6, "pause_s": 0.1}).json()
+            until(lambda: client.get(f"/jobs/{waiting['id']}").json()["records"] == 1)
+            yield SimpleNamespace(
+                client=client, app=app, done=done["id"], running=waiting["id"], patch=patch, folder=folder
+            )
+            stop.append(True)
+            stepping.GO_ON.set()
+    stepping.GO_ON.clear()
+
+
+def on_scene(s: SimpleNamespace, scene: str) -> str:
+    """Return the ended job, as if it had been on another scene."""
+    writer = s.app.state.parts.jobs._store._writer
+    writer.execute("UPDATE jobs SET scene = ? WHERE id = ?", (scene, s.done))
+    return s.done
+
+
+SCENES = {
+    "scene_not_found": "none", "scene_unloaded": "away", "corrupt_scene": "torn", "unsupported_format": "odd",
+    "scene_not_ready": "slow", "no_room": "fat",
+}  # fmt: skip
+
+
+def send_photo(s: SimpleNamespace, data: bytes | None = None, **fields) -> httpx.Response:
+    return post(s.client, data, prefer="", **{"scene": "good", **fields})
+
+
+def geopose(s: SimpleNamespace, scene: str = "good", image: bytes | None = None, **reading) -> httpx.Response:
+    shot = {"imageBytes": base64.b64encode(photo() if image is None else image).decode(), **reading}
+    return s.client.post(f"/geopose?scene={scene}", json={"sensorReadings": {"cameraReadings": [shot]}})
+
+
+def render(s: SimpleNamespace, scene: str = "good", **changes) -> httpx.Response:
+    return s.client.post(f"/scenes/{scene}/render", json={"pose": {"world_from_camera": TURNED.tolist()}, **changes})
+
+
+def twice(s: SimpleNamespace) -> httpx.Response:
+    def keyed(seed: str) -> httpx.Response:
+        files, headers = {"photo": photo()}, {"Idempotency-Key": "a"}
+        return s.client.post("/localize", files=files, data={"scene": "good", "seed": seed}, headers=headers)
+
+    keyed("1")
+    return keyed("2")
+
+
+def full(*_: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def undeletable(path: Path, ignore_errors: bool = False) -> None:
+    if not ignore_errors:
+        full()
+
+
+def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> httpx.Response:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.api.photos, "write_durably", full)
+        patch.setattr(service.api.uploads.os, "fsync", full)
+        patch.setattr(service.api.uploads.shutil, "rmtree", undeletable)
+        writer = s.app.state.parts.jobs._store._writer
+        (pages,) = writer.execute("PRAGMA page_count").fetchone()
+        writer.execute(f"PRAGMA max_page_count = {pages}")
+        writer.execute("PRAGMA query_only = 1")
+        try:
+            return send()
+        finally:
+            writer.execute("PRAGMA query_only = 0")
+            writer.execute("PRAGMA max_page_count = 1000000")
+
+
+def uploaded(s: SimpleNamespace) -> str:
+    if "extra" not in {scene["id"] for scene in s.client.get("/scenes").json()["scenes"]}:
+        assert s.client.put("/scenes/extra", content=ply()).status_code == 201
+    return "/scenes/extra"
+
+
+def delete_with_full_disk(s: SimpleNamespace) -> httpx.Response:
+    path = uploaded(s)
+    return with_full_disk(s, lambda: s.client.delete(path))
+
+
+def failing_geopose(s: SimpleNamespace, **options) -> httpx.Response:
+    """GeoPoseProtocol has no options: the estimator gets them behind its back."""
+    import service.estimators.stepping as plugin  # type: ignore[import-not-found]
+
+    with pytest.MonkeyPatch.context() as patch:
+        run = plugin.run
+        patch.setattr(plugin, "run", lambda query, tools, _: run(query, tools, plugin.Options(**options)))
+        return geopose(s)
+
+
+def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
+    """The scene is gone when the job starts."""
+    from service.errors import Interrupted
+
+    with pytest.MonkeyPatch.context() as patch:
+        import service.api.attempts as attempts
+
+        def gone(*_: object) -> None:
+            raise Interrupted("told to.")
+
+        patch.setattr(attempts, "localize", gone)
+        return geopose(s)
+
+
+# (operation, code) -> what provokes it; what is alike in all operations comes further down.
+PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
+    ("localize_photo", "invalid_request"): lambda s: send_photo(s, seed="x"),
+    ("localize_photo", "bad_request"): lambda s: s.client.post(
+        "/localize", content=b"x", headers={"Content-Type": "multipart/form-data"}
+    ),
+    ("localize_photo", "unsupported_media_type"): lambda s: s.client.post(
+        "/localize", content=photo(), headers={"Content-Type": "image/jpeg"}
+    ),
+    ("localize_photo", "invalid_image"): lambda s: send_photo(s, b"x"),
+    ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(s, intrinsics={}),
+    ("localize_photo", "invalid_prior"): lambda s: send_photo(s, prior={}),
+    ("localize_photo", "invalid_options"): lambda s: send_photo(s, options={"no": 1}),
+    ("localize_photo", "unknown_name"): lambda s: send_photo(s, estimator="magic"),
+    ("localize_photo", "backend_missing"): lambda s: send_photo(s, estimator="absent"),
+    ("localize_photo", "idempotency_conflict"): twice,
+    ("localize_photo", "storage_failed"): lambda s: with_full_disk(s, lambda: send_photo(s)),
+    ("geopose", "invalid_request"): lambda s: s.client.post("/geopose", json={}),
+    ("geopose", "bad_request"): lambda s: s.client.post(
+        "/geopose", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("geopose", "no_geo_anchor"): lambda s: geopose(s, "plain"),
+    ("geopose", "invalid_image"): lambda s: geopose(s, image=b"x"),
+    ("geopose", "invalid_intrinsics"): lambda s: geopose(s, params={"model": "MAGIC", "modelParams": [1]}),
+    ("geopose", "no_pose"): geopose,
+    ("geopose", "deadline_exceeded"): lambda s: failing_geopose(s, hold=True),
+    ("geopose", "estimator_fault"): lambda s: failing_geopose(s, fail="fault"),
+    ("geopose", "interrupted"): interrupted_geopose,
+    ("geopose", "storage_failed"): lambda s: with_full_disk(s, lambda: geopose(s)),
+    ("list_jobs", "invalid_request"): lambda s: s.client.get("/jobs?limit=0"),
+    ("cancel_job", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete(f"/jobs/{s.running}")),
+    ("job_photo", "photo_gone"): lambda s: s.client.get(f"/jobs/{s.done}/photo"),
+    ("job_photo", "job_not_ready"): lambda s: s.client.get(f"/jobs/{recovered(s)}/photo"),
+    ("job_render", "invalid_request"): lambda s: s.client.get(f"/jobs/{s.done}/iterations/x/render.jpg"),
+    ("job_render", "record_not_found"): lambda s: s.client.get(f"/jobs/{s.done}/iterations/99/render.jpg"),
+    ("job_render", "job_not_ready"): lambda s: s.client.get(f"/jobs/{s.running}/iterations/99/render.jpg"),
+    ("export_pose", "invalid_request"): lambda s: s.client.get(f"/jobs/{s.done}/export/dwg"),
+    ("export_pose", "job_not_ready"): lambda s: s.client.get(f"/jobs/{s.running}/export/tum"),
+    ("export_pose", "no_pose"): lambda s: s.client.get(f"/jobs/{s.done}/export/tum"),
+    ("export_pose", "no_geo_anchor"): lambda s: s.client.get(f"/jobs/{localized(s)}/export/geopose"),
+    ("get_scene", "scene_not_found"): lambda s: s.client.get("/scenes/none"),
+    ("load_scene", "scene_not_found"): lambda s: s.client.post("/scenes/none/load"),
+    ("unload_scene", "scene_not_found"): lambda s: s.client.post("/scenes/none/unload"),
+    ("unload_scene", "bad_input"): lambda s: fileless(s).client.post("/scenes/hall/unload"),
+    ("delete_scene", "scene_not_found"): lambda s: s.client.delete("/scenes/none"),
+    ("delete_scene", "scene_in_use"): lambda s: s.client.delete("/scenes/good"),
+    ("delete_scene", "storage_failed"): delete_with_full_disk,
+    ("upload_scene", "invalid_request"): lambda s: s.client.put("/scenes/new?file=a.exe", content=b"x"),
+    ("upload_scene", "scene_exists"): lambda s: s.client.put("/scenes/good", content=ply()),
+    ("upload_scene", "corrupt_scene"): lambda s: s.client.put("/scenes/new", content=b"ply\n"),
+    ("upload_scene", "unsupported_format"): lambda s: s.client.put("/scenes/new", content=b"?"),
+    ("upload_scene", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.put("/scenes/new", content=ply())),
+    ("scene_splats", "invalid_request"): lambda s: s.client.get("/scenes/good/splats?max=0"),
+    ("render_scene", "invalid_request"): lambda s: s.client.post("/scenes/good/render", json={}),
+    ("render_scene", "bad_request"): lambda s: s.client.post(
+        "/scenes/good/render", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("render_scene", "invalid_intrinsics"): lambda s: render(s, intrinsics={}),
+    ("render_scene", "invalid_prior"): lambda s: render(s, pose={}),
+    ("make_token", "no_keys"): lambda s: s.client.post("/tokens"),
+}
+for _code, _scene in SCENES.items():
+    PROVOKED |= {
+        ("localize_photo", _code): lambda s, scene=_scene: send_photo(s, scene=scene),
+        ("geopose", _code): lambda s, scene=_scene: geopose(s, scene),
+        ("job_render", _code): lambda s, scene=_scene: s.client.get(
+            f"/jobs/{on_scene(s, scene)}/iterations/0/render.jpg"
+        ),
+        ("scene_thumbnail", _code): lambda s, scene=_scene: s.client.get(f"/scenes/{scene}/thumbnail.jpg"),
+        ("scene_splats", _code): lambda s, scene=_scene: s.client.get(f"/scenes/{scene}/splats"),
+        ("render_scene", _code): lambda s, scene=_scene: render(s, scene),
+    }
+for _name in ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose"):
+    PROVOKED[_name, "job_not_found"] = lambda s, name=_name: plainly(s.client, name, job="none")
+
+
+def plainly(client: httpx.Client, name: str, job: str = "x", **headers: str) -> httpx.Response:
+    """Ask for something that would be well, as far as the address goes."""
+    method, pattern, _ = OPERATIONS[name]
+    path = pattern.pattern.replace("[^/]+", "{}")
+    fills = ("0",) if path.startswith("/scenes") else (job, "0" if "iterations" in path else "tum")
+    path = path.format(*(("good",) if path.startswith("/scenes") else fills))
+    return client.request(method, path, headers=headers)
+
+
+def recovered(s: SimpleNamespace) -> str:
+    """A job after a restart, whose scene isn't there yet."""
+    from service.api.live import LiveJob
+
+    s.app.state.parts.jobs._live[s.done] = LiveJob(s.done, "slow")
+    s.client.event_hooks["response"].append(lambda _: s.app.state.parts.jobs._live.pop(s.done, None))
+    return s.done
+
+
+def localized(s: SimpleNamespace) -> str:
+    writer = s.app.state.parts.jobs._store._writer
+    writer.execute("UPDATE jobs SET status = 'localized' WHERE id = ?", (s.done,))
+    result = json.loads(s.client.get(f"/jobs/{s.done}").text)["result"] | {"geopose": None}
+    writer.execute("UPDATE jobs SET result = ? WHERE id = ?", (json.dumps(result), s.done))
+    s.client.event_hooks["response"].append(
+        lambda _: writer.execute("UPDATE jobs SET status = 'not_localized' WHERE id = ?", (s.done,))
+    )
+    return s.done
+
+
+def fileless(s: SimpleNamespace) -> SimpleNamespace:
+    known = s.app.state.parts.scenes
+    known._entries["hall"] = type(known.entry("good"))("hall", None, loaded=make_scene("hall"), state="ready")
+    return s
+
+
+LIKE_ALL = ("unauthorized", "forbidden", "internal_error", "content_too_large", "rate_limited", "queue_full")
+SPECIFIC = [pair for pair in PAIRS if pair[1] not in (*LIKE_ALL, "request_timeout")]
+
+
+@pytest.mark.parametrize(("name", "code"), SPECIFIC, ids=lambda value: str(value))
+def test_an_operation_gives_the_error_that_it_tells_of(troubled, name, code):
+    hooks = list(troubled.client.event_hooks["response"])
+    try:
+        answer = PROVOKED[name, code](troubled)
+    finally:
+        troubled.client.event_hooks["response"] = hooks
+        on_scene(troubled, "good")
+    assert_problem(answer, EXAMPLES[code].status, code)
+    method, pattern, _ = OPERATIONS[name]
+    assert answer.request.method == method
+    assert pattern.fullmatch(answer.request.url.path)
+
+
+def test_nothing_is_provoked_that_is_not_told():
+    assert PROVOKED.keys() == set(SPECIFIC)
+
+
+# ------------------------------------------------------------------ alike in all operations
+
+
+def telling(code: str) -> list[str]:
+    return [name for name, told in PAIRS if told == code]
+
+
+def test_the_gate_stops_every_operation(stepping, tmp_path):
+    add_key(tmp_path / "keys.json", "reader", "read")
+    app = create_app(settings(keys_file=tmp_path / "keys.json"), {"good": make_scene("good")})
+    with serving(app) as client:
+        assert set(telling("unauthorized")) == set(OPERATIONS)
+        for name in OPERATIONS:
+            assert_problem(plainly(client, name, Authorization="Bearer wrong"), 401, "unauthorized")
+    with serving(create_app(settings(), {"good": make_scene("good")})) as client:
+        assert set(telling("forbidden")) == set(OPERATIONS)
+        for name in OPERATIONS:
+            assert_problem(plainly(client, name, Host="evil.example"), 403, "forbidden", "header.host")
+
+
+def test_a_bug_in_any_operation_is_told_without_details(stepping):
+    app = create_app(settings(), {"good": make_scene("good")})
+    assert set(telling("internal_error")) == set(OPERATIONS) - {"live", "get_version"}
+    with serving(app) as client:
+        parts = app.state.parts
+        del app.state.parts
+        for name in telling("internal_error"):
+            # The queue's state is asked for before anything else; that it fails is no less a bug.
+            answer = plainly(client, name)
+            assert_problem(answer, 500, "internal_error")
+            assert "parts" not in answer.text
+        app.state.parts = parts
+
+
+WRITING = {name for name, (method, _, _) in OPERATIONS.items() if method != "GET"}
+
+
+def test_limits_hold_for_every_operation_that_changes_something(stepping):
+    for code in ("content_too_large", "rate_limited", "queue_full"):
+        assert set(telling(code)) == WRITING
+    with serving(create_app(settings(rate_limit="1/hour"), {"good": make_scene("good")})) as client:
+        client.post("/tokens")
+        for name in WRITING:
+            answer = plainly(client, name)
+            assert_problem(answer, 429, "rate_limited")
+            assert int(answer.headers["retry-after"]) > 0
+    with serving(create_app(settings(max_uploads=1, rate_limit=""), {"good": make_scene("good")})) as client:
+        for name in WRITING:
+            status, problem = of_head(client, name, f"Content-Length: {10**13}")
+            assert (status, problem["code"]) == (413, "content_too_large")
+        with upload_under_way(client):
+            for name in WRITING:
+                answer = plainly(client, name)
+                assert_problem(answer, 503, "queue_full")
+                assert int(answer.headers["retry-after"]) > 0
+
+
+def test_a_body_that_does_not_come_is_given_up(stepping):
+    changes = {"upload_s": 0.01, "max_upload_bytes": 1, "max_scene_bytes": 1000, "rate_limit": ""}
+    with serving(create_app(settings(**changes), {"good": make_scene("good")})) as client:
+        for name in telling("request_timeout"):
+            kind = "multipart/form-data; boundary=x" if name == "localize_photo" else "application/json"
+            status, problem = of_head(client, name, f"Content-Type: {kind}\r\nContent-Length: 100", scene="new")
+            assert (name, status, problem["code"]) == (name, 408, "request_timeout")
+
+
+def of_head(client: httpx.Client, name: str, lines: str, scene: str = "good") -> tuple[int, dict]:
+    """Send the head of a request and no body; return the answer's status and problem."""
+    method, pattern, _ = OPERATIONS[name]
+    path = pattern.pattern.replace("[^/]+", scene if name == "upload_scene" else "good")
+    with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
+        connection.settimeout(20)
+        connection.sendall(f"{method} {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}\r\n\r\n".encode())
+        answer = b""
+        while not answer.endswith(b"}"):
+            answer += connection.recv(65536)
+    head, _, body = answer.partition(b"\r\n\r\n")
+    problem = json.loads(body)
+    assert problem.keys() == PROBLEM
+    return int(head.split()[1]), problem
+
+
+@contextmanager
+def upload_under_way(client: httpx.Client) -> Iterator[None]:
+    head = "POST /localize HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\nContent-Length: 99\r\n"
+    with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
+        connection.sendall(f"{head}\r\n{{".encode())
+        connection.settimeout(0.5)
+        with pytest.raises(TimeoutError):  # no answer: it waits for the rest
+            connection.recv(1)
+        yield
+
+
+# ------------------------------------------------------------------ the catalogue itself
+
+
+def test_every_error_has_an_example_and_each_example_its_error():
+    def below(kind: type) -> set[type]:
+        return {kind}.union(*(below(sub) for sub in kind.__subclasses__()))
+
+    bases = {SplatfixError, SceneError}  # never raised themselves
+    ours = {kind.code for kind in below(SplatfixError) - bases if kind.__module__ == "service.errors"}
+    http = {
+        *("bad_request", "not_found", "method_not_allowed", "request_timeout", "content_too_large"),
+        *("unsupported_media_type", "unavailable", "internal_error"),
+    }
+    assert set(EXAMPLES) == ours | http
+    assert BadInput.code in EXAMPLES
+
+
+def test_the_document_shows_the_examples():
+    shown = create_app(settings(estimator="view_index")).openapi()["components"]["examples"]
+    assert {code: example["value"] for code, example in shown.items()} == {
+        code: problem.model_dump() for code, problem in EXAMPLES.items()
+    }
+
+
+def test_what_belongs_to_no_operation_is_a_problem_document_too(shared):
+    assert_problem(shared.get("/nowhere"), 404, "not_found")
+    assert_problem(shared.put("/localize"), 405, "method_not_allowed")
+    refused = shared.patch("/jobs/x")
+    assert_problem(refused, 405, "method_not_allowed")
+    assert refused.headers["allow"] == "DELETE, GET"
+
+
+def test_a_viewer_that_is_gone_is_told(stepping):
+    from service.api.relay import Relay
+
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    app = create_app(settings(), {"good": make_scene("good")})
+    app.include_router(Relay(SimpleNamespace(port=port)).router)
+    with serving(app) as client:
+        answer = client.get("/viewer/")
+        assert_problem(answer, 503, "unavailable")
+        assert answer.headers["retry-after"]
+
+
+JOB_ERRORS = {
+    "estimator_fault": {"options": {"fail": "fault"}},
+    "internal_error": {"options": {"fail": "bug"}},
+    "deadline_exceeded": {"deadline_s": 1e-6},
+}
+
+
+@pytest.mark.parametrize("code", JOB_ERRORS)
+def test_a_jobs_own_error_is_one_of_the_catalogue(troubled, code):
+    """`interrupted` and the scenes' errors: see test_durable."""
+    job = send_photo(troubled, **JOB_ERRORS[code]).json()
+    error = finished(troubled.client, job["links"]["self"])["error"]
+    assert (error["code"], error["status"]) == (code, EXAMPLES[code].status)
