@@ -211,3 +211,22 @@ def test_serve_prints_a_line_that_works_and_ends_when_told(room, photo):
             server.wait(20)
     assert time.monotonic() - began < 10
     assert server.returncode in (0, -signal.SIGTERM)
+
+
+def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monkeypatch, tmp_path):
+    from service.bench.paper import runs
+
+    seen = []
+    monkeypatch.setattr(runs, "run", lambda asked, show: seen.append(asked))
+    scenes = [tmp_path / "chair", f"{tmp_path / 'fern.ply'}={tmp_path / 'llff'}"]
+    flags = "--trials 7 --slow-trials 1 --seed 3 --study table2 --protocol hard --method mc_do --matcher sift"
+    assert splatfix("bench", "paper", *scenes, "--out", tmp_path / "out", *flags.split())[0] == 0
+    (asked,) = seen
+    assert asked.scenes == {"chair": (scenes[0], None), "fern": (tmp_path / "fern.ply", tmp_path / "llff")}
+    assert [cell.name for cell in asked.cells] == ["table2/mc_do/hard"]
+    assert (asked.trials, asked.slow_trials, asked.seed, asked.matcher) == (7, 1, 3, "sift")
+    for flag, known in (("--study", "table5"), ("--protocol", "hard"), ("--method", "view_index")):
+        code, _, complaint = splatfix("bench", "paper", scenes[0], "--out", tmp_path / "out", flag, "magic")
+        assert (code, "magic" in complaint, known in complaint) == (2, True, True)
+    code, _, complaint = splatfix("bench", "paper", tmp_path / "a", f"{tmp_path / 'b' / 'a'}", "--out", tmp_path)
+    assert (code, "two scenes 'a'" in complaint) == (2, True)

@@ -74,10 +74,12 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
         raise SceneNotFound(f"there are no test photos in layout '{layout}'.", where=str(folder))
     place = scene if scene is not None and scene.is_dir() else folder
     world_from_scene = read_manifest(place).world_from_scene
+    cut_out = layout == "nerf_synthetic"
     photos = [
-        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), (p.file.name,)) for p in test
+        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), flatten=cut_out)
+        for p in test
     ]
-    background = WHITE if layout == "nerf_synthetic" else None
+    background = WHITE if cut_out else None
     return DataSet(layout, tuple(photos), tuple(p.camera for p in training), background)
 
 
