@@ -393,7 +393,7 @@ class Verdict:
     reason: Reason
     score: float
     """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
-    every estimator; at most 0.5 where the lens is in doubt. At least 0.9 is `localized`."""
+    every estimator; at most 0.5 where the lens is in doubt. At least 0.8 is `localized`."""
     inliers: int
     """Matches between the photo and the render at the pose that agree with it."""
     agreement: float

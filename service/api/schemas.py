@@ -212,7 +212,7 @@ class Result(Model):
     hint: str
     """What to do about the reason; empty if all is well."""
     score: float
-    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.9
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.8
     is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
