@@ -194,7 +194,7 @@ def bench_localize(
     start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
     trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
     seed: int = 0,
-    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    intrinsics: Annotated[Literal["given", "approximate", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,

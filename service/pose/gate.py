@@ -123,6 +123,8 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
     pixels = evidence(resized, frame, camera, answer, query.focal_sigma, known)
     signals = pixel_signals(resized, frame, known, size, pixels) | _match_signals(found, frame, query, size, pose)
+    if known is not None:  # as many as a whole photo would have
+        signals["inliers"] /= max(float(known.mean()), 0.1)
     return judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
 
 
