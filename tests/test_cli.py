@@ -14,6 +14,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -21,7 +22,7 @@ from PIL import Image
 import service
 import service.__main__
 from service import jit
-from service.geometry import pose_distance
+from service.geometry import moved, pose_distance
 from service.types import Pose
 from tests.small_room import INTRINSICS, pose_at, write_room
 
@@ -95,6 +96,40 @@ def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo,
     assert told.startswith(f"{photo}: localized, score ")
 
 
+def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
+    film, table, trajectory = (tmp_path / name for name in ("walk.avi", "poses.csv", "poses.tum"))
+    truth = [moved(pose_at(1.0 + 0.02 * i, 0.1), np.array([0.15, 0, 0, 0, 0, 0])) for i in range(4)]
+    frames = []
+    for i, pose in enumerate(truth):
+        frames.append(tmp_path / f"{i}.png")
+        service.__main__.render(room, json.dumps({"world_from_camera": pose.world_from_camera.tolist()}), frames[-1])
+    size = (INTRINSICS["width"], INTRINSICS["height"])
+    writer = cv2.VideoWriter(str(film), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size)
+    for frame in frames:
+        writer.write(cv2.imread(str(frame)))
+    writer.release()
+    given = ("--scene", room, "--intrinsics", json.dumps(INTRINSICS))
+    code, told, _ = splatfix("localize", film, *given, "--json", "--csv", table, "--tum", trajectory)
+    assert code == 0
+    found = json.loads(told)["frames"]
+    for frame, pose in zip(found, truth, strict=True):
+        degrees, units = pose_distance(Pose(np.array(frame["world_from_camera"]["matrix"])), pose)
+        assert degrees < 0.2  # seen: 0.02
+        assert units < 0.01  # seen: 0.0006
+    assert [frame["followed"] for frame in found] == [False, True, True, True]
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row["time_s"] for row in rows] == ["0.0", "0.1", "0.2", "0.3"]
+    lines = np.loadtxt(trajectory)
+    assert lines[:, 0] == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    places = [frame["world_from_camera"]["translation"] for frame in found]
+    assert lines[:, 1:4] == pytest.approx(np.array(places))
+    assert lines[:, 7] == pytest.approx([frame["world_from_camera"]["quaternion_wxyz"][0] for frame in found])
+    code, told, _ = splatfix("localize", *frames, "--sequence", *given, "--every", 2, "--times", "[5, 6, 7, 8]")
+    first, second = told.splitlines()
+    assert first.startswith(f"5.000 s, {frames[0]}: localized")
+    assert second.startswith(f"7.000 s, {frames[2]}: localized")
+
+
 def test_scenes_are_listed_and_inspected(splatfix, room):
     assert splatfix("scenes", "list", room.parent)[:2] == (0, f"{room}\n")
     code, told, _ = splatfix("scenes", "inspect", room)
@@ -119,6 +154,10 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         (("localize", photo, "--scene", room, "--intrinsics", "none.json"), "none.json"),
         (("localize", photo, "--scene", room, "--prior", "{"), "prior"),
         (("localize", photo, "--scene", room, "--budget-s", "-1"), "budget_s"),
+        (("localize", photo, "--scene", room, "--sequence"), "two photos"),
+        (("localize", photo, photo, "--scene", room, "--sequence", "--times", "[1]"), "times_s"),
+        (("localize", photo, photo, "--scene", room, "--every", "2"), "every"),
+        (("localize", photo, "--scene", room, "--tum", tmp_path / "t.txt"), "--sequence"),
         (("render", "--scene", room, "--pose", pose, "--out", tmp_path / "a.png"), "not a rotation"),
         (("render", "--scene", room, "--pose", "{}", "--out", tmp_path / "a.gif"), ".png"),
         (("scenes", "list", tmp_path / "none"), "none"),

@@ -185,7 +185,7 @@ def _at_size_of(file: Path, intrinsics: Intrinsics) -> Intrinsics:
 
 def _size_of(file: Path) -> tuple[int, int]:
     try:
-        return photo_size(file)
+        return photo_size(file.read_bytes())
     except (InvalidImage, OSError) as error:
         raise CorruptScene(f"the photo has no size: {error}", where=str(file.name)) from None
 
