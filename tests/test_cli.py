@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -269,3 +271,24 @@ def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monk
         assert (code, "magic" in complaint, known in complaint) == (2, True, True)
     code, _, complaint = splatfix("bench", "paper", tmp_path / "a", f"{tmp_path / 'b' / 'a'}", "--out", tmp_path)
     assert (code, "two scenes 'a'" in complaint) == (2, True)
+
+
+def test_bench_paper_shows_how_far_it_is():
+    from rich.console import Console
+
+    from service.__main__ import _progress_table
+    from service.bench.paper.runs import Progress
+
+    cells = ("table2/mc_do/hard", "table2/icomma/hard", "table5/mc_do:mc/random")
+    progress = Progress(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})
+    progress.done |= {("chair", cells[0]): 3, ("chair", cells[1]): 1}
+    progress.within |= {("chair", cells[0]): 2}
+    progress.seconds |= {cells[0]: [4.0, 6.0], cells[1]: [60.0]}
+    # mc_do: 7 to go at 5 s; icomma: 9 at 60 s; the third has no pace yet: 10 at the mean of all, 70 / 3 s
+    assert progress.eta_s == pytest.approx(35 + 540 + 700 / 3)
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(_progress_table(progress))
+    told = console.export_text()
+    assert re.search(r"mc_do/hard .*2 / 3 / 5 .*0 / 0 / 5", told)
+    assert "table5" not in told
+    assert "4 of 30 queries, 13 minutes to go" in told

@@ -195,6 +195,9 @@ def test_what_is_no_data_set_is_told(tmp_path: Path) -> None:
         read_data_set(tmp_path)
     with pytest.raises(SceneNotFound, match="no such folder"):
         read_data_set(tmp_path / "none")
+    scene_ply(tmp_path / "scene.ply")
+    with pytest.raises(SceneNotFound, match="has no photos"):
+        bench.subject(tmp_path / "scene.ply")
     (tmp_path / "poses_bounds.npy").write_bytes(b"no array")
     with pytest.raises(CorruptScene, match="not LLFF's poses"):
         read_data_set(tmp_path)

@@ -63,6 +63,8 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
     """Read a data set; `scene` is the folder or file of its trained scene. Raises UnknownName, SceneError."""
     if layout not in ("auto", *LAYOUTS):
         raise UnknownName(f"there is no layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
+    if folder.is_file():
+        raise SceneNotFound("a scene file has no photos.", where=str(folder), hint="Name the data set: --data FOLDER.")
     if not folder.is_dir():
         raise SceneNotFound("there is no such folder.", where=str(folder))
     if layout == "auto":
