@@ -49,6 +49,9 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, 
     pictures = []
     for view, lens, background in zip(views, lenses, a["backgrounds"].double(), strict=True):
         fx, fy, cx, cy = (float(lens[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        if ((values[0] @ view[:3, :3].T + view[:3, 3])[:, 2] <= reference.NEAR).all():
+            pictures.append(empty(values, view, background, height, width))
+            continue
         pictures.append(
             reference.render(*values, view, (fx, fy, cx, cy), width, height, a["eps2d"], background, antialiased)
         )
@@ -56,6 +59,12 @@ def rasterization(*args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, dict[str, 
     alpha = torch.stack([p.alpha[..., None] for p in pictures])
     with torch.no_grad():
         return image, alpha, projected(a, values, views, lenses)
+
+
+def empty(values: list[Tensor], view: Tensor, background: Tensor, height: int, width: int) -> reference.Picture:
+    """Background alone; it depends on everything, with gradients of 0, as gsplat's graph does."""
+    nothing = 0 * (view.sum() + torch.stack([value.sum() for value in values]).sum()) + torch.zeros(height, width)
+    return reference.Picture(nothing[..., None] + background, nothing, nothing, nothing)
 
 
 def projected(a: dict[str, Any], values: list[Tensor], views: Tensor, lenses: Tensor) -> dict[str, Any]:
