@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from service.api.requests import LocalizeFields
     from service.api.schemas import Result
     from service.api.settings import Settings
-    from service.bench.paper.runs import Progress
+    from service.bench.paper.runs import Progress as PaperProgress
     from service.localize import LoadedScene
 
 # Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
@@ -361,14 +361,14 @@ def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
 
 
 @contextmanager
-def _live_table() -> Iterator[Callable[[Progress], None]]:
+def _live_table() -> Iterator[Callable[[PaperProgress], None]]:
     """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
     from rich.live import Live
 
     told = time.monotonic()
     with Live(console=err, auto_refresh=False, transient=True) as live:
 
-        def show(progress: Progress) -> None:
+        def show(progress: PaperProgress) -> None:
             nonlocal told
             if err.is_terminal:
                 live.update(_progress_table(progress), refresh=True)
@@ -380,7 +380,7 @@ def _live_table() -> Iterator[Callable[[Progress], None]]:
         yield show
 
 
-def _progress_table(progress: Progress) -> Table:
+def _progress_table(progress: PaperProgress) -> Table:
     from rich.table import Table
 
     scenes = list(dict.fromkeys(scene for scene, _ in progress.total))

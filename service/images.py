@@ -22,6 +22,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from io import BytesIO
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -38,7 +39,7 @@ from service.types import Intrinsics, Pose, Query
 MAX_PIXELS = 64 * 1024 * 1024
 """A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
 MAX_PIXELS_WHOLE = 25 * 1024 * 1024
-"""Of PNG and WebP: they can't be decoded at a reduced size, and some kilobytes may hold any number of pixels."""
+"""Of WebP: it can't be decoded at a reduced size, and 64 megapixels, which 120 kB may hold, would take 1.9 GB."""
 MAX_SCANS = 24
 """Of a progressive JPEG. Each is a walk over all pixels, for which an attacker needs 100 bytes; encoders make 10."""
 LONG_SIDE = 1600
@@ -61,7 +62,7 @@ ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE
 # check.
 _DECODERS = (
     ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
-    ("PNG", PngImageFile, MAX_PIXELS_WHOLE, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
+    ("PNG", PngImageFile, MAX_PIXELS, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
     ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
     ("HEIC", lambda file: _heic(file.read()), MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
 )

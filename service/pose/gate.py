@@ -6,8 +6,8 @@ colours), each over most of the photo and over its better half (the other may be
 between photo and render agree with the pose, to the pixel and without any fit, what share that is, and how they are
 spread; and by how much alignment would still move the pose. Together they give a probability that the pose is right
 (within 5 degrees and 1/80 of the distance), by a logistic model whose weights `splatfix bench gate` fits and tests:
-each signal is cut off at both ends and weighs positively. Sums forgive, so each signal has a floor besides, that 199
-of 200 right poses stay above: below it a pose is in doubt, however good the rest (a mirrored picture of a row of
+each signal is cut off at both ends and weighs positively. Sums forgive, so each signal has a floor besides, that 249
+of 250 right poses stay above: below it a pose is in doubt, however good the rest (a mirrored picture of a row of
 spheres has all edges in place, and other colours).
 """
 
@@ -82,15 +82,15 @@ SCALES = {
     "inlier_spread": Scale(0.1, 0.9),
 }
 WITH_MATCHES = {
-    "bias": -9.63, "gradients": 0.0, "gradients_half": 1.02, "colours": 0.0, "colours_half": 3.48,
-    "drift_px": 6.07, "inliers": 0.0, "inlier_share": 3.49, "inlier_spread": 0.0,
+    "bias": -9.94, "gradients": 0.0, "gradients_half": 1.21, "colours": 0.0, "colours_half": 3.66,
+    "drift_px": 4.94, "inliers": 0.0, "inlier_share": 4.98, "inlier_spread": 0.0,
 }  # fmt: skip
 BY_PIXELS = {
-    "bias": -9.89, "gradients": 0.86, "gradients_half": 2.88, "colours": 0.0, "colours_half": 3.72, "drift_px": 6.52,
+    "bias": -7.0, "gradients": 3.05, "gradients_half": 3.49, "colours": 0.0, "colours_half": 0.0, "drift_px": 4.92,
 }  # fmt: skip
 FLOORS = {
-    "gradients": 0.57, "gradients_half": 0.81, "colours": 0.69, "colours_half": 0.895, "drift_px": 1.58,
-    "inliers": 88.0, "inlier_share": 0.425, "inlier_spread": 0.417,
+    "gradients": 0.603, "gradients_half": 0.841, "colours": 0.708, "colours_half": 0.902, "drift_px": 5.2,
+    "inliers": 91.0, "inlier_share": 0.456, "inlier_spread": 0.418,
 }  # fmt: skip
 """In `drift_px` a ceiling."""
 LOCALIZED, UNCERTAIN = 0.8, 0.1
@@ -122,7 +122,8 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     resized, known = photo_at(query, tools, size), known_at(query, tools, size)
     answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
     pixels = evidence(resized, frame, camera, answer, query.focal_sigma, known)
-    signals = pixel_signals(resized, frame, known, size, pixels) | _match_signals(found, frame, query, size, pose)
+    signals = pixel_signals(resized, frame, known, size, pixels)
+    signals |= _match_signals(found, _both_known(frame, known), query, size, pose)
     if known is not None:  # as many as a whole photo would have
         signals["inliers"] /= max(float(known.mean()), 0.1)
     return judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
@@ -154,12 +155,12 @@ def pixel_signals(
 
 
 def _match_signals(
-    found: Correspondences, frame: Frame, query: Query, size: Intrinsics, pose: Pose
+    found: Correspondences, alpha: Float32[np.ndarray, "h w"], query: Query, size: Intrinsics, pose: Pose
 ) -> dict[str, float]:
     scale = size.long_side / query.intrinsics.long_side
     error = scale * reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
     inlier = error < MAX_ERROR_PX
-    opaque = cv2.resize(frame.alpha, (CELLS, CELLS), interpolation=cv2.INTER_AREA) > 0.5 * MIN_ALPHA
+    opaque = cv2.resize(alpha, (CELLS, CELLS), interpolation=cv2.INTER_AREA) > 0.5 * MIN_ALPHA
     cell = (found.photo_px[inlier] * (CELLS / np.array([query.intrinsics.width, query.intrinsics.height]))).astype(int)
     held = np.zeros((CELLS, CELLS), bool)
     held[tuple(np.clip(cell[:, ::-1], 0, CELLS - 1).T)] = True

@@ -211,7 +211,13 @@ def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, seed: int) -> di
     estimate = answered(one, trial, Request(method.estimator, method.options, seed))
     spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
     outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, one.units), *spent)
-    line = {"scene": scene, "cell": cell.name, "study": cell.study, "method": method.name, "protocol": cell.protocol}
+    line: dict[str, Any] = {
+        "scene": scene,
+        "cell": cell.name,
+        "study": cell.study,
+        "method": method.name,
+        "protocol": cell.protocol,
+    }
     line |= line_of(trial, estimate, outcome, one.units)
     line |= {"profile": method.profile, "within_5deg_0p05": outcome.within((5.0, 0.05))}
     line |= {"within_1deg_0p01": outcome.within((1.0, 0.01))}
