@@ -146,6 +146,9 @@ def test_an_old_job_opens_by_its_address_and_can_be_stepped_through(
     above = page.locator(".splatfix-flicker img").last
     for opacity in ("1", "0", "1"):
         expect(above).to_have_css("opacity", opacity)
+    page.get_by_role("button", name="beside").click()
+    expect(page.locator("img[src^='blob:']").first).to_be_visible()
+    expect(above).not_to_be_visible()
     page.close()
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.types import IterationRecord, Pose
-from viewer.measure import MatchView, angle_counts, mean_angle_deg, pose_error
+from viewer.measure import SHORTEST_PX, MatchView, angle_counts, mean_angle_deg, pose_error
 
 _BINS = 24
 _QUIET = "#9aa0a8"
@@ -25,14 +25,17 @@ def vectors_html(view: MatchView | None) -> str:
     if view is None or not len(view.inlier):
         return _note("This step has no matches.")
     angle = mean_angle_deg(view.vectors_px)
+    said = "no vector is long enough" if angle is None else f"{angle:.0f}° between two, on average"
     lengths = np.linalg.norm(view.vectors_px, axis=1)
     lengths = lengths[np.isfinite(lengths)]
-    if angle is None or not len(lengths):
-        return _note("No match vector has a direction here.")
+    if not len(lengths):
+        return _note("No match is in view here.")
+    median = float(np.median(lengths))
+    long = f"below {SHORTEST_PX}" if median < SHORTEST_PX else f"{median:.3g}"
     return (
         "<div style='display:flex;gap:.8em;padding:0 .6em;flex-wrap:wrap'>"
-        f"{_figure(_rose(angle_counts(view.vectors_px, _BINS)), f'angles: {angle:.0f}° between two, on average')}"
-        f"{_figure(_bars(lengths), f'lengths: {np.median(lengths):.3g} px, the median')}"
+        f"{_figure(_rose(angle_counts(view.vectors_px, _BINS)), f'angles: {said}')}"
+        f"{_figure(_bars(lengths), f'lengths: {long} px, the median')}"
         "</div>"
         + _note(
             "From where the render has a point to where the photo has it. Turned about its axis or swung round what it "
@@ -216,7 +219,7 @@ def _rose(counts: Float64[np.ndarray, "bins"]) -> str:
 
 def _bars(lengths: Float64[np.ndarray, "m"]) -> str:
     """Counts over a logarithmic axis of pixels."""
-    low = np.floor(np.log10(max(np.quantile(lengths, 0.02), 1e-2)))
+    low = np.floor(np.log10(max(np.quantile(lengths, 0.02), SHORTEST_PX)))
     high = np.ceil(np.log10(max(lengths.max(), 10**low * 10)))
     edges = np.linspace(low, high, int(4 * (high - low)) + 1)
     counts, _ = np.histogram(np.log10(np.clip(lengths, 10**low, 10**high)), edges)

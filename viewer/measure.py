@@ -143,8 +143,12 @@ def _as_if(target: Intrinsics, px: Float64[np.ndarray, "m 2"], source: Intrinsic
     return rays * [target.fx, target.fy] + [target.cx, target.cy]
 
 
+SHORTEST_PX = 0.1
+"""Matches are no finer: what is shorter has no direction that means anything."""
+
+
 def _directions(vectors: Float64[np.ndarray, "m 2"]) -> Float64[np.ndarray, "k 2"]:
     """Unit vectors of those that have a direction."""
     length = np.linalg.norm(vectors, axis=1)
-    has_one = np.isfinite(length) & (length > 1e-9)
+    has_one = np.isfinite(length) & (length > SHORTEST_PX)
     return vectors[has_one] / length[has_one, None]
