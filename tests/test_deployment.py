@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import promql_parser
@@ -61,6 +62,48 @@ def test_what_the_dockerfile_copies_is_there_and_not_ignored():
         assert any(source == entry or entry.startswith(f"{source}/") for entry in kept), source
     for entry in kept:
         assert (ROOT / entry).exists(), entry
+
+
+@pytest.fixture
+def entrypoint(tmp_path) -> Callable[..., str]:
+    """The container's entrypoint with a root of its own, and a `splatfix` that tells what it is given."""
+    if not Path("/lib64/ld-linux-x86-64.so.2").exists():
+        pytest.skip("needs the C library of an x86-64 Linux")
+    text = (DOCKER / "entrypoint").read_text()
+    text = re.sub(r"(=| )/(opt|scenes|tmp)", rf"\1{tmp_path}/\2", text)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "entrypoint").write_text(text)
+    told = 'echo "$1 $NUMBA_CPU_NAME $NUMBA_CPU_FEATURES $SPLATFIX_SCENES $(ls "$NUMBA_CACHE_DIR")"'
+    made = 'mkdir -p "$NUMBA_CACHE_DIR" && touch "$NUMBA_CACHE_DIR/kernel"'
+    (tmp_path / "splatfix").write_text(f'#!/bin/sh\n[ "$1" != doctor ] || {{ {made}; }}\n{told}\n')
+    (tmp_path / "splatfix").chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "SPLATFIX_CACHE_DIR": str(tmp_path / "cache")}
+
+    def run(*arguments: str, **more: str) -> str:
+        command = ["sh", str(tmp_path / "entrypoint"), *arguments]
+        done = subprocess.run(command, env=environment | more, capture_output=True, text=True, check=True)
+        return done.stdout + done.stderr
+
+    return run
+
+
+def test_the_entrypoint_runs_the_kernels_that_were_compiled(entrypoint):
+    """numba's key is the processor's name and its features: both the same at build and run."""
+    assert "are compiled now" in entrypoint("serve")
+    compiled = [line.split()[1:3] for line in entrypoint("compile").splitlines() if line.startswith("doctor")]
+    if not compiled:
+        pytest.skip("this processor has no AVX2")
+    command, *key, _, kernels = entrypoint("serve").split()
+    assert (command, kernels) == ("serve", "kernel")
+    assert key == compiled[0]  # the best comes first
+    assert len({name for name, _ in compiled}) == len({features for _, features in compiled}) == len(compiled)
+
+
+def test_the_entrypoint_serves_the_demo_where_there_are_no_scenes(entrypoint, tmp_path):
+    assert f'["{tmp_path}/opt/splatfix/demo/studio"]' in entrypoint("serve")
+    (tmp_path / "scenes" / "mine").mkdir()
+    assert f'["{tmp_path}/scenes"]' in entrypoint("serve")
+    assert '["elsewhere"]' in entrypoint("serve", SPLATFIX_SCENES='["elsewhere"]')
 
 
 def compose() -> dict:
