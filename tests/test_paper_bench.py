@@ -105,6 +105,17 @@ def test_it_goes_on_where_it_was_and_takes_more(scene, monkeypatch):
     more = runs.run(asked_for(scene))
     assert set(keys(few)) < set(keys(more))
     assert len(asked) == len(more) == len(set(keys(more))) == 30
+    shown = []
+    runs.run(
+        asked_for(scene, trials=3, cells=plan.chosen(protocols=("random",), methods=("view_index",))), shown.append
+    )
+    runs.run(
+        asked_for(scene, trials=2, cells=plan.cells()[:1], scenes={"t": (scene, None), "s": (scene, None)}),
+        shown.append,
+    )
+    assert [sum(shown[i].total.values()) for i in (0, -1)] == [3, 4]
+    assert sum(shown[-1].done.values()) == 4
+    assert shown[-1].eta_s == 0
 
 
 def child(folder: Path) -> None:

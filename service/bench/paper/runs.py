@@ -245,8 +245,9 @@ def _begun(asked: Asked, subjects: Mapping[str, Subject], lines: Sequence[Mappin
     for cell in asked.cells:
         for scene, one in subjects.items():
             progress.total[scene, cell.name] = asked.count(cell, len(_of_cell(one, cell).photos))
-    for line in lines:
-        if (line["scene"], line["cell"]) in progress.total:
+    for line in lines:  # of an earlier call there may be more than this one asks for
+        place = line["scene"], line["cell"]
+        if progress.done.get(place, 0) < progress.total.get(place, 0):
             _count(progress, line)
     return progress
 
