@@ -33,7 +33,7 @@ lint: setup
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# Rebuilds the demo scene from nothing: some 30 minutes of path tracing and 10 of training on two cores.
+# Rebuilds the demo scene from nothing: some 45 minutes of path tracing and 15 of training on two cores.
 studio: setup
 	$(STUDIO_PYTHON) -m venv scenes/studio/.venv
 	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt

@@ -1,6 +1,6 @@
 """Train a 3D Gaussian scene on the CPU, with the gradients of our own renderer.
 
-    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 10000]
+    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 14000]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
 (float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
@@ -320,7 +320,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, default=240_000)
-    parser.add_argument("--iterations", type=int, default=10_000)
+    parser.add_argument("--iterations", type=int, default=14_000)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     scene = train(arguments.folder, arguments.gaussians, arguments.iterations)

@@ -7,7 +7,9 @@ import dataclasses
 import json
 import logging
 import os
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -19,8 +21,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from service.errors import InvalidRequest, SplatfixError
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from service.api.schemas import Result
     from service.api.settings import Settings
+    from service.bench.paper.runs import Progress
     from service.localize import LoadedScene
 
 # Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
@@ -39,6 +44,7 @@ IntrinsicsOption = Annotated[
     str,
     typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
 ]
+MatcherOption = Annotated[str, typer.Option("--matcher", help="Of local features; `splatfix doctor` lists them.")]
 
 
 def main() -> None:
@@ -96,6 +102,7 @@ def localize(
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
+    matcher: MatcherOption = "",
     seed: int = 0,
     budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
@@ -112,7 +119,7 @@ def localize(
     given |= {"intrinsics": _json(intrinsics, "intrinsics"), "prior": _json(prior, "prior")}
     fields = read_fields({name: value for name, value in given.items() if value is not None})
     bodies = [Body(_bytes(photo), str(photo), {}) for photo in photos]
-    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR)
+    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         task, query = make_task(body, fields, loaded)
@@ -176,14 +183,21 @@ def render(
 
 @bench_app.command("localize")
 def bench_localize(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses, or a scene file.")],
+    data: Annotated[Path | None, typer.Option(help="The data set's folder, if it isn't the scene's.")] = None,
+    layout: Annotated[
+        str, typer.Option(help="auto, nerf_synthetic, llff, mipnerf360, deep_blending, nerfstudio or scene.")
+    ] = "auto",
+    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
     estimator: str = "view_index",
-    start: Annotated[Literal["none", "easy", "hard", "inplace", "random"], typer.Option()] = "none",
+    matcher: MatcherOption = "",
+    start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
     trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
     seed: int = 0,
     intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
@@ -192,18 +206,24 @@ def bench_localize(
     """Localize a scene's test photos and compare with the truth."""
     from service.api.intake import options_from
     from service.bench.localize import Budget, run
+    from service.localize import DEFAULT_MATCHER
 
     _tell_machine()
     with _progress() as progress:
         outcome = run(
             folder,
+            data=data,
+            layout=layout,
+            background=background,
             estimator=estimator,
+            matcher=matcher or DEFAULT_MATCHER,
             start=start,
             trials=trials,
             seed=seed,
             intrinsics=intrinsics,
             cameras=cameras,
             modify=tuple(modify or ()),
+            occluders=occluders,
             options=options_from(estimator, _json(options, "options") or {}),
             budget=Budget(budget_s, budget_renders),
             progress=_counter(progress, "photos"),
@@ -217,6 +237,124 @@ def bench_localize(
 
 def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+@bench_app.command("paper")
+def bench_paper(
+    scenes: Annotated[list[str], typer.Argument(help="Scene folders; SCENE=DATA where the data set is elsewhere.")],
+    folder: Annotated[Path, typer.Option("--out", help="Where results are kept; a run there is gone on with.")],
+    trials: Annotated[int, typer.Option(min=1, help="Of fast methods, a scene and protocol.")] = 40,
+    slow_trials: Annotated[int, typer.Option(min=0, help="Of the baselines.")] = 5,
+    study: Annotated[list[str] | None, typer.Option(help="table1, table2, table5, pnerf, range, resolution.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
+    protocol: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
+    layout: Annotated[str, typer.Option(help="Of the data sets.")] = "auto",
+    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
+    matcher: MatcherOption = "",
+    seed: int = 0,
+    report: Annotated[Path | None, typer.Option(help="Write tables, figures and page to this folder.")] = None,
+    run: Annotated[bool, typer.Option("--run/--report-only", help="Run what is missing first.")] = True,
+) -> None:
+    """Reproduce the paper: methods x scenes x protocols, then its tables and figures."""
+    from service.bench.paper import runs
+    from service.bench.paper.plan import chosen
+    from service.localize import DEFAULT_MATCHER
+
+    asked = runs.Asked(
+        scenes=_scene_arguments(scenes),
+        cells=chosen(study or (), method or (), protocol or ()),
+        out=folder,
+        trials=trials,
+        slow_trials=slow_trials,
+        seed=seed,
+        matcher=matcher or DEFAULT_MATCHER,
+        layout=layout,
+        background=background,
+        cache_dir=_settings({}).cache_dir,
+    )
+    if run:
+        _tell_machine()
+        with _live_table() as show:
+            runs.run(asked, show)
+    if report:
+        from service.bench.paper.report import write
+
+        with err.status("drawing"):
+            write(asked, report)
+        out.print(str(report / "index.html"), highlight=False, soft_wrap=True)
+
+
+def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
+    """SCENE or SCENE=DATA; a scene's name is its folder's."""
+    found: dict[str, tuple[Path, Path | None]] = {}
+    for text in given:
+        scene, _, data = text.partition("=")
+        name = Path(scene).resolve().stem
+        if name in found:
+            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
+        found[name] = Path(scene), Path(data) if data else None
+    return found
+
+
+@contextmanager
+def _live_table() -> Iterator[Callable[[Progress], None]]:
+    """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
+    from rich.live import Live
+
+    told = time.monotonic()
+    with Live(console=err, auto_refresh=False, transient=True) as live:
+
+        def show(progress: Progress) -> None:
+            nonlocal told
+            if err.is_terminal:
+                live.update(_progress_table(progress), refresh=True)
+            elif time.monotonic() - told > 60:
+                told = time.monotonic()
+                done, total = sum(progress.done.values()), sum(progress.total.values())
+                err.print(f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go", highlight=False)
+
+        yield show
+
+
+def _progress_table(progress: Progress) -> Table:
+    from rich.table import Table
+
+    scenes = list(dict.fromkeys(scene for scene, _ in progress.total))
+    table = Table("study / method / start", *scenes, title="within 5 deg / 0.05, of done, of all")
+    for cell in dict.fromkeys(cell for _, cell in progress.total):
+        places = [(scene, cell) for scene in scenes]
+        if any(progress.done.get(place) for place in places):
+            counts = [(progress.within.get(p, 0), progress.done.get(p, 0), progress.total[p]) for p in places]
+            table.add_row(cell, *(f"{a} / {b} / {c}" for a, b, c in counts))
+    done, total = sum(progress.done.values()), sum(progress.total.values())
+    table.caption = f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go"
+    return table
+
+
+@bench_app.command("gate")
+def bench_gate(
+    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
+    seed: int = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+    plot: Annotated[Path | None, typer.Option(help="Write a reliability plot, a .png.")] = None,
+) -> None:
+    """Test the verification gate on right, wrong and foreign poses, leaving one scene out of its fit in turn."""
+    from service.bench.gate import run
+
+    _tell_machine()
+    if len(folders) < 2:
+        raise InvalidRequest("needs two scenes or more, to test on another one than it fits on.", where="folders")
+    with _progress() as progress:
+        outcome = run(folders, seed=seed, progress=_counter(progress, "photos"), cache_dir=_settings({}).cache_dir)
+    _write_json(json_file, outcome)
+    if plot:
+        from service.bench.paper.figures import reliability
+
+        plot.write_bytes(reliability({name: outcome[name]["reliability"] for name in ("with_matches", "by_pixels")}))
+    for name in ("with_matches", "by_pixels"):
+        for key, value in outcome[name].items():
+            if key not in ("reliability", "by_kind"):
+                out.print(f"{name:13} {key:30} {value}", markup=False, highlight=False, soft_wrap=True)
 
 
 @bench_app.command("render")
@@ -342,12 +480,13 @@ def _bytes(path: Path) -> bytes:
         raise InvalidRequest(f"{error.strerror}.", where=str(path)) from error
 
 
-def _loaded(scene: Path, estimator: str | None = None) -> LoadedScene:
+def _loaded(scene: Path, estimator: str | None = None, matcher: str = "") -> LoadedScene:
     """Load a scene and, if an estimator is to use it, make what that prepares for it."""
     from service.localize import LoadedScene
 
     with err.status(f"reading {scene}") as status:
-        loaded = LoadedScene.load(scene, cache_dir=_settings({}).cache_dir)
+        settings = _settings({"matcher": matcher} if matcher else {})
+        loaded = LoadedScene.load(scene, cache_dir=settings.cache_dir, matcher=settings.matcher)
         if estimator:
             status.update("preparing")
             loaded.prepare(estimator)

@@ -20,6 +20,7 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
@@ -43,6 +44,8 @@ MAX_SCANS = 24
 """Of a progressive JPEG. Each is a walk over all pixels, for which an attacker needs 100 bytes; encoders make 10."""
 LONG_SIDE = 1600
 """Of `Query.rgb`; matching uses 512 and alignment 400 pixels, the rest is for close looks."""
+OPAQUE = 128
+"""Of 255: what is more transparent is unknown."""
 MIN_SIDE = 32
 """Of `Query.rgb`; the features need more anyway."""
 GUESSED_FOCAL = 0.78
@@ -92,8 +95,9 @@ def read_query(
 ) -> Query:
     """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
 
-    `intrinsics` refer to the upright photo in its full size. Transparent parts are filled with
-    `background_rgb` (0..1): pass the scene's, then a cut-out object looks as it does in a render.
+    `intrinsics` refer to the upright photo in its full size. Transparent parts are unknown: nothing is expected
+    there. They are filled with `background_rgb` (0..1): pass the scene's, then a cut-out object has the edges that
+    it has in a render.
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb)
@@ -113,24 +117,36 @@ def read_query(
         focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
         size = decoded.width, decoded.height
         intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
-    rgb, pinhole = undistorted(decoded.rgb, decoded.camera(intrinsics))
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings))
+    camera = decoded.camera(intrinsics)
+    rgb, pinhole, seen = undistorted(decoded.rgb, camera)
+    known = decoded.known
+    if seen is not None and not seen.all():
+        known = seen if known is None else seen & (undistorted(known.astype(np.uint8), camera)[0] > 0)
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), known)
 
 
 def encode_image(
-    rgb: UInt8[np.ndarray, "h w 3"] | Float32[np.ndarray, "h w 3"],
+    rgb: UInt8[np.ndarray, "h w c"] | Float32[np.ndarray, "h w c"],
     kind: Literal["jpg", "png"] = "jpg",
     *,
     quality: int = 90,
 ) -> bytes:
-    """Return an image (uint8, or a render's float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100."""
+    """Return an image (uint8, or float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100; a PNG may be RGBA."""
     if rgb.dtype != np.uint8:
         rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpg" else []
-    encoded, data = cv2.imencode(f".{kind}", rgb[:, :, ::-1], options)
+    order = [2, 1, 0, *range(3, rgb.shape[2])]
+    encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(rgb[:, :, order]), options)
     if not encoded:
         raise ValueError(f"an image of shape {rgb.shape} can't be {kind}")
     return data.tobytes()
+
+
+def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float32[np.ndarray, "height width 3"]:
+    """Resample: area averages where it shrinks, so nothing aliases; else bilinear."""
+    shrinks = width * height < rgb.shape[0] * rgb.shape[1]
+    mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=mode), np.float32)
 
 
 def photo_size(path: Path) -> tuple[int, int]:
@@ -183,23 +199,36 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
 
 
 def undistorted(
-    rgb: UInt8[np.ndarray, "h w 3"], intrinsics: Intrinsics
-) -> tuple[UInt8[np.ndarray, "h w 3"], Intrinsics]:
-    """Return the image as a pinhole of the same focal length and size sees it; black where it sees more."""
+    image: UInt8[np.ndarray, "h w *channels"], intrinsics: Intrinsics
+) -> tuple[UInt8[np.ndarray, "h w *channels"], Intrinsics, Bool[np.ndarray, "h w"] | None]:
+    """Return the image as a pinhole of the same focal length and size sees it, black where it sees more.
+
+    The last value says where it does not; None if nothing had to be done.
+    """
     pinhole = replace(intrinsics, model="PINHOLE", distortion=())
-    fisheye = "FISHEYE" in intrinsics.model
-    if not fisheye and not any(intrinsics.distortion):
-        return rgb, pinhole
+    if "FISHEYE" not in intrinsics.model and not any(intrinsics.distortion):
+        return image, pinhole, None
+    x, y, seen = _undistortion(intrinsics)
+    straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
+    straight[~seen] = 0
+    return straight, pinhole, seen
+
+
+@lru_cache(maxsize=4)
+def _undistortion(
+    intrinsics: Intrinsics,
+) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+    """Return where each pixel of the pinhole lies in the photo, and whether it does; made once for a camera."""
+    pinhole, fisheye = replace(intrinsics, model="PINHOLE", distortion=()), "FISHEYE" in intrinsics.model
     coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
     coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
     # cv2 counts pixels from the centre of the first one.
     matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
     make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     size = (pinhole.width, pinhole.height)
-    maps = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-    straight = cv2.remap(rgb, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    straight[_folded(pinhole, coefficients, fisheye)] = 0
-    return straight, pinhole
+    x, y = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
+    inside = (x > -0.5) & (y > -0.5) & (x < pinhole.width - 0.5) & (y < pinhole.height - 0.5)
+    return x, y, inside & ~_folded(pinhole, coefficients, fisheye)
 
 
 def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:
@@ -231,6 +260,7 @@ def _fisheye(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "4"]) -> Float6
 class _Decoded:
     rgb: UInt8[np.ndarray, "h w 3"]
     """Upright, reduced."""
+    known: Bool[np.ndarray, "h w"] | None
     width: int
     """Of the upright photo in its full size."""
     height: int
@@ -335,7 +365,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
             step = (raw_size[0] / drafted[1][2], raw_size[1] / drafted[1][3])
     try:
         photo.load()
-        pixels, warnings = _rgb(photo, background_rgb)
+        pixels, alpha, warnings = _rgb(photo, background_rgb)
     except Exception as error:
         raise InvalidImage(
             f"the {name} can't be decoded, it is truncated or damaged: {_short(error)}.",
@@ -345,16 +375,19 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     covered = (pixels.shape[1] * step[0], pixels.shape[0] * step[1])
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
+    layers = [pixels] if alpha is None else [pixels, alpha]
     if pixels.shape[:2] != (target[1], target[0]):
-        pixels = cv2.resize(pixels, target, interpolation=cv2.INTER_AREA)
+        layers = [cv2.resize(layer, target, interpolation=cv2.INTER_AREA) for layer in layers]
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
     transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
     if transpose:
-        pixels, scale, beyond, raw_size = pixels.transpose(1, 0, 2), scale[::-1], beyond[::-1], raw_size[::-1]
-    pixels = pixels[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]
+        layers = [layer.swapaxes(0, 1) for layer in layers]
+        scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
+    turned = [np.ascontiguousarray(layer[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]) for layer in layers]
     return _Decoded(
-        np.ascontiguousarray(pixels),
+        turned[0],
+        turned[1] >= OPAQUE if len(turned) > 1 else None,
         *raw_size,
         scale=(scale[0], scale[1]),
         offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
@@ -364,28 +397,32 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
 
 def _rgb(
     photo: Image.Image, background_rgb: tuple[float, float, float]
-) -> tuple[UInt8[np.ndarray, "h w 3"], list[str]]:
-    rgb, opaque = np.empty((photo.height, photo.width, 3), np.uint8), True
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, list[str]]:
+    """Return colours, opacity unless all is opaque, and warnings."""
+    rgb, alpha = np.empty((photo.height, photo.width, 3), np.uint8), None
     rows = max(1, _BAND_PX // photo.width)
     for top in range(0, photo.height, rows):
         band = photo.crop((0, top, photo.width, min(top + rows, photo.height)))
-        rgb[top : top + rows], band_is_opaque = _band_rgb(band, background_rgb)
-        opaque = opaque and band_is_opaque
-    return rgb, [] if opaque else ["Transparent parts were filled with one colour."]
+        rgb[top : top + rows], band_alpha = _band_rgb(band, background_rgb)
+        if band_alpha is not None:
+            alpha = np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha
+            alpha[top : top + rows] = band_alpha
+    return rgb, alpha, [] if alpha is None else ["Transparent parts of the photo are ignored."]
 
 
-def _band_rgb(band: Image.Image, background_rgb: tuple[float, float, float]) -> tuple[np.ndarray, bool]:
-    """Return the pixels, and whether all are opaque."""
+def _band_rgb(
+    band: Image.Image, background_rgb: tuple[float, float, float]
+) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
     if band.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
         gray = (np.asarray(band).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
-        return np.repeat(gray[:, :, None], 3, axis=2), True
+        return np.repeat(gray[:, :, None], 3, axis=2), None
     if not band.has_transparency_data:
-        return np.asarray(band.convert("RGB")), True
+        return np.asarray(band.convert("RGB")), None
     rgba = band.convert("RGBA")
     alpha = rgba.getchannel("A")
     canvas = Image.new("RGB", band.size, tuple(round(255 * c) for c in background_rgb))
     canvas.paste(rgba, mask=alpha)
-    return np.asarray(canvas), alpha.getextrema()[0] == 255
+    return np.asarray(canvas), None if alpha.getextrema()[0] == 255 else np.asarray(alpha)
 
 
 def _orientation(photo: Image.Image) -> int:

@@ -102,8 +102,27 @@ class Matcher(Protocol):
         ...
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
-        """Return pairs of indices into `a` and `b`; each index at most once."""
+        """Return pairs of indices into `a` and `b`, the surest first; each index at most once."""
         ...
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePairs:
+    """Points of two images that show the same."""
+
+    a_px: Float32[np.ndarray, "m 2"]
+    """Centre of the top-left pixel = (0.5, 0.5)."""
+    b_px: Float32[np.ndarray, "m 2"]
+    confidence: Float32[np.ndarray, "m"]
+
+
+@runtime_checkable
+class ImageMatcher(Protocol):
+    """Pairs two images without features of each (detector-free networks). Safe to call from several threads."""
+
+    name: str
+
+    def match_images(self, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs: ...
 
 
 @dataclass(slots=True)
@@ -127,6 +146,8 @@ class Tools:
     memo: dict[Any, Any] = field(default_factory=dict)
     """What one part of the job computed and another wants too (the photo's features, the last render): a cache
     of this job alone; it never changes a result's meaning."""
+    image_matcher: ImageMatcher | None = None
+    """In the place of `matcher` for methods that match renders with the photo; those that need features refuse."""
     tally: RenderTally = field(default_factory=RenderTally)
     """Of `rasterizer`; an estimator that renders with another one wraps it with `counted`, too."""
 

@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import EstimatorFault
+from service.errors import EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
-from service.interfaces import Matcher, Rasterizer, RenderTally, Tools
+from service.interfaces import ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
 from service.pose.gate import verify
 from service.render import RASTERIZERS
@@ -59,6 +59,8 @@ class LoadedScene:
     scene: GaussianScene
     rasterizer: Rasterizer
     matcher: Matcher
+    """The gate's, too; beside an `image_matcher` it is the default one."""
+    image_matcher: ImageMatcher | None = None
     cache_dir: Path | None = None
     """Where prepared things (view indexes) are kept between runs; None: nowhere."""
     _prepared: dict[str, Any] = field(default_factory=dict)
@@ -86,7 +88,12 @@ class LoadedScene:
         rasterizer: str = DEFAULT_RASTERIZER,
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
-        return cls(scene, RASTERIZERS.load(rasterizer).create(scene), MATCHERS.load(matcher).create(), cache_dir)
+        features = images = MATCHERS.load(matcher).create()
+        if isinstance(images, ImageMatcher):
+            features = MATCHERS.load(DEFAULT_MATCHER).create()
+        else:
+            images = None
+        return cls(scene, RASTERIZERS.load(rasterizer).create(scene), features, images, cache_dir)
 
     @property
     def nbytes(self) -> int:
@@ -129,6 +136,7 @@ def localize(
     """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing."""
     request = request or Request()
     plugin = ESTIMATORS.load(request.estimator)
+    _require_matching(request.estimator, loaded)
     options = request.options if request.options is not None else plugin.Options()
     tally = RenderTally()
     tools = Tools(
@@ -137,6 +145,7 @@ def localize(
         loaded.matcher,
         np.random.default_rng(request.seed),
         loaded.prepare(request.estimator),
+        image_matcher=loaded.image_matcher,
         tally=tally,
     )
     clock = _Clock()
@@ -164,7 +173,7 @@ def localize(
         scene_sha256=loaded.scene.info.sha256,
         estimator=request.estimator,
         rasterizer=loaded.rasterizer.name,
-        matcher=loaded.matcher.name,
+        matcher=(loaded.image_matcher or loaded.matcher).name,
         seed=request.seed,
         budget_exhausted=exhausted,
         renders=renders,
@@ -172,6 +181,16 @@ def localize(
         warnings=query.warnings + loaded.scene.info.warnings,
         records=tuple(records),
     )
+
+
+def _require_matching(estimator: str, loaded: LoadedScene) -> None:
+    """Raise InvalidOptions where a method would have to match with another matcher than the one asked for."""
+    if loaded.image_matcher and not getattr(ESTIMATORS.load(estimator), "MATCHES_IMAGES", False):
+        raise InvalidOptions(
+            f"'{loaded.image_matcher.name}' has no features of one image, which '{estimator}' needs.",
+            where="matcher",
+            hint="Take mc_do or icomma, or another matcher.",
+        )
 
 
 def _exhausted(request: Request, clock: _Clock, tally: RenderTally) -> bool:

@@ -7,7 +7,8 @@ units; quaternions are wxyz.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Literal
 
@@ -249,9 +250,13 @@ class Query:
     """Of the whole upright photo in its own resolution, with its distortion: what results report."""
     prior: Pose | None = None
     warnings: tuple[str, ...] = ()
+    known: Bool[np.ndarray, "h w"] | None = None
+    """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+        if self.known is not None:
+            object.__setattr__(self, "known", frozen(self.known, np.bool_))
 
     @property
     def focal_sigma(self) -> float:
@@ -387,7 +392,8 @@ class Verdict:
     status: Status
     reason: Reason
     score: float
-    """0..1, the same meaning for every estimator: at least 0.5 is `localized`."""
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
+    every estimator; at most 0.5 where the lens is in doubt. At least 0.9 is `localized`."""
     inliers: int
     """Matches between the photo and the render at the pose that agree with it."""
     agreement: float
@@ -400,6 +406,8 @@ class Verdict:
     true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
     focal_sigma: float = 0.0
     """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
+    signals: Mapping[str, float] = field(default_factory=dict)
+    """All that the gate measured, by name; `service/pose/gate.py` says what each is."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,8 @@
 """The benches: which photos, what is held back, starts, modifications, and what is counted."""
 
+import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from service.bench import localize as bench
 from service.bench import render as render_bench
 from service.bench.metrics import Units, units_of
 from service.bench.modifications import MODIFICATIONS, Shot, modified
-from service.bench.queries import find_photos, photo_bytes
+from service.bench.queries import find_photos, sent
 from service.bench.starts import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
 from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
@@ -241,7 +243,9 @@ class TestRun:
             ({"modify": ("sharpen=3",)}, UnknownName),
             ({"modify": ("blur=x",)}, InvalidOptions),
             ({"modify": ("blur",)}, InvalidOptions),
-            ({"modify": ("occlude=2",)}, InvalidOptions),
+            ({"modify": ("occlusion=2",)}, InvalidOptions),
+            ({"modify": ("occlusion=0.2",)}, InvalidOptions),
+            ({"layout": "tartan"}, UnknownName),
         ],
     )
     def test_wrong_words(self, tmp_path, runs, arguments, error):
@@ -257,7 +261,8 @@ class TestStarts:
     CAMERAS = tuple(Camera(LENS, pose) for pose in poses())
 
     @pytest.mark.parametrize(
-        ("kind", "degrees", "lengths"), [("easy", (0, 30), (0, 0.5)), ("hard", (30, 60), (0.5, 1))]
+        ("kind", "degrees", "lengths"),
+        [("near", (0, 5), (0, 0.1)), ("easy", (0, 30), (0, 0.5)), ("hard", (30, 60), (0.5, 1))],
     )
     @given(seed=st.integers(0, 1000))
     def test_world_frame(self, kind, degrees, lengths, seed):
@@ -318,8 +323,36 @@ class TestStarts:
         rng = np.random.default_rng(0)
         assert start_pose("none", poses()[0], self.UNITS, self.CAMERAS, rng) is None
         with pytest.raises(UnknownName, match="inplace"):
-            start_pose("near", poses()[0], self.UNITS, self.CAMERAS, rng)
-        assert KINDS == ("none", "easy", "hard", "inplace", "random")
+            start_pose("far", poses()[0], self.UNITS, self.CAMERAS, rng)
+        assert KINDS == ("none", "near", "easy", "hard", "pnerf", "inplace", "random")
+
+    def test_a_case_by_hand(self):
+        """Quarter turns about x and then z carry (0, -1, 0) to (0, 0, -1) and leave it there."""
+
+        class Drawn:
+            def choice(self, signs, count):
+                return np.array([1.0, 1, 1, 1, -1, 1])
+
+            def uniform(self, low, high, count):
+                return np.array([90.0, 0.0, 90.0]) if high == 60 else np.array([0.5, 0.75, 1.0])
+
+        truth = look_at(np.array([1.0, -4.0, 0.5]), np.array([1.0, 0.0, 0.5]), UP)  # focus at (1, -2, 0.5), 2 away
+        start = start_pose("hard", truth, self.UNITS, self.CAMERAS, Drawn())  # type: ignore[arg-type]
+        assert start is not None
+        # normalized by 0.5: offset (0, -1, 0) -> (0, 0, -1), then shifted by (0.5, -0.75, 1)
+        assert start.position_in_world == pytest.approx(np.array([1.0, -2, 0.5]) + 2 * np.array([0.5, -0.75, 0.0]))
+        # it looked along +y: Rx takes that to +z, where Rz leaves it
+        assert start.axis_in_world == pytest.approx([0.0, 0.0, 1.0])
+
+    @given(seed=st.integers(0, 1000))
+    def test_pnerf_turns_in_place(self, seed):
+        start = start_pose("pnerf", poses()[1], self.UNITS, self.CAMERAS, np.random.default_rng(seed))
+        assert start is not None
+        shift = (start.position_in_world - poses()[1].position_in_world) * 0.5
+        assert np.all(np.abs(shift) <= 0.25)
+        r = start.world_from_camera[:3, :3] @ poses()[1].world_from_camera[:3, :3].T
+        angles = np.degrees([np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])])
+        assert np.all(np.abs(angles) <= 15)
 
 
 def dotted_shot() -> tuple[Shot, np.ndarray]:
@@ -337,7 +370,17 @@ def dotted_shot() -> tuple[Shot, np.ndarray]:
 class TestModifications:
     @pytest.mark.parametrize(
         "specs",
-        [["roll=90"], ["roll=-90"], ["roll=180"], ["roll=23"], ["crop=0.8"], ["roll=45", "crop=0.9"], ["jpeg=90"]],
+        [
+            ["roll=90"],
+            ["roll=-90"],
+            ["roll=180"],
+            ["roll=23"],
+            ["crop=0.8"],
+            ["roll=45", "crop=0.9"],
+            ["jpeg=90"],
+            ["scale=1.6"],
+            ["scale=0.75", "roll=10"],
+        ],
     )
     def test_truth_goes_with_the_pixels(self, specs):
         """The dots must lie where the new camera projects the points from the new pose."""
@@ -373,8 +416,8 @@ class TestModifications:
         assert np.allclose(modified(shot, ["gamma=2"], rng).rgb, 0.16)
         assert np.allclose(modified(shot, ["blur=3"], rng).rgb, 0.4, atol=1e-6)
         assert modified(shot, ["noise=0.1"], rng).rgb.std() == pytest.approx(0.1, rel=0.05)
-        covered = np.any(modified(shot, ["occlude=0.3"], rng).rgb != np.float32(0.4), axis=2).mean()
-        assert 0.28 < covered < 0.4  # squares of up to 10 x 10 of 2400 pixels overshoot a little
+        warm = modified(shot, ["white_balance=1.25"], rng).rgb
+        assert np.allclose(warm[0, 0], [0.5, 0.4, 0.32])
         assert np.allclose(modified(shot, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
 
     def test_blur_has_its_width(self):
@@ -391,6 +434,7 @@ class TestModifications:
     def test_all_take_both_ends_of_their_range(self, name):
         shot, _ = dotted_shot()
         for value in MODIFICATIONS[name][:2]:
+            shot = replace(shot, occluders=(shot.rgb,))
             found = modified(shot, [f"{name}={value}"], np.random.default_rng(0))
             assert found.rgb.dtype == np.float32
             assert np.isfinite(found.rgb).all()
@@ -398,11 +442,45 @@ class TestModifications:
 
     def test_the_file_is_without_loss(self, tmp_path):
         (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
-        data, camera = photo_bytes(one, ("crop=1",), (0.0, 0.0, 0.0), 0)
-        assert camera.intrinsics == one.camera.intrinsics
-        assert np.array_equal(read_query(data).rgb, read_query(one.path.read_bytes()).rgb)
-        same, _ = photo_bytes(one, (), (0.0, 0.0, 0.0), 0)
-        assert same == one.path.read_bytes()
+        cropped = sent(one, ("crop=1",), (0.0, 0.0, 0.0), 0)
+        assert cropped.truth.intrinsics == cropped.told == one.camera.intrinsics
+        assert np.array_equal(read_query(cropped.data).rgb, read_query(one.path.read_bytes()).rgb)
+        assert sent(one, (), (0.0, 0.0, 0.0), 0).data == one.path.read_bytes()
+
+    def test_padding_is_transparent(self, tmp_path):
+        """So it has the scene's background in the query, and none of it is taken for the photo."""
+        (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
+        turned = sent(one, ("roll=30",), (0.0, 0.0, 0.0), 0)
+        size = (turned.truth.intrinsics.width, turned.truth.intrinsics.height)
+        assert Image.open(io.BytesIO(turned.data)).size == size
+        alpha = np.asarray(Image.open(io.BytesIO(turned.data)).convert("RGBA"))[..., 3]
+        assert alpha[0, 0] == 0
+        assert (alpha > 0).sum() == pytest.approx(64 * 48 * 60.5**2 / 60 / 61, rel=0.1)  # less the rim
+        shown = read_query(turned.data, intrinsics=turned.told, background_rgb=(0.0, 1.0, 0.0)).rgb
+        assert shown[0, 0].tolist() == [0, 255, 0]
+
+    @pytest.mark.parametrize("share", [0.05, 0.2, 0.35, 0.9])
+    def test_occlusion_covers_exactly_its_share_with_the_other_scene(self, share):
+        rng = np.random.default_rng(1)
+        rgb = np.full((48, 64, 3), 2.0, np.float32)  # no photo has that
+        other = rng.uniform(0, 1, (30, 40, 3)).astype(np.float32)
+        shot = Shot(rgb, LENS, poses()[0], occluders=(other,))
+        places = []
+        for seed in range(3):
+            found = modified(shot, [f"occlusion={share}"], np.random.default_rng(seed)).rgb
+            covered = np.all(found != 2.0, axis=2)
+            assert covered.sum() == round(share * 48 * 64)
+            known = {tuple(p) for p in other.reshape(-1, 3).tolist()}
+            assert {tuple(p) for p in found[covered].tolist()} <= known
+            places.append(covered)
+        assert not np.array_equal(places[0], places[1])
+
+    def test_a_false_focal_length_is_told_and_the_truth_kept(self, tmp_path):
+        (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
+        false = sent(one, ("focal=1.1",), (0.0, 0.0, 0.0), 0)
+        assert false.truth == one.camera
+        assert (false.told.fx, false.told.fy) == pytest.approx((66.0, 67.1))
+        assert np.array_equal(read_query(false.data).rgb, read_query(one.path.read_bytes()).rgb)
 
 
 class TestRoom:

@@ -114,6 +114,7 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         (("localize", tmp_path / "none.jpg", "--scene", room), "none.jpg"),
         (("localize", text, "--scene", room), "not a JPEG"),
         (("localize", photo, "--scene", room, "--estimator", "magic"), "magic"),
+        (("localize", photo, "--scene", room, "--matcher", "magic"), "sift, xfeat, xfeat_lighterglue"),
         (("localize", photo, "--scene", room, "--intrinsics", '{"fx": 0}'), "intrinsics"),
         (("localize", photo, "--scene", room, "--intrinsics", "none.json"), "none.json"),
         (("localize", photo, "--scene", room, "--prior", "{"), "prior"),
@@ -152,13 +153,15 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
 
     monkeypatch.setattr(service.bench.localize, "run", run)
     flags = "--estimator view_index --start hard --trials 3 --seed 4 --intrinsics withheld --cameras ignored"
-    flags += " --budget-renders 9"
+    flags += " --budget-renders 9 --matcher sift --background white"
     written = tmp_path / "out.json"
     code, told, complaint = splatfix(
         "bench",
         "localize",
         tmp_path,
         *flags.split(),
+        "--occluders",
+        tmp_path,
         "--modify",
         "blur=2",
         "--options",
@@ -172,8 +175,9 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
     assert asked.pop("budget") == service.bench.localize.Budget(None, 9)
     assert asked.pop("cache_dir") == Path(os.environ["SPLATFIX_CACHE_DIR"])
     assert asked == {
-        "folder": tmp_path, "estimator": "view_index", "start": "hard", "trials": 3, "seed": 4,
+        "folder": tmp_path, "estimator": "view_index", "matcher": "sift", "start": "hard", "trials": 3, "seed": 4,
         "intrinsics": "withheld", "cameras": "ignored", "modify": ("blur=2",),
+        "data": None, "layout": "auto", "background": "white", "occluders": tmp_path,
     }  # fmt: skip
     assert json.loads(written.read_text())["per_query"] == [{"photo": "a"}]
     assert "success_5deg_0p05" in told

@@ -222,7 +222,7 @@ class TestDistortion:
         camera = Intrinsics(*size, 200.0, 200.0, 121.0, 88.0, "OPENCV", (-0.15, 0.04, 0.003, -0.002))
         rows, columns = np.mgrid[: size[1], : size[0]]
         coordinates = np.stack([columns, rows, np.zeros_like(rows)], -1).astype(np.uint8)
-        rgb, straight = undistorted(coordinates, camera)
+        rgb, straight, _ = undistorted(coordinates, camera)
         x, y = (columns + 0.5 - straight.cx) / straight.fx, (rows + 0.5 - straight.cy) / straight.fy
         taken = colmap_pixels(np.stack([x, y], -1).reshape(-1, 2), camera).reshape(*size[::-1], 2) - 0.5
         inside = (taken > 2).all(-1) & (taken < np.array(size) - 3).all(-1)
@@ -233,14 +233,14 @@ class TestDistortion:
 
     def test_what_the_polynomial_folds_back_is_black(self):
         camera = Intrinsics(400, 300, 150.0, 150.0, 200.0, 150.0, "SIMPLE_RADIAL", (-0.25,))
-        rgb, _ = undistorted(np.full((300, 400, 3), 200, np.uint8), camera)
+        rgb, *_ = undistorted(np.full((300, 400, 3), 200, np.uint8), camera)
         # r (1 - r^2 / 4) grows up to r = sqrt(4 / 3).
         assert rgb[150, int(200 + 150 * 1.1)].min() > 150
         assert rgb[150, int(200 + 150 * 1.2)].max() == 0
 
     def test_no_distortion_leaves_the_pixels(self):
         camera = Intrinsics(80, 60, 50.0, 50.0, 40.0, 30.0, "OPENCV", (0.0, 0.0, 0.0, 0.0))
-        rgb, straight = undistorted(gradient(), camera)
+        rgb, straight, _ = undistorted(gradient(), camera)
         assert np.array_equal(rgb, gradient())
         assert straight.model == "PINHOLE"
 

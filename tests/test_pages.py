@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
+import re
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browsing import NEEDS_CHROMIUM, PATIENCE_MS, free_port, launched, opened, served
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
 
@@ -59,18 +62,20 @@ def until(condition, seconds: float = 90) -> None:
         time.sleep(0.05)
 
 
-def drop(page: Page, data: bytes, name: str) -> None:
-    """Drop a file on the page, as the mouse does."""
+def drop(page: Page, data: bytes, name: str, *, paste: bool = False) -> None:
+    """Drop a file on the page, as the mouse does, or paste it."""
     page.evaluate(
-        """([base64, name]) => {
+        """([base64, name, paste]) => {
             const bytes = Uint8Array.from(atob(base64), letter => letter.charCodeAt(0));
             const dataTransfer = new DataTransfer();
             dataTransfer.items.add(new File([bytes], name, { type: "image/jpeg" }));
             const over = type => new DragEvent(type, { dataTransfer, bubbles: true, cancelable: true });
-            document.querySelector("main").dispatchEvent(over("dragover"));
-            document.querySelector("main").dispatchEvent(over("drop"));
+            const pasted = new ClipboardEvent("paste", { clipboardData: dataTransfer, bubbles: true });
+            for (const event of paste ? [pasted] : [over("dragover"), over("drop")]) {
+                document.querySelector("main").dispatchEvent(event);
+            }
         }""",
-        [base64.b64encode(data).decode(), name],
+        [base64.b64encode(data).decode(), name, paste],
     )
 
 
@@ -131,6 +136,64 @@ def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
         words = slice(0, -1) if kind == "colmap" else slice(0, None)
         np.testing.assert_allclose(np.float64(ours[words]), np.float64(theirs[words]), atol=1e-6)
         assert kind == "tum" or ours[-1] == theirs[-1] == PHOTO.name
+
+
+def test_a_pasted_photo_that_shows_nothing_is_refused_with_reason_and_hint(page: Page, url: str) -> None:
+    page.get_by_role("radio").first.wait_for()
+    fog = io.BytesIO()
+    Image.linear_gradient("L").resize((320, 240)).convert("RGB").save(fog, "JPEG")
+    drop(page, fog.getvalue(), "fog.jpg", paste=True)
+    page.locator(".badge.not_localized").wait_for()
+    result = job_of(page, url)["result"]
+    lead = page.locator(".lead")
+    expect(lead).to_contain_text(result["reason"].replace("_", " "), ignore_case=True)
+    expect(lead).to_contain_text(result["hint"])
+    expect(page.get_by_text("The best guess")).to_be_visible()
+    expect(page.get_by_role("link", name="COLMAP")).to_have_count(0)
+    _audit(page)
+
+
+def test_the_answer_can_be_copied_and_taken_along(page: Page, url: str) -> None:
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    job = posted(url, PHOTO.read_bytes(), {"scene": "studio"})
+    page.goto(f"{url}/#/jobs/{job['id']}")
+    page.get_by_role("button", name="Copy World from camera, OpenCV axes").click()
+    page.get_by_text("Copied", exact=True).wait_for()
+    copied = numbers(page.evaluate("navigator.clipboard.readText()")).reshape(4, 4)
+    np.testing.assert_allclose(copied, job["result"]["pose"]["world_from_camera"]["matrix"], atol=6e-10)
+    for link, kind in (("JSON", "self"), ("Trace", "trace")):
+        with page.expect_download() as waited:
+            page.get_by_role("link", name=link, exact=True).click()
+        taken = json.loads(waited.value.path().read_text())
+        assert taken == httpx.get(f"{url}{job['links'][kind]}", trust_env=False).json()
+    with page.expect_download() as waited:
+        page.get_by_role("link", name="nerfstudio", exact=True).click()
+    opengl = json.loads(waited.value.path().read_text())["transform_matrix"]
+    np.testing.assert_allclose(opengl, job["result"]["pose"]["opengl"]["world_from_camera"]["matrix"], atol=1e-12)
+
+
+def test_who_has_no_photo_can_try_a_view_of_the_scene(page: Page) -> None:
+    page.get_by_role("radio", name="room").check()
+    page.get_by_role("button", name="Try a view of the scene").click()
+    page.locator(".badge.localized").wait_for()
+    # The picture's pose was sent as the truth; 0.002 seen.
+    assert float(fact(page, "Error of rotation").rstrip("°")) < 0.1
+
+
+def test_a_running_job_can_be_watched_and_cancelled(page: Page) -> None:
+    page.get_by_role("radio", name="room").check()
+    page.get_by_text("Intrinsics, prior, estimator").click()
+    page.get_by_role("combobox").first.select_option("mc_do")
+    page.get_by_label(re.compile("^hypotheses")).fill("4096")
+    page.get_by_label("refinement steps").fill("10000")
+    page.set_input_files("#photo", PHOTO)
+    expect(page.locator(".line")).to_contain_text("step 1")
+    expect(page.get_by_role("link", name="Watch it in the viewer")).to_have_attribute(
+        "href", re.compile("/viewer/jobs/")
+    )
+    _audit(page)
+    page.get_by_role("button", name="Cancel").click()
+    page.locator(".badge.cancelled").wait_for()
 
 
 def test_the_viewer_shows_how_the_pose_was_found(page: Page, url: str) -> None:

@@ -237,7 +237,7 @@ def match_view(photo_px: np.ndarray, render_px: np.ndarray, camera: Camera) -> m
     """Matches that all agree, as they are seen by the camera that they refer to."""
     found = MatchVectors(photo_px, render_px, np.ones(len(photo_px), bool), camera)
     depth = np.ones((camera.intrinsics.height, camera.intrinsics.width), np.float32)
-    return measure.seen(measure.lifted(found, depth, 0), camera.pose, camera.intrinsics, 0)
+    return measure.seen(measure.lifted(found, depth, 0), camera, 0)
 
 
 def test_colours_tell_inliers_and_residuals() -> None:
@@ -267,6 +267,17 @@ def test_overlays_compare_pixel_by_pixel() -> None:
     np.testing.assert_array_equal(tiles, expected)
     both = re.findall(r"base64,([^']+)", draw.flicker_html(photo, render))
     assert [draw.decode(base64.b64decode(data))[5, 5, 0] for data in both] == [100, 180]
+
+
+def test_arrows_go_from_the_renders_point_to_the_photos() -> None:
+    camera = Camera(Intrinsics(400, 300, 300, 300, 200, 150), orbit(0))
+    view = match_view(np.float32([[300, 100]]), np.float32([[100, 200]]), camera)
+    picture = draw.flow(np.zeros((150, 200, 3), np.uint8), view, np.uint8([draw.INLIER]))
+    rows, columns = np.nonzero(picture[..., 1] > 150)  # 800 wide: all at twice the photo's pixels
+    assert (columns.min(), columns.max()) == (pytest.approx(200, abs=4), pytest.approx(600, abs=4))
+    assert (rows.min(), rows.max()) == (pytest.approx(200, abs=8), pytest.approx(400, abs=4))
+    at_photo, at_render = (np.hypot(columns - x, rows - y) < 14 for x, y in ((600, 200), (200, 400)))
+    assert at_photo.sum() > 2 * at_render.sum()  # the dot and the arrow's tip
 
 
 def test_decoding_and_scaling() -> None:
@@ -315,7 +326,7 @@ def test_lifted_matches_come_back_to_their_pixels(share: float, depth: float, tu
     np.testing.assert_allclose(project(in_camera, camera.intrinsics), px[known], atol=1e-3)
     # Seen from another pose by another step, residuals are what the renderer's own projection says.
     other = orbit(share + turn)
-    view = measure.seen(found, other, PHOTO, 7)
+    view = measure.seen(found, Camera(PHOTO, other), 7)
     assert view.carried_from == 3
     there = transformed(other.camera_from_world, found.points_in_world[known])
     before = there[:, 2] > 0

@@ -21,7 +21,7 @@ import viser
 from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
-from service.types import Reason, Status
+from service.types import Lens, Reason, Status
 from viewer import app, draw, private, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble
@@ -127,13 +127,14 @@ def test_layers_can_be_hidden_and_stay_hidden(fake: FakeService, viewer: Viewer)
         browser.wait(lambda: "/trajectory/current" in browser.nodes, "the job")
         (client,) = viewer.server.get_clients().values()
         shown = lambda: {n: h.visible for n, h in client.scene._handle_from_node_name.items()}  # noqa: E731
+        browser.set("exact render at rest", False)  # it would hide the splats
         browser.set("trajectory", False)
         browser.set("training cameras", False)
         browser.wait(lambda: not shown()["/trajectory/current"] and not shown()["/training cameras/cameras"], "hiding")
         job.add(records(3)[2])
         browser.wait(lambda: browser.widget("step")["value"] == 2, "the next record")
         browser.wait(lambda: not any(v for n, v in shown().items() if n.startswith("/trajectory/")), "still hidden")
-        assert shown()["/splats/splats"]
+        browser.wait(lambda: shown()["/splats/splats"], "the splats")
 
 
 def test_nothing_grows_however_long_a_job_is(fake: FakeService, viewer: Viewer) -> None:
@@ -210,6 +211,27 @@ def _click(browser: FakeBrowser, origin: np.ndarray, direction: np.ndarray) -> N
         screen_pos=[[0.5, 0.5]],
         modifier=None,
     )
+
+
+def test_a_camera_is_drawn_with_the_lens_that_its_step_found(fake: FakeService, viewer: Viewer) -> None:
+    job = fake.job("j", 1)
+    job.add(replace(records(2)[1], lens=Lens(focal_factor=2.0)))
+    job.finish()
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: browser.widget("step")["value"] == 1, "the last step")
+        for index, focal in ((0, 80.0), (1, 160.0)):
+            browser.set("step", index)
+            seen = 2 * np.arctan(32 / focal)
+            browser.wait(lambda seen=seen: _fov(browser) == pytest.approx(seen), f"step {index}")
+        browser.set("look through this camera", True)
+        (client,) = viewer.server.get_clients().values()
+        fitted = 2 * np.arctan(48 / 160 / (800 / 600))  # the photo is wider than the browser: its width fits
+        browser.wait(lambda: client.camera.fov == pytest.approx(fitted), "its view")
+
+
+def _fov(browser: FakeBrowser) -> float | None:
+    node = browser.nodes.get("/trajectory/current")
+    return node and node["props"]["fov"]
 
 
 def test_a_click_on_a_frustum_jumps_there(fake: FakeService, viewer: Viewer) -> None:

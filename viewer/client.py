@@ -98,6 +98,10 @@ class JobView:
     answer: Answer | None
     """None until it has ended."""
 
+    def camera(self, record: IterationRecord) -> Camera:
+        """Return the photo's camera as a step has it: its pose, its estimate of the lens."""
+        return Camera(self.photo.corrected(record.lens), record.pose)
+
 
 class Service:
     """One running splatfix service. Safe to use from several threads."""

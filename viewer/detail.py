@@ -10,11 +10,11 @@ from typing import cast
 from service.types import IterationRecord
 from viewer.charts import curves_html, stages_html, vectors_html
 from viewer.client import ServiceTrouble
-from viewer.draw import ColourBy, Mode, beside, flicker_html, match_colours, overlaid, reduced
+from viewer.draw import ColourBy, Mode, beside, flicker_html, flow, match_colours, overlaid, reduced
 from viewer.feed import JobFeed
 from viewer.measure import MatchView, seen
 from viewer.panel import Panel
-from viewer.playback import caption_html, record_html, small_html
+from viewer.playback import caption_html, flow_caption_html, record_html, small_html
 from viewer.stage import Stage
 
 _TEXTURE_PX = 512
@@ -52,7 +52,7 @@ class Detail:
             return
         photo = feed.photo() if self._shown is None else None
         texture = None if photo is None else reduced(photo, _TEXTURE_PX)
-        self._stage.show_current(record.pose, job.photo, texture)
+        self._stage.show_current(job.camera(record), texture)
         weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
         self._stage.show_candidates(next(weighed, None), job.photo)
         self._shown = feed.id, index
@@ -64,6 +64,7 @@ class Detail:
         record = feed.records[index]
         try:
             view = self._matches(feed, record)
+            self._flow(feed, record, view)
             self._picture(feed, record, view)
         except (ServiceTrouble, ValueError) as error:
             self._panel.caption.content = small_html(f"There is no picture of this step: {error}")
@@ -73,16 +74,24 @@ class Detail:
     def _matches(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
         """Show the match vectors, 3D and histograms; return them."""
         source = feed.matches(record.index)
-        view = seen(source, record.pose, feed.job.photo, record.index) if source and feed.job else None
+        view = seen(source, feed.job.camera(record), record.index) if source and feed.job else None
         colours = None if view is None else match_colours(view, self._colour_by)
         self._stage.show_matches(view, colours)
-        self._panel.vectors.content = vectors_html(view)
+        self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
         return view
+
+    def _flow(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
+        """Draw the match vectors over the photo, or over what it should look like."""
+        self._panel.flow.visible = view is not None
+        if view is not None:
+            photo = feed.photo()
+            ground = feed.render(record.index, matched=False) if photo is None else photo
+            self._panel.flow.image = flow(ground, view, match_colours(view, self._colour_by))
 
     def _picture(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
         """Compose photo and render."""
         panel, mode = self._panel, self.mode
-        panel.matches.visible = panel.colour_by.visible = mode == "beside"
+        panel.matches.visible = mode == "beside"
         panel.weight.visible, panel.flicker.visible = mode == "blend", mode == "flicker"
         panel.picture.visible = mode != "flicker"
         if mode != "beside" or not panel.matches.value:

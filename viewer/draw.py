@@ -25,6 +25,7 @@ _RESIDUAL_RAMP = np.array([INLIER, (225, 225, 80), OUTLIER], np.float64)
 # Dull blue to bright yellow, lightness rising all the way: readable on a dark ground and without hue.
 _RAMP = np.array([(72, 84, 150), (44, 130, 165), (60, 175, 150), (150, 205, 90), (255, 225, 60)], np.float64)
 _GAP_PX = 8
+_TIP_PX = 12
 _TILES = 10
 """Of a checkerboard, in a row."""
 _WIDTH_PX, _HEIGHT_PX = 800, 1160
@@ -143,15 +144,32 @@ def beside(
     return picture
 
 
+def flow(
+    ground: UInt8[np.ndarray, "h w 3"], view: MatchView, colours: UInt8[np.ndarray, "m 3"]
+) -> UInt8[np.ndarray, "c d 3"]:
+    """Return all match vectors in the photo: arrows from where the render has a point to where the photo has it.
+
+    `ground` is the photo, or what stands for it, in any size; it is dimmed.
+    """
+    k = view.photo_camera.intrinsics
+    picture = _fitted(ground, _WIDTH_PX, _HEIGHT_PX)
+    picture = cv2.cvtColor((0.45 * cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    scale = np.array([picture.shape[1] / k.width, picture.shape[0] / k.height])
+    starts, ends = (view.photo_px - view.vectors_px) * scale, view.photo_px * scale
+    lengths = np.linalg.norm(ends - starts, axis=1)
+    for i in np.argsort(view.inlier, kind="stable"):
+        ink = tuple(map(int, colours[i]))
+        if 3 < lengths[i] < 10 * _WIDTH_PX:
+            tip = min(0.5, _TIP_PX / lengths[i])
+            cv2.arrowedLine(picture, _fixed(starts[i]), _fixed(ends[i]), ink, 2, cv2.LINE_AA, _SHIFT, tip)
+        cv2.circle(picture, _fixed(ends[i]), 3 << _SHIFT, ink, -1, cv2.LINE_AA, _SHIFT)
+    return _pasted((picture, ((_WIDTH_PX - picture.shape[1]) // 2, 0)))
+
+
 def score_colours(scores: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:
     """Return colours from dull blue (worst) to yellow (best); equal scores are all best."""
     spread = np.ptp(scores) if len(scores) else 0.0
     share = (scores - scores.min()) / spread if spread > 0 else np.ones(len(scores))
-    return ramp(share)
-
-
-def ramp(share: Float[np.ndarray, "k"]) -> UInt8[np.ndarray, "k 3"]:
-    """Return colours for values 0..1."""
     return _interpolated(_RAMP, share)
 
 

@@ -49,6 +49,7 @@ class JobFeed:
         self._service = service
         self._stop = threading.Event()
         self._photo: UInt8[np.ndarray, "h w 3"] | None = None
+        self._asked_photo = False
         self._renders: OrderedDict[tuple[int, bool], UInt8[np.ndarray, "h w 3"]] = OrderedDict()
         self._lifted: OrderedDict[int, Lifted] = OrderedDict()
         self._lock = threading.Lock()
@@ -61,16 +62,17 @@ class JobFeed:
         self._stop.set()
 
     def photo(self) -> UInt8[np.ndarray, "h w 3"] | None:
-        """Return the job's photo, fetched once; None: it was deleted after the job.
+        """Return the job's photo, asked for once; None: it was deleted after the job.
 
         Raises ServiceTrouble, ValueError.
         """
-        if self._photo is None:
+        if not self._asked_photo:
             try:
                 self._photo = decode(self._service.photo(self.id))
             except ServiceTrouble as trouble:
                 if trouble.status not in (404, 410):
                     raise
+            self._asked_photo = True
         return self._photo
 
     def render(self, index: int, *, matched: bool) -> UInt8[np.ndarray, "h w 3"]:

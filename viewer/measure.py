@@ -33,6 +33,8 @@ class MatchView:
     render_px: Float64[np.ndarray, "m 2"]
     """In the picture of `render_camera`; NaN behind the camera."""
     render_camera: Camera
+    photo_camera: Camera
+    """The photo's, as the step has it."""
     inlier: Bool[np.ndarray, "m"]
     residual_px: Float64[np.ndarray, "m"]
     """Between the photo's point and the scene's point seen from the step's pose, in photo pixels; NaN: unknown."""
@@ -56,11 +58,10 @@ def lifted(matches: MatchVectors, depth: Float32[np.ndarray, "h w"], index: int)
     return Lifted(matches, unprojected(matches.render_px, z, camera), index)
 
 
-def seen(source: Lifted, pose: Pose, photo: Intrinsics, index: int) -> MatchView:
-    """Return the matches as the step `index` with this pose sees them."""
+def seen(source: Lifted, at_pose: Camera, index: int) -> MatchView:
+    """Return the matches as the step `index`, which gives the photo this camera, sees them."""
     matches = source.matches
     photo_px = matches.photo_px.astype(np.float64)
-    at_pose = Camera(photo, pose)
     seen_px = projected(source.points_in_world, at_pose)
     carried = source.index != index
     if carried:  # matched with another picture: where the points are in this one
@@ -73,9 +74,10 @@ def seen(source: Lifted, pose: Pose, photo: Intrinsics, index: int) -> MatchView
         photo_px=photo_px,
         render_px=render_px,
         render_camera=render_camera,
+        photo_camera=at_pose,
         inlier=matches.inlier,
         residual_px=np.linalg.norm(photo_px - seen_px, axis=1),
-        vectors_px=photo_px - _as_if(photo, render_px, render_camera.intrinsics),
+        vectors_px=photo_px - _as_if(at_pose.intrinsics, render_px, render_camera.intrinsics),
         segments=segments[drawn].astype(np.float32),
         drawn=drawn,
         carried_from=source.index if carried else None,

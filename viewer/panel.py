@@ -42,11 +42,13 @@ class Panel:
         self.replay = gui.add_button("save as replay file", disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
             self.layers = {layer: gui.add_checkbox(layer, True) for layer in get_args(Layer)}
+            self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
                 "exact render at rest",
                 True,
                 hint="When the view rests, the service's renderer draws it: what the estimator sees.",
             )
+            self.legend = gui.add_html("")
             self.scene = gui.add_html("")
         self._add_window(gui)
 
@@ -59,8 +61,8 @@ class Panel:
             self.caption = gui.add_html("")
             self.matches = gui.add_checkbox("match lines", True)
             self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
-            self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
         with self.window.add_tab("match vectors"):
+            self.flow = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88, visible=False)
             self.vectors = gui.add_html("")
         with self.window.add_tab("curves"):
             self.curves = gui.add_html("")

@@ -10,7 +10,7 @@ import numpy as np
 
 from service.types import IterationRecord, Pose
 from viewer.client import Answer, JobSummary, JobView
-from viewer.draw import INLIER, OUTLIER, ColourBy, Mode
+from viewer.draw import INLIER, OUTLIER, ColourBy, Mode, score_colours
 from viewer.measure import MatchView, pose_error
 
 STATUS_COLOURS = {
@@ -22,6 +22,8 @@ STATUS_COLOURS = {
     "interrupted": (140, 140, 140),
 }
 PENDING_COLOUR = (40, 120, 200)
+INITIAL_COLOUR, CURRENT_COLOUR, TRUTH_COLOUR = (150, 150, 150), (255, 140, 0), (240, 240, 240)
+TRAINING_COLOUR = (70, 105, 160)
 
 
 @dataclass(slots=True)
@@ -116,9 +118,9 @@ def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
 
 _CAPTIONS: dict[Mode, str] = {
     "beside": "photo, and render at this step's pose",
-    "blend": "photo and render at this step's pose, blended",
+    "blend": "photo and render at this step's pose on top of one another",
     "checker": "photo and render at this step's pose, in turns: edges should run on from tile to tile",
-    "difference": "difference of photo and render at this step's pose, doubled",
+    "difference": "of photo and render at this step's pose, doubled: black is agreement",
     "flicker": "photo and render at this step's pose, one after the other: what jumps is off",
 }
 
@@ -126,21 +128,52 @@ _CAPTIONS: dict[Mode, str] = {
 def caption_html(mode: Mode, view: MatchView | None, colour_by: ColourBy = "inlier") -> str:
     """What the picture shows."""
     if view is None:
-        return _small(_CAPTIONS[mode])
+        return _small(f"<b>{mode}</b>: {_CAPTIONS[mode]}")
     if view.carried_from is None:
         what = "photo, and the render that was matched"
     else:
         what = f"photo, and render at this step's pose with the matches of step {view.carried_from}"
+    return _small(f"<b>{mode}</b>: {what}; lines: {_colours_said(view, colour_by)}")
+
+
+def flow_caption_html(view: MatchView | None, colour_by: ColourBy) -> str:
+    """What the picture of the match vectors shows."""
+    if view is None:
+        return ""
+    of = "" if view.carried_from is None else f" of step {view.carried_from}"
+    return _small(
+        f"matches{of}, each from where the render has it to where the photo has it: {_colours_said(view, colour_by)}"
+    )
+
+
+def _colours_said(view: MatchView, colour_by: ColourBy) -> str:
     if colour_by == "residual":
         known = view.residual_px[np.isfinite(view.residual_px)]
         middle = f"; median {np.median(known):.2g} px" if len(known) else ""
-        colours = f"off by {_coloured('½ px', INLIER)} to {_coloured('50 px', OUTLIER)}{middle}"
-    else:
-        inliers = int(view.inlier.sum())
-        colours = (
-            f"{_coloured(f'{inliers} agree', INLIER)}, {_coloured(f'{len(view.inlier) - inliers} do not', OUTLIER)}"
-        )
-    return _small(f"{what}; lines: {colours}")
+        return f"off by {_coloured('½ px', INLIER)} to {_coloured('50 px', OUTLIER)}{middle}"
+    inliers = int(view.inlier.sum())
+    return f"{_coloured(f'{inliers} agree', INLIER)}, {_coloured(f'{len(view.inlier) - inliers} do not', OUTLIER)}"
+
+
+def legend_html(answer: Answer | None, *, truth: bool) -> str:
+    """The colours of the cameras in 3D."""
+    cameras = [("start", INITIAL_COLOUR), ("this step", CURRENT_COLOUR)]
+    if answer:
+        cameras.append(("answer", answer_colour(answer)))
+    if truth:
+        cameras.append(("true", TRUTH_COLOUR))
+    cameras.append(("training", TRAINING_COLOUR))
+    named = " ".join(f"<span style='white-space:nowrap'>{_swatch(f'rgb{c}')}{name}</span>" for name, c in cameras)
+    ramp = ",".join(f"rgb{tuple(map(int, colour))}" for colour in score_colours(np.linspace(0, 1, 5)))
+    scores = f"{_swatch(f'linear-gradient(90deg,{ramp})', '2.4em')}candidates, worst to best score"
+    return _small(f"cameras: {named}<br>{scores}")
+
+
+def _swatch(ground: str, width: str = ".7em") -> str:
+    return (
+        f"<i style='display:inline-block;width:{width};height:.7em;border-radius:2px;margin:0 .3em;"
+        f"background:{ground}'></i>"
+    )
 
 
 def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:

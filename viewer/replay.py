@@ -69,11 +69,11 @@ def _show(stage: Stage, feed: JobFeed, index: int) -> None:
     if job is None:
         return
     render = reduced(feed.render(index, matched=False), _TEXTURE_PX)
-    stage.show_current(record.pose, job.photo, render)
+    stage.show_current(job.camera(record), render)
     weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
     stage.show_candidates(next(weighed, None), job.photo)
     source = feed.matches(index)
-    view = seen(source, record.pose, job.photo, index) if source else None
+    view = seen(source, job.camera(record), index) if source else None
     stage.show_matches(view, None if view is None else match_colours(view, "inlier"))
 
 

@@ -23,7 +23,7 @@ from viewer.draw import Mode
 from viewer.exact import ExactView
 from viewer.feed import JobFeed, Library
 from viewer.panel import NO_JOB, NO_SCENE, Panel
-from viewer.playback import Playback, headline_html, job_label, scene_html
+from viewer.playback import Playback, headline_html, job_label, legend_html, scene_html
 from viewer.replay import replay_html
 from viewer.stage import Stage
 
@@ -200,6 +200,7 @@ class Session:
         self.panel.headline.content = headline_html(feed.job, count, feed.trouble)
         if feed.job is None:
             return
+        self.panel.legend.content = legend_html(feed.job.answer, truth=feed.job.truth is not None)
         newest = feed.records[count - 1].pose if count else None
         self._show_scene(feed.job.scene, newest)
         self._playback.grow(count)
@@ -287,7 +288,7 @@ class Session:
     def _look_through(self) -> None:
         feed, index = self._feed, self._playback.index
         if feed is not None and feed.job is not None and index < len(feed.records):
-            self._look(Camera(feed.job.photo, feed.records[index].pose))
+            self._look(feed.job.camera(feed.records[index]))
 
     def _look(self, camera: Camera) -> None:
         self._opened = 0.0  # from now on the view is the user's

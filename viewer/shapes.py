@@ -145,6 +145,14 @@ def frusta(
     return in_world[:, _EDGES].reshape(-1, 2, 3).astype(np.float32)
 
 
+def frustum_form(photo: Intrinsics, depth: float) -> tuple[float, float, float]:
+    """Return what viser calls field of view, aspect and scale of a frustum of this depth."""
+    half_width, half_height = 0.5 * photo.width / photo.fx, 0.5 * photo.height / photo.fy
+    # Its scale is the cube root of the pyramid's volume (times 3/4), not its depth.
+    scale = depth * float(np.cbrt(half_width * half_height / 3))
+    return float(2 * np.arctan(half_height)), half_width / half_height, scale
+
+
 def frustum_colours(colours: UInt8[np.ndarray, "k 3"]) -> UInt8[np.ndarray, "e 2 3"]:
     """Return a colour for both ends of every edge of `frusta`."""
     return np.repeat(colours, 2 * len(_EDGES), 0).reshape(-1, 2, 3)

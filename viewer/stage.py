@@ -21,12 +21,10 @@ from viewer.client import JobView
 from viewer.draw import score_colours
 from viewer.feed import SceneContent
 from viewer.measure import MatchView
-from viewer.playback import answer_colour
+from viewer.playback import CURRENT_COLOUR, INITIAL_COLOUR, TRAINING_COLOUR, TRUTH_COLOUR, answer_colour
 
 Layer = Literal["splats", "training cameras", "trajectory", "candidates", "match vectors"]
 
-_INITIAL, _CURRENT, _TRUTH = (150, 150, 150), (255, 140, 0), (240, 240, 240)
-_TRAINING = (70, 105, 160)
 _WIDTH_PX = 2.0
 _FRUSTA = 24
 """Candidates that are drawn as frusta, the best; all are points."""
@@ -74,7 +72,7 @@ class Stage:
         client.flush()
         poses = shapes.stacked([c.pose for c in cameras])
         segments = shapes.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
-        self._lines("training cameras", "cameras", segments, _TRAINING, 1.0)
+        self._lines("training cameras", "cameras", segments, TRAINING_COLOUR, 1.0)
         self._add_splats(content)
 
     def show_trajectory(self, records: Sequence[IterationRecord], job: JobView) -> None:
@@ -89,24 +87,26 @@ class Stage:
         self._steps = [records[i].index for i in kept], steps
         colour = answer_colour(job.answer)
         self._spline(steps[:, :3, 3], colour)
-        ghosts = shapes.frusta(steps[1:-1], [job.photo] * len(steps[1:-1]), 0.5 * depth)
-        self._lines("trajectory", "steps", ghosts, _INITIAL, 1.0)
-        self._frustum("initial", records[0].pose, job.photo, _INITIAL, 0.8 * depth)
+        lenses = [job.camera(records[i]).intrinsics for i in kept[1:-1]]
+        ghosts = shapes.frusta(steps[1:-1], lenses, 0.5 * depth)
+        self._lines("trajectory", "steps", ghosts, INITIAL_COLOUR, 1.0)
+        self._frustum("initial", job.camera(records[0]), INITIAL_COLOUR, 0.8 * depth)
         if job.answer is not None:
-            self._frustum("final", records[-1].pose, job.photo, colour, 1.1 * depth)
+            self._frustum("final", job.camera(records[-1]), colour, 1.1 * depth)
         if job.truth is not None:
-            self._frustum("truth", job.truth, job.photo, _TRUTH, 1.15 * depth)
+            self._frustum("truth", Camera(job.photo, job.truth), TRUTH_COLOUR, 1.15 * depth)
 
-    def show_current(self, pose: Pose, photo: Intrinsics, texture: UInt8[np.ndarray, "h w 3"] | None) -> None:
-        """Draw the camera of the record that is looked at, with the photo in it."""
+    def show_current(self, camera: Camera, texture: UInt8[np.ndarray, "h w 3"] | None) -> None:
+        """Draw the camera of the record that is looked at, with the photo in it; None: the last photo."""
         if self._scene is None:
             return
-        node = self._nodes["trajectory"].get("current")
-        if node is None or texture is not None:
-            self._frustum("current", pose, photo, _CURRENT, self._scene.extent.frustum, texture)
+        depth, node = self._scene.extent.frustum, self._nodes["trajectory"].get("current")
+        if texture is not None or not isinstance(node, viser.CameraFrustumHandle):
+            self._frustum("current", camera, CURRENT_COLOUR, depth, texture)
             return
         with self._client.atomic():
-            node.wxyz, node.position = _wxyz(pose.world_from_camera), pose.position_in_world
+            node.wxyz, node.position = _wxyz(camera.pose.world_from_camera), camera.pose.position_in_world
+            node.fov, node.aspect, node.scale = shapes.frustum_form(camera.intrinsics, depth)
 
     def label(self, pose: Pose, text: str) -> None:
         """Write above the picture in a camera."""
@@ -281,26 +281,24 @@ class Stage:
     def _frustum(
         self,
         name: str,
-        pose: Pose,
-        photo: Intrinsics,
+        camera: Camera,
         colour: tuple[int, int, int],
         depth: float,
         texture: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
-        half_width, half_height = 0.5 * photo.width / photo.fx, 0.5 * photo.height / photo.fy
+        fov, aspect, scale = shapes.frustum_form(camera.intrinsics, depth)
         self._nodes["trajectory"][name] = self._client.scene.add_camera_frustum(
             f"/trajectory/{name}",
-            fov=float(2 * np.arctan(half_height)),
-            aspect=half_width / half_height,
-            # viser's scale is the cube root of the pyramid's volume (times 3/4), not its depth.
-            scale=depth * float(np.cbrt(half_width * half_height / 3)),
+            fov=fov,
+            aspect=aspect,
+            scale=scale,
             thickness=_WIDTH_PX,
             thickness_units="screen",
             color=colour,
             image=texture,
             jpeg_quality=80,
-            wxyz=_wxyz(pose.world_from_camera),
-            position=pose.position_in_world,
+            wxyz=_wxyz(camera.pose.world_from_camera),
+            position=camera.pose.position_in_world,
             visible=self._visible["trajectory"],
             cast_shadow=False,
             receive_shadow=False,

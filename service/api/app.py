@@ -46,6 +46,7 @@ from service.api.viewer_child import ViewerChild
 from service.errors import InvalidRequest, StorageFailed
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
+from service.matchers import MATCHERS
 
 
 def create_app(
@@ -59,12 +60,14 @@ def create_app(
     settings name what is not there, InvalidRequest if they would let everybody in without saying so.
     """
     settings = settings or Settings()
-    ESTIMATORS.load(settings.estimator)  # an unknown name shall be told now, not in each job
+    for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
+        kind.load(name)  # an unknown name shall be told now, not in each job
     if scenes is None:
         known = Scenes(
             settings.scenes,
             settings.estimator,
             settings.cache_dir,
+            matcher=settings.matcher,
             preload=settings.preload,
             memory_bytes=settings.scene_memory_bytes,
         )

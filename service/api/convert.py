@@ -179,6 +179,7 @@ def result_out(
         inliers=verdict.inliers,
         agreement=verdict.agreement,
         coverage=verdict.coverage,
+        signals=dict(verdict.signals),
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
         timings=[decode, *map(timing_out, estimate.timings)],
         budget_exhausted=estimate.budget_exhausted,

@@ -20,7 +20,7 @@ from pathlib import Path
 from service.api.schemas import Readiness, SceneState
 from service.api.warmup import warm_up
 from service.errors import BadInput, NoRoom, SceneNotFound, SceneNotReady, SceneUnloaded, SplatfixError
-from service.localize import LoadedScene
+from service.localize import DEFAULT_MATCHER, LoadedScene
 from service.scene_formats.discovery import find_scenes
 
 _log = logging.getLogger(__name__)
@@ -60,6 +60,7 @@ class Scenes:
         estimator: str,
         cache_dir: Path | None,
         *,
+        matcher: str = DEFAULT_MATCHER,
         preload: list[str] | None = None,
         memory_bytes: int | None = None,
     ) -> None:
@@ -67,7 +68,8 @@ class Scenes:
 
         `estimator` is the one that they are made ready for. `preload` names those to load at start, None all.
         """
-        self._estimator, self._cache_dir, self._memory_bytes = estimator, cache_dir, memory_bytes
+        self._estimator, self._matcher = estimator, matcher
+        self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
         self._entries: dict[str, Entry] = {}
         self._lock = threading.RLock()
         self._stop = threading.Event()
@@ -238,7 +240,7 @@ class Scenes:
 
     def _load(self, entry: Entry) -> None:
         if entry.loaded is None and entry.path is not None:
-            loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir)
+            loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, matcher=self._matcher)
             self._make_room(entry, loaded.nbytes)
             entry.loaded, entry.state = loaded, "preparing"
             self._settle(entry)

@@ -212,7 +212,8 @@ class Result(Model):
     hint: str
     """What to do about the reason; empty if all is well."""
     score: float
-    """0..1; at least 0.5 is `localized`."""
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.9
+    is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
     geopose: GeoPose | None
@@ -228,6 +229,8 @@ class Result(Model):
     """Correlation of the gradients of photo and render, -1..1."""
     coverage: float
     """Share of the photo in which the scene is rendered opaque."""
+    signals: dict[str, float]
+    """All that the gate measured at the pose, by name."""
     covariance: Covariance | None
     timings: list[Timing]
     """By stage, in order; `decode` is the photo's."""

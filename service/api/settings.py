@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
-from service.localize import DEFAULT_ESTIMATOR
+from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
 """Where `splatfix serve` keeps its jobs, a folder for each port."""
@@ -53,6 +53,8 @@ class Settings(BaseSettings):
     """The sub-path under which a proxy shows the service, e.g. /fix; `X-Forwarded-Prefix` wins."""
     estimator: str = DEFAULT_ESTIMATOR
     """Of jobs that name none; what it prepares for a scene is made at start."""
+    matcher: str = DEFAULT_MATCHER
+    """Of local features, for all scenes; some need weights in the folder that SPLATFIX_WEIGHTS_DIR names."""
     workers: int = Field(default_factory=_cores, ge=1)
     """Jobs that run at once; each has one thread."""
     queue_size: int = Field(default=32, ge=1)

@@ -1,4 +1,4 @@
-"""`splatfix bench localize`: localize a scene's test photos and compare with the truth.
+"""`splatfix bench localize`: localize a data set's test photos in its scene and compare with the truth.
 
 The test photos' cameras are taken out before the scene is loaded, whatever layout it has, so that no index view
 and no unit rests on them. Latency is wall time from the photo's bytes to the result, decoding included, with the
@@ -10,21 +10,29 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from jaxtyping import Float32
 
+from service.bench.datasets import PHOTO_SUFFIXES, DataSet, read_data_set
 from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
-from service.bench.queries import BenchPhoto, find_photos, photo_bytes
+from service.bench.modifications import require_modifications
+from service.bench.queries import BenchPhoto, sent
 from service.bench.starts import require_kind, start_pose
+from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
 from service.images import read_query
-from service.localize import LoadedScene, Request, localize
+from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.pose.focus import centre_depth
 from service.scene_formats import load_scene
-from service.types import Camera, Pose, PoseEstimate
+from service.scene_formats.manifest import read_manifest
+from service.types import Camera, GaussianScene, Intrinsics, Pose, PoseEstimate
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
+MAX_OCCLUDERS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +42,43 @@ class Trial:
     photo: str
     number: int
     data: bytes
+    told: Intrinsics
+    """Those sent with it."""
     truth: Camera
     start: Pose | None
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A scene to localize in, the photos to localize, and its units."""
+
+    loaded: LoadedScene
+    photos: tuple[BenchPhoto, ...]
+    training: tuple[Camera, ...]
+    """Never a test photo's."""
+    units: Units
+    layout: str
+
+    @property
+    def background_rgb(self) -> tuple[float, float, float]:
+        return self.loaded.scene.info.background_rgb
 
 
 def run(
     folder: Path,
     *,
+    data: Path | None = None,
+    layout: str = "auto",
+    background: Literal["scene", "white", "black"] = "scene",
     estimator: str = "view_index",
+    matcher: str = DEFAULT_MATCHER,
     start: str = "none",
     trials: int = 1,
     seed: int = 0,
     intrinsics: Literal["given", "withheld"] = "given",
     cameras: Literal["given", "ignored"] = "given",
     modify: Sequence[str] = (),
+    occluders: Path | None = None,
     options: Any = None,
     budget: Budget | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -55,35 +86,35 @@ def run(
 ) -> dict[str, Any]:
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
-    `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is used without
-    its training cameras; they still define the units.
+    `folder` has the scene; `data` the photos, if they are elsewhere. `occluders` is a folder with photos of another
+    scene. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is used
+    without its training cameras; they still define the units.
     """
     require_kind(start)
+    require_modifications(modify)
     chosen, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
-    folder = Path(folder)
-    photos = find_photos(folder)
-    loaded, training = _loaded(folder, photos, cameras, cache_dir)
+    one = subject(
+        Path(folder), data, layout=layout, background=background, cameras=cameras, matcher=matcher, cache_dir=cache_dir
+    )
     began = time.perf_counter()
-    loaded.prepare(estimator)
+    one.loaded.prepare(estimator)
     prepare_s = time.perf_counter() - began
-    units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
-    background = loaded.scene.info.background_rgb
-    todo = list(_trials(photos, start, trials, seed, tuple(modify), background, units, training))
+    todo = list(trials_of(one, start, trials * len(one.photos), seed, tuple(modify), occluders))
+    limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
+    request = Request(estimator=estimator, options=chosen, seed=seed, **limits)
 
     def answer(trial: Trial) -> PoseEstimate:
-        given = trial.truth.intrinsics if intrinsics == "given" else None
-        query = read_query(trial.data, intrinsics=given, prior=trial.start, background_rgb=background)
-        limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
-        return localize(query, loaded, Request(estimator=estimator, options=chosen, seed=seed, **limits))
+        return answered(one, trial, request, intrinsics)
 
-    outcomes, per_query = measure(todo, answer, units, progress)
-    asked = {"estimator": estimator, "start": start, "trials": trials, "seed": seed}
+    outcomes, per_query = measure(todo, answer, one.units, progress)
+    asked = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
+    asked |= {"layout": one.layout, "background_rgb": list(one.background_rgb)}
     asked |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
     asked |= {"options": dataclasses.asdict(chosen), "budget": dataclasses.asdict(budget)}
-    facts = {"photos": len(photos), "training_cameras": len(training), "gaussians": loaded.scene.count}
-    facts |= {"forward_facing": units.forward_facing, "units_per_scene_unit": units.units_per_scene_unit}
+    facts = {"photos": len(one.photos), "training_cameras": len(one.training), "gaussians": one.loaded.scene.count}
+    facts |= {"forward_facing": one.units.forward_facing, "units_per_scene_unit": one.units.units_per_scene_unit}
     facts |= {"prepare_s": prepare_s}
-    return {"scene": loaded.scene.info.name, **asked, **facts, **summary(outcomes), "per_query": per_query}
+    return {"scene": one.loaded.scene.info.name, **asked, **facts, **summary(outcomes), "per_query": per_query}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,43 +140,85 @@ def measure(
         latency_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
         outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, units), latency_ms, cpu_ms)
         outcomes.append(outcome)
-        lines.append(_line(trial, estimate, outcome, units))
+        lines.append(line_of(trial, estimate, outcome, units))
         if progress:
             progress(done, len(todo))
     return outcomes, lines
 
 
-def _loaded(
-    folder: Path, photos: Sequence[BenchPhoto], cameras: str, cache_dir: Path | None
-) -> tuple[LoadedScene, list[Camera]]:
-    """Return the scene without the test photos, and its training cameras; the truth's if there are none."""
-    held_back = [name for photo in photos for name in photo.names]
-    scene = load_scene(folder, without_photos=held_back)
-    training = [named.camera for named in scene.cameras] or [photo.camera for photo in photos]
+def subject(
+    folder: Path,
+    data: Path | None = None,
+    *,
+    layout: str = "auto",
+    background: str = "scene",
+    cameras: str = "given",
+    matcher: str = DEFAULT_MATCHER,
+    cache_dir: Path | None = None,
+) -> Subject:
+    """Read a data set and its scene without the test photos. Raises SceneError, UnknownName."""
+    found = read_data_set(data or folder, layout, folder)
+    scene = _scene(folder, found, background)
+    training = [named.camera for named in scene.cameras] or [photo.camera for photo in found.test]
     if cameras == "ignored":
-        scene = load_scene(folder, without_photos=held_back, cameras=False)
-    return LoadedScene.of(scene, cache_dir=cache_dir), training
+        scene = _scene(folder, found, background, cameras=False)
+    loaded = LoadedScene.of(scene, cache_dir=cache_dir, matcher=matcher)
+    units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
+    return Subject(loaded, found.test, tuple(training), units, found.layout)
 
 
-def _trials(
-    photos: Sequence[BenchPhoto],
+def _scene(folder: Path, found: DataSet, background: str, cameras: bool = True) -> GaussianScene:
+    scene = load_scene(folder, without_photos=found.held_back, cameras=cameras, training=found.training)
+    rgb = BACKGROUNDS.get(background)
+    if rgb is None and not (folder.is_dir() and read_manifest(folder).background):
+        rgb = found.background_rgb
+    if rgb is None or rgb == scene.info.background_rgb:
+        return scene
+    # The digest is the key of cached view indexes: a render over another background is another one.
+    return replace(scene, info=replace(scene.info, background_rgb=rgb, sha256=f"{scene.info.sha256}-{rgb}"))
+
+
+def trials_of(
+    one: Subject,
     start: str,
-    trials: int,
+    count: int,
     seed: int,
-    modify: tuple[str, ...],
-    background_rgb: tuple[float, float, float],
-    units: Units,
-    training: Sequence[Camera],
+    modify: tuple[str, ...] = (),
+    occluders: Path | None = None,
 ) -> Iterator[Trial]:
-    """Each trial of a photo has its own start, the same in every run with this seed."""
-    for index, photo in enumerate(photos):
-        data, truth = photo_bytes(photo, modify, background_rgb, seed)
-        for number in range(trials):
+    """Yield `count` trials, photo after photo: as many for each as go round, each with its own start.
+
+    They are the same in every run with this seed, and the first ones also for a larger count.
+    """
+    cut = _pictures(occluders) if occluders else ()
+    for index, photo in enumerate(one.photos):
+        numbers = range(len(range(index, count, len(one.photos))))
+        one_sent = sent(photo, modify, one.background_rgb, seed, cut) if numbers else None
+        for number in numbers:
+            assert one_sent is not None
             rng = np.random.default_rng([seed, index, number])
-            yield Trial(photo.name, number, data, truth, start_pose(start, truth.pose, units, training, rng))
+            begin = start_pose(start, one_sent.truth.pose, one.units, one.training, rng)
+            yield Trial(photo.name, number, one_sent.data, one_sent.told, one_sent.truth, begin)
 
 
-def _line(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) -> dict[str, Any]:
+def _pictures(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
+    """Return photos of a folder, at most MAX_OCCLUDERS. Raises SceneNotFound."""
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES) if folder.is_dir() else []
+    if not files:
+        raise SceneNotFound("there are no photos to cut occluders from.", where=str(folder))
+    step = -(-len(files) // MAX_OCCLUDERS)
+    return [read_query(file.read_bytes()).rgb.astype(np.float32) / 255 for file in files[::step]]
+
+
+def answered(one: Subject, trial: Trial, request: Request, intrinsics: str = "given") -> PoseEstimate:
+    """Localize one trial as the service would."""
+    told = trial.told if intrinsics == "given" else None
+    query = read_query(trial.data, intrinsics=told, prior=trial.start, background_rgb=one.background_rgb)
+    return localize(query, one.loaded, request)
+
+
+def line_of(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) -> dict[str, Any]:
+    """Return what the result file has of one trial."""
     verdict = estimate.verdict
     begun = errors(trial.start, trial.truth.pose, units) if trial.start else (None, None)
     return {

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, Float64
 
 from service.bench.modifications import Shot, modified
 from service.errors import CorruptScene, SceneNotFound, SplatfixError
@@ -17,7 +19,7 @@ from service.scene_formats.folder import COLMAP_FOLDER
 from service.scene_formats.manifest import read_manifest
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
 from service.scene_formats.similarity import moved_pose
-from service.types import Camera, NamedCamera, Pose
+from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 HOLD_OUT_EVERY = 8
 """Where nothing says which photos are for testing: every eighth by name, LLFF's custom. The scene was then trained
@@ -63,17 +65,33 @@ def find_photos(folder: Path) -> list[BenchPhoto]:
     return photos
 
 
-def photo_bytes(
-    photo: BenchPhoto, modify: tuple[str, ...], background_rgb: tuple[float, float, float], seed: int
-) -> tuple[bytes, Camera]:
-    """Return the file to send and its camera: as it is, or spoilt and stored without loss and without EXIF."""
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What an estimator gets of a photo, and what it is compared with."""
+
+    data: bytes
+    """The file: as it is, or spoilt and stored without loss and without EXIF."""
+    told: Intrinsics
+    """The intrinsics sent with it: the truth's, unless the `focal` modification falsifies them."""
+    truth: Camera
+
+
+def sent(
+    photo: BenchPhoto,
+    modify: tuple[str, ...],
+    background_rgb: tuple[float, float, float],
+    seed: int,
+    occluders: Sequence[Float32[np.ndarray, "h w 3"]] = (),
+) -> Sent:
+    """Return the photo, modified; `occluders` are photos of another scene. Raises UnknownName, InvalidOptions."""
     data = photo.path.read_bytes()
     if not modify:
-        return data, photo.camera
+        return Sent(data, photo.camera.intrinsics, photo.camera)
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background_rgb)
-    shot = Shot(query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose)
+    shot = Shot(query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose, occluders=tuple(occluders))
     shot = modified(shot, modify, np.random.default_rng(seed))
-    return encode_image(shot.rgb, "png"), Camera(shot.intrinsics, shot.pose)
+    told = replace(shot.intrinsics, fx=shot.intrinsics.fx * shot.told_focal, fy=shot.intrinsics.fy * shot.told_focal)
+    return Sent(encode_image(shot.pixels(), "png"), told, Camera(shot.intrinsics, shot.pose))
 
 
 def _from_truth(folder: Path) -> list[BenchPhoto]:
@@ -108,9 +126,12 @@ def _from_transforms(path: Path, folder: Path) -> list[BenchPhoto]:
 
 
 def _photo(folder: Path, file: str, named: NamedCamera, aliases: tuple[str, ...] = ()) -> BenchPhoto:
-    """The camera of a file in the scene's frame, moved into the world as the scene is."""
-    world_from_scene = read_manifest(folder).world_from_scene
-    camera = named.camera
-    if world_from_scene is not None:
-        camera = Camera(camera.intrinsics, moved_pose(camera.pose, world_from_scene))
+    camera = moved_camera(named.camera, read_manifest(folder).world_from_scene)
     return BenchPhoto(named.name, folder / file, camera, aliases)
+
+
+def moved_camera(camera: Camera, world_from_scene: Float64[np.ndarray, "4 4"] | None) -> Camera:
+    """Return a camera of the scene file's frame in the world, where the scene is moved to."""
+    if world_from_scene is None:
+        return camera
+    return Camera(camera.intrinsics, moved_pose(camera.pose, world_from_scene))

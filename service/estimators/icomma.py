@@ -32,6 +32,8 @@ from service.pose.matching import epipolar_inliers, match_record, render_and_mat
 from service.pose.views import RENDER_PX, Correspondences, photo_at, sized
 from service.types import Camera, Intrinsics, IterationRecord, Pose, Query
 
+MATCHES_IMAGES = True
+"""It works with matchers that have no features of one image."""
 MATCH_SHARE = 0.8
 OFF_BELOW = 0.001
 MIN_MATCHES = 5

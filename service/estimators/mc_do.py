@@ -38,6 +38,8 @@ from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.types import Camera, Candidates, IterationRecord, Pose, Query
 
+MATCHES_IMAGES = True
+"""It works with matchers that have no features of one image."""
 SCENE_JITTER_DEG, SCENE_JITTER_SHARE = 10.0, 0.05
 """About each of the scene's viewpoints, where there is no prior."""
 LEVEL_VIEWS, LEVEL_PX = 24, 384
@@ -61,6 +63,8 @@ class Options:
     """Resampling rounds after the first, each with an eighth of its hypotheses and the best ones' solutions."""
     hypothesis_px: int = 256
     """Long side of their renders."""
+    render_px: int = RENDER_PX
+    """Long side of the renders of the later stages."""
     iterations: int = 10
     """Of the decoupled optimization; 0 leaves the stage out."""
     solver: Literal["least_squares", "gradient"] = "least_squares"
@@ -79,6 +83,7 @@ class Options:
             "range_share": (0, 10),
             "rounds": (0, 10),
             "hypothesis_px": (64, 1024),
+            "render_px": (64, 2048),
             "iterations": (0, 1000),
             "refinement_steps": (0, 10_000),
         }
@@ -176,7 +181,7 @@ def _decoupled(start: Pose, query: Query, tools: Tools, options: Options) -> Gen
     """Render, match, solve; the pose whose own render had the most support is the answer."""
     pose, best, most = start, start, -1.0
     for iteration in range(options.iterations):
-        camera = Camera(sized(query.intrinsics, RENDER_PX), pose)
+        camera = Camera(sized(query.intrinsics, options.render_px), pose)
         matches, view = render_and_match(camera, tools.rasterizer, query, tools)
         solved = _solved(matches, pose, query, tools, iteration if options.solver == "gradient" else None)
         if solved is None:
@@ -191,7 +196,7 @@ def _decoupled(start: Pose, query: Query, tools: Tools, options: Options) -> Gen
 
 
 def _descended(start: Pose, query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    intrinsics = sized(query.intrinsics, RENDER_PX)
+    intrinsics = sized(query.intrinsics, options.render_px)
     loss = loss_against(options.loss, photo_at(query, tools, intrinsics))
     focus = tools.prepared.focus
     best, least = start, np.inf

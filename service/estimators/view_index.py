@@ -3,9 +3,9 @@
     features of the photo -> views that look like it (VLAD) -> matches, lifted to 3D -> PnP
     -> while few agree: render there, match again -> align photometrically on two renders -> verification gate
 
-Only if the gate doesn't accept the answer the dearer search is tried: a vote of features instead of VLAD, with the
-photo turned by quarters. A prior pose is one more candidate view. Sizes and rounds are the research's;
-numbers that were measured stand beside the constants.
+Only if the gate doesn't accept the answer the dearer searches are tried: a vote of features instead of VLAD, with the
+photo turned by eighths; then poses sampled near the views. A prior pose is one more candidate view. Sizes and rounds
+are the research's; numbers that were measured stand beside the constants.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -23,7 +23,9 @@ from service.interfaces import Features, Tools
 from service.pose.alignment import align
 from service.pose.focal import WIDER, focal_resection, refine
 from service.pose.gate import verify
+from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
+from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
 from service.pose.retrieval import top, vlad, vote
 from service.pose.views import (
@@ -31,10 +33,12 @@ from service.pose.views import (
     Correspondences,
     View,
     correspondences,
+    known_at,
     photo_at,
     photo_features,
     rendered_frame,
     rendered_view,
+    sized,
 )
 from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Status
 
@@ -47,14 +51,28 @@ CHANCE = 15
 """Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
 STRONG = 150
 """Inliers with which alignment needs no further match."""
-TURN_BIAS = (1.0, 0.77, 0.77, 0.77)
+SAME_SCALE = 1.4
+"""Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
+SCALES_PX = (160, 768)
+VOTE_SHARE, CLOSER_LOOKS = 0.6, 2
+"""Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
+TURN_BIAS = 0.77
 """On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
+ODD_SHRINK = 0.8
+"""A photo turned by an eighth needs twice the canvas."""
+SAMPLE_PX, SAMPLES, SAMPLE_ROUNDS = 256, 8, 4
+MOST_ROUNDS = 100
+"""Of an exhaustive search without a budget."""
+RECOGNISED = 14
+"""Inliers of any match that make sampling worth its while."""
+PROMISING = 12
+"""Inliers of a sampled pose with which it is worth a larger render."""
 SETTLED_PX = 0.3
 """Where alignment moved what is seen by less, another render would be the same."""
+LENS_SETTLED_PX = 0.05
+"""The same while the focal length is free: it hides behind the distance, and hardly moves what is seen."""
 SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
-
-
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
 
@@ -63,14 +81,18 @@ REMATCHES, ALIGNMENTS = 3, 4
 class Options:
     candidates: int = 5
     """Index views that the photo is matched with in one search, 1 to 64."""
-    escalate: bool = True
-    """Search again by a vote of features, photo turned, where the verification gate doesn't accept the answer."""
+    effort: Literal["fast", "normal", "exhaustive"] = "normal"
+    """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, by a vote of
+    features, with the photo turned. `normal`: then among sampled poses, if something in the photo was recognised.
+    `exhaustive`: among sampled poses until the budget ends."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
 
     def __post_init__(self) -> None:
         if not 1 <= self.candidates <= 64:
             raise InvalidOptions(f"must lie in 1..64, is {self.candidates}.", where="candidates")
+        if self.effort not in ("fast", "normal", "exhaustive"):
+            raise InvalidOptions(f"must be fast, normal or exhaustive, is '{self.effort}'.", where="effort")
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
@@ -80,42 +102,109 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
-    answer: tuple[IterationRecord, float] | None = None
-    for search in _searches(query, tools, options):
-        last: IterationRecord | None = None
-        for last in search:
-            yield last if answer is None else _with_pose_of(answer[0], last)
-        if last is None or (answer and last.stage != "align"):
-            continue  # the search gave up
-        verdict = verify(query.corrected(last.lens), last.pose, tools)
-        if answer is None or verdict.score > answer[1]:
-            answer = last, verdict.score
-        final = IterationRecord("verify", last.pose, loss=1.0 - answer[1], num_inliers=verdict.inliers)
-        yield _with_pose_of(answer[0], final)
-        if verdict.status is Status.LOCALIZED:
+    hunt = _Hunt(query, tools)
+    for search in _searches(query, tools, options, hunt):
+        yield from hunt.follow(search)
+        if hunt.accepted:
             return
 
 
-def _with_pose_of(answer: IterationRecord, record: IterationRecord) -> IterationRecord:
-    return replace(record, pose=answer.pose, lens=answer.lens)
+@dataclass(slots=True)
+class _Hunt:
+    """What the searches have led to."""
+
+    query: Query
+    tools: Tools
+    answer: IterationRecord | None = None
+    """The one that the gate likes best."""
+    score: float = 0.0
+    accepted: bool = False
+    most_inliers: int = 0
+    """Of any match: more than chance gives tell that something was recognised."""
+
+    def follow(self, search: Iterator[IterationRecord]) -> Iterator[IterationRecord]:
+        """Yield a search's records, with the best answer so far, and put its end before the gate."""
+        last: IterationRecord | None = None
+        for last in search:
+            self.most_inliers = max(self.most_inliers, last.num_inliers or 0)
+            yield self._with_answer(last)
+        if last is None or (self.answer and last.stage != "align"):
+            return  # the search gave up
+        verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
+        if self.answer is None or verdict.score > self.score:
+            self.answer, self.score = last, verdict.score
+        self.accepted = verdict.status is Status.LOCALIZED
+        yield self._with_answer(
+            IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
+        )
+
+    def _with_answer(self, record: IterationRecord) -> IterationRecord:
+        return replace(record, pose=self.answer.pose, lens=self.answer.lens) if self.answer else record
 
 
-def _searches(query: Query, tools: Tools, options: Options) -> Iterator[Iterator[IterationRecord]]:
-    """The ways to look for the photo in the index, cheapest first."""
+@dataclass(slots=True)
+class _Sight:
+    """How the photo is looked at in a search."""
+
+    long_side: int
+    eighths: int = 0
+    """Of a turn, counter-clockwise, that make it upright."""
+
+    def features(self, query: Query, tools: Tools, share: float = 1.0) -> Features:
+        shrink = ODD_SHRINK if self.eighths % 2 else 1.0
+        return photo_features(query, tools, round(self.long_side * shrink * share), self.eighths)
+
+    @property
+    def max_error_px(self) -> float:
+        """At PHOTO_PX."""
+        return MATCH_ERROR_PX * max(1.0, PHOTO_PX / self.long_side)
+
+
+def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iterator[Iterator[IterationRecord]]:
+    """The ways to look for the photo, cheapest first."""
     index: ViewIndex = tools.prepared
-    photo = photo_features(query, tools)
-    upright = index.vectors @ vlad(photo.descriptors, index.words)
-    yield _search("retrieve", photo, upright, query, tools, options)
-    if not options.escalate:
+    sight = _Sight(_same_scale_px(query, index))
+    words = vlad(sight.features(query, tools).descriptors, index.words)
+    yield _search("retrieve", sight, index.vectors @ words, query, tools, options)
+    sight, scores = _turned_sight(sight, query, tools)
+    yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options)
+    if options.effort == "fast" or (options.effort == "normal" and hunt.most_inliers < RECOGNISED):
         return
-    features = [photo, *(photo_features(query, tools, quarter_turns) for quarter_turns in (1, 2, 3))]
-    votes = [vote(f.descriptors, [view.features.descriptors for view in index.views]) for f in features]
-    likeliest = int(np.argmax([v.max() * bias for v, bias in zip(votes, TURN_BIAS, strict=True)]))
-    yield _search("turn" if likeliest else "vote", features[likeliest], votes[likeliest], query, tools, options)
+    for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
+        yield _sampled(sight, scores, query, tools)
+
+
+def _turned_sight(sight: _Sight, query: Query, tools: Tools) -> tuple[_Sight, np.ndarray]:
+    """Return the photo upright, or turned as the views' votes say, and the votes.
+
+    Votes on a smaller photo choose the turns that are worth a closer look.
+    """
+    described = [view.features.descriptors for view in tools.prepared.views]
+
+    def votes(turned: _Sight, share: float) -> np.ndarray:
+        return vote(turned.features(query, tools, share).descriptors, described)
+
+    turns = [replace(sight, eighths=eighths) for eighths in range(1, 8)]
+    turns.sort(key=lambda turned: -votes(turned, VOTE_SHARE).max())
+    best, best_votes = sight, votes(sight, 1.0)
+    for turned in turns[:CLOSER_LOOKS]:
+        if (found := votes(turned, 1.0)).max() * TURN_BIAS > best_votes.max() * (TURN_BIAS if best.eighths else 1.0):
+            best, best_votes = turned, found
+    return best, best_votes
+
+
+def _same_scale_px(query: Query, index: ViewIndex) -> int:
+    """Return the photo's size at which a pixel covers the angle that it covers in the views, if that matters."""
+    lenses = [view.camera.intrinsics for view in index.views]
+    of_views = float(np.median([max(lens.fx, lens.fy) / lens.long_side for lens in lenses]))
+    factor = of_views * query.intrinsics.long_side / max(query.intrinsics.fx, query.intrinsics.fy)
+    if 1 / SAME_SCALE < factor < SAME_SCALE or query.intrinsics_source == "guessed":
+        return PHOTO_PX
+    return int(np.clip(PHOTO_PX * factor, *SCALES_PX))
 
 
 def _search(
-    stage: str, photo: Features, scores: np.ndarray, query: Query, tools: Tools, options: Options
+    stage: str, sight: _Sight, scores: np.ndarray, query: Query, tools: Tools, options: Options
 ) -> Iterator[IterationRecord]:
     """Go from scored views to an aligned pose; end early where too few matches agree."""
     index: ViewIndex = tools.prepared
@@ -126,29 +215,46 @@ def _search(
     yield IterationRecord(stage, query.prior or views[0].camera.pose, candidates=candidates)
     if query.prior and stage == "retrieve":
         views.insert(0, rendered_view(query.prior, query, tools)[0])
-    found = yield from _matched(photo, views, query, tools)
+    found = yield from _matched(sight, views, query, tools)
     if found and found.num_inliers < STRONG:
         found = yield from _rematched(found, query, tools)
     if found:
         yield from _aligned(found, query, tools)
 
 
+def _sampled(sight: _Sight, scores: np.ndarray, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+    """Render at sampled poses and match; go on from the one that most matches agree with."""
+    index: ViewIndex = tools.prepared
+    poses = poses_near_views(index.views, scores, -0.25 * np.pi * sight.eighths, SAMPLES, tools.rng)
+    lens = sized(query.intrinsics, SAMPLE_PX)
+    best: Resection | None = None
+    for pose in poses:
+        matches, view = render_and_match(Camera(lens, pose), tools.rasterizer, query, tools)
+        found = _resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)
+        if found and (best is None or found.num_inliers > best.num_inliers):
+            best = found
+        yield _match_record("sample", best or pose, matches, found, view.camera)
+    if best and best.num_inliers >= PROMISING and (best := (yield from _rematched(best, query, tools))):
+        yield from _aligned(best, query, tools)
+
+
 def _matched(
-    photo: Features, views: Sequence[View], query: Query, tools: Tools
+    sight: _Sight, views: Sequence[View], query: Query, tools: Tools
 ) -> Generator[IterationRecord, None, Resection | None]:
     """Match the photo with one view after the other until one explains it; else with all of them together."""
+    photo = sight.features(query, tools)
     best: Resection | None = None
     seen: list[Correspondences] = []
     for view in views:
         seen.append(correspondences(photo, view, tools.matcher))
-        found = _resected(seen[-1], query, MATCH_ERROR_PX, 500)
+        found = _resected(seen[-1], query, sight.max_error_px, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
         yield _match_record("match", best or views[0].camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
     pooled = Correspondences.pooled(seen)
-    together = _resected(pooled, query, MATCH_ERROR_PX, 2000)
+    together = _resected(pooled, query, sight.max_error_px, 2000)
     if together and (best is None or together.num_inliers > best.num_inliers):
         best = together
     if best is None:
@@ -181,7 +287,8 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
     """Align on a render, render at the result, align again, until a new render would be the same."""
     pose, camera, lens = found.pose, None, found.lens
     for round_number in range(ALIGNMENTS):
-        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, SETTLED_PX if camera else 1.0)
+        settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
+        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0)
         if new_camera is camera:
             return
         camera = new_camera
@@ -189,7 +296,8 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
         start = Camera(query.intrinsics.resized(size.width, size.height), pose)
         levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
         photo = photo_at(query, tools, size)
-        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma)
+        known = known_at(query, tools, size)
+        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known)
         if not np.isfinite(result.loss):
             return
         step_deg, step_units = pose_distance(pose, result.pose)

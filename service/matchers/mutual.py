@@ -9,7 +9,7 @@ from jaxtyping import Float32, Int32
 def mutual_nearest(
     a: Float32[np.ndarray, "n d"], b: Float32[np.ndarray, "m d"], min_cosine: float
 ) -> Int32[np.ndarray, "k 2"]:
-    """Return pairs of indices, in the order of `a`. Descriptors have unit length."""
+    """Return pairs of indices, the most similar first. Descriptors have unit length."""
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int32)
     similarity = a @ b.T
@@ -19,4 +19,5 @@ def mutual_nearest(
     pairs = np.flatnonzero((value >= similarity.max(0)[partner]) & (value >= min_cosine))
     _, first = np.unique(partner[pairs], return_index=True)  # equal descriptors tie: each index once
     pairs = pairs[np.sort(first)]
+    pairs = pairs[np.argsort(-value[pairs], kind="stable")]
     return np.stack([pairs, partner[pairs]], 1).astype(np.int32)

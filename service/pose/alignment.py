@@ -2,13 +2,15 @@
 
 For the pixels x of a render I (intensity, depth: the point X in the render's camera frame) and the photo P:
 
-    minimize  sum |r|,   r = P(project(T X)) - (gain I(x) + bias),   T = photo_camera_from_render_camera
+    minimize  sum |r|,   r = P(project(T X)) - look(I)(x),   T = photo_camera_from_render_camera
+    look(I) = gain I + bias + curve I (1 - I) + blur laplacian(I): exposure, haze, nearly any gamma, a little defocus
 
 by inverse compositional steps (Baker and Matthews, IJCV 2004): the render is moved by a small twist, so its
-gradients and Jacobians are computed once; each step solves 8 normal equations (twist, gain, bias; 11 with the
+gradients and Jacobians are computed once; each step solves 10 normal equations (twist and look; 13 with the
 photo's lens, where that is approximate) with weights 1 / max(|r|, DELTA) that fall to nothing at CUT times the
-median residual: what hides the scene has no say. Coarse to fine over an image pyramid. The render's own change with
-the pose (occlusion, highlights) is ignored: render again at the result and repeat.
+median residual: what hides the scene has no say. Coarse to fine over an image pyramid. A saturated photo is compared
+with a render cut off like it. The render's own change with the pose (occlusion, highlights) is ignored: render again
+at the result and repeat.
 
 Measured in the research: RGB, forward or symmetric gradients are no better on real photos; L2 is worst; two renders
 are enough; the basin with four levels is some 10 degrees. The cut, here: with a third of the photo hidden medians
@@ -22,7 +24,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, Int64, UInt8
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.geometry import moved, se3_exp, se3_log
 from service.interfaces import Frame
@@ -30,10 +32,14 @@ from service.jit import kernel
 from service.pose.focal import lens_precision, lens_state, stepped
 from service.types import EXACT, Camera, Intrinsics, Lens, Pose
 
+TWIST, LOOK, LENS = slice(0, 6), slice(6, 10), slice(10, 13)
+"""Places in the vector of unknowns."""
 DELTA = 0.02
 """Residuals (0..1) below it are noise: they weigh like least squares."""
 CUT = 9.0
 MIN_SPREAD = 0.01
+SATURATED, SATURATED_SHARE = 252, 0.005
+"""Of 0..255; of all values of a photo, from which on the render is cut off as the photo is."""
 MAX_STEPS = 12
 SIGMA_PX = 0.7
 """Blur of photo and render at each level: renders are softer than photos."""
@@ -49,6 +55,10 @@ MAX_PIXELS = 8_000
 MIN_PIXELS = 200
 FAR = np.float32(1e30)
 SETTLED_PX = 0.005
+UNKNOWN = np.float32(-1e4)
+"""In a photo; whatever mixes with it is negative, too."""
+UNTOUCHED = np.array([1.0, 0.0, 0.0, 0.0])
+"""The look of a photo that is like the render."""
 CORRELATED = 50.0
 """Neighbouring residuals err together: this many count as one observation against what is known of the lens."""
 
@@ -70,15 +80,17 @@ def align(
     levels: int,
     lens: Lens = EXACT,
     focal_sigma: float = 0.0,
+    known: Bool[np.ndarray, "h w"] | None = None,
 ) -> Alignment:
-    """Move `start` until the photo agrees with the frame, which `camera` rendered.
+    """Move `start` until the photo, where it is known, agrees with the frame, which `camera` rendered.
 
     The photo has the frame's size; `start` has the photo's intrinsics, without the `lens` to begin with, and its pose
     need not be the camera's. The lens is estimated too unless `focal_sigma` (of the logarithm) is 0.
     """
-    state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma)
+    state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma, UNTOUCHED.copy())
     loss = np.inf
-    for level in _levels(photo, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma)):
+    for level in _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma)):
+        state.look[3] = 0.0  # another at each level
         loss = _align_level(level, state)
         if not np.isfinite(loss):
             return Alignment(start.pose, lens, loss)
@@ -91,8 +103,15 @@ class _State:
     photo_from_render: Float64[np.ndarray, "4 4"]
     lens: Lens
     focal_sigma: float
-    gain: float = 1.0
-    bias: float = 0.0
+    look: Float64[np.ndarray, "4"]
+    """Gain, bias, curve, blur (in squared pixels of the level)."""
+
+    @property
+    def slopes(self) -> Float64[np.ndarray, "13"]:
+        """What the unknowns' columns are multiplied with: the photo shows the render's gradients times the gain."""
+        factor = np.full(13, self.look[0])
+        factor[LOOK] = 1.0
+        return factor
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,8 +130,8 @@ class _Level:
         residuals, weights = np.empty((2, len(self.pixels)), np.float32)
         k = _parameters(self.photo_lens.corrected(state.lens))
         total, count = _residuals(
-            self.photo, self.points, self.columns[6], state.photo_from_render, k,
-            state.gain, state.bias, DELTA, residuals, weights,
+            self.photo, self.points, self.columns[LOOK], state.photo_from_render, k,
+            state.look, DELTA, residuals, weights,
         )  # fmt: skip
         if count < MIN_PIXELS:
             return residuals, weights, np.inf
@@ -121,6 +140,7 @@ class _Level:
 
 def _levels(
     photo: UInt8[np.ndarray, "h w 3"],
+    known: Bool[np.ndarray, "h w"] | None,
     frame: Frame,
     render_lens: Intrinsics,
     photo_lens: Intrinsics,
@@ -128,14 +148,17 @@ def _levels(
     lens_unknown: bool,
 ) -> Iterator[_Level]:
     """Linearize the levels of the pyramid, coarsest first; each only when it is asked for."""
-    photos, renders = _pyramid(_luma(photo), levels), _pyramid(_luma(frame.rgb), levels)
+    luma = _luma(photo)
+    if known is not None:
+        luma[~known] = UNKNOWN
+    photos, renders = _pyramid(luma, levels), _pyramid(_luma(_cut_off(photo, frame)), levels)
     depths = _depth_pyramid(_edge_owner_depth(frame), levels)
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):
         height, width = render.shape
         pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
         pixels = np.ascontiguousarray(pixels[:: max(1, len(pixels) // MAX_PIXELS)])  # one layout: one compilation
         points, columns = _linearize(render, depth, pixels, _parameters(render_lens.resized(width, height)))
-        columns = columns if lens_unknown else columns[:8]
+        columns = columns if lens_unknown else columns[: LENS.start]
         yield _Level(photo_level, pixels, points, columns, photo_lens.resized(width, height))
 
 
@@ -152,14 +175,13 @@ def _align_level(level: _Level, state: _State) -> float:
         step = _solved(level.columns, residuals, weights, state, loss)
         if not np.all(np.isfinite(step)):
             return np.inf
-        state.photo_from_render = state.photo_from_render @ se3_exp(-step[:6])
-        state.gain += step[6]
-        state.bias += step[7]
+        state.photo_from_render = state.photo_from_render @ se3_exp(-step[TWIST])
+        state.look += step[LOOK]
         if state.focal_sigma:
-            state.lens = stepped(state.lens, step[8:], state.focal_sigma)
+            state.lens = stepped(state.lens, step[LENS], state.focal_sigma)
         lens = level.photo_lens
         moved_px = lens.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
-        if moved_px + lens.long_side * np.abs(step[8:]).max() < SETTLED_PX:
+        if moved_px + lens.long_side * np.abs(step[LENS]).max() < SETTLED_PX:
             break
     return loss
 
@@ -179,22 +201,26 @@ class Evidence:
 
 
 def evidence(
-    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, camera: Camera, answer: Camera, focal_sigma: float
+    photo: UInt8[np.ndarray, "h w 3"],
+    frame: Frame,
+    camera: Camera,
+    answer: Camera,
+    focal_sigma: float,
+    known: Bool[np.ndarray, "h w"] | None = None,
 ) -> Evidence | None:
     """Weigh an answer against the frame, which `camera` rendered nearby; None where too few pixels overlap.
 
     Residuals of neighbours err together, and some regions err more than others: the covariance is the sandwich
     estimator, clustered by blocks of the image (White 1980; Liang and Zeger 1986).
     """
-    (level,) = _levels(photo, frame, camera.intrinsics, answer.intrinsics, 1, lens_unknown=True)
-    state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0)
+    (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1, lens_unknown=True)
+    state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0, UNTOUCHED.copy())
     before = state.photo_from_render
-    if not np.isfinite(_align_level(replace(level, columns=level.columns[:8]), state)):
+    if not np.isfinite(_align_level(replace(level, columns=level.columns[: LENS.start]), state)):
         return None
     pull = se3_log(before @ np.linalg.inv(state.photo_from_render))
     residuals, weights, _ = level.residuals(state)
-    factor = np.where((np.arange(11) == 6) | (np.arange(11) == 7), 1.0, state.gain)
-    columns = level.columns * factor[:, None].astype(np.float32)
+    columns = level.columns * state.slopes[:, None].astype(np.float32)
     scores = columns * (weights * residuals)
     width = frame.alpha.shape[1] - 2
     row, column = np.divmod(level.pixels, width)
@@ -203,21 +229,22 @@ def evidence(
     # The loss is bent only near 0; the weights of the steps would overstate it.
     hessian = ((columns * (weights * (np.abs(residuals) < DELTA))) @ columns.T).astype(np.float64)
     covariance = _sandwich(hessian, summed)
-    free_focal = _sandwich(hessian[:9, :9], summed[:9])
+    focal = LENS.start + 1
+    free_focal = _sandwich(hessian[:focal, :focal], summed[:focal])
     if covariance is None or free_focal is None:
         return None
-    focal_pull = float(np.linalg.solve(hessian[:9, :9], scores[:9].sum(1, dtype=np.float64))[8])
+    focal_pull = float(np.linalg.solve(hessian[:focal, :focal], scores[:focal].sum(1, dtype=np.float64))[-1])
     if focal_sigma:
-        keep = np.r_[0:6, 8:11]
+        keep = np.r_[TWIST, LENS]
         information = np.linalg.inv(covariance[np.ix_(keep, keep)])
         information[range(6, 9), range(6, 9)] += lens_precision(focal_sigma)
         covariance = np.linalg.inv(information)
     else:
-        covariance = _sandwich(hessian[:8, :8], summed[:8])
+        covariance = _sandwich(hessian[: LENS.start, : LENS.start], summed[: LENS.start])
         if covariance is None:
             return None
-        covariance = covariance[:6, :6]
-    return Evidence(pull, covariance, focal_pull, float(np.sqrt(free_focal[8, 8])))
+        covariance = covariance[TWIST, TWIST]
+    return Evidence(pull, covariance, focal_pull, float(np.sqrt(free_focal[-1, -1])))
 
 
 def _sandwich(
@@ -251,23 +278,38 @@ def _solved(
     weights: Float32[np.ndarray, "n"],
     state: _State,
     loss: float,
-) -> Float64[np.ndarray, "11"]:
+) -> Float64[np.ndarray, "13"]:
     """Solve the weighted normal equations; each unknown is scaled, for they differ by orders of magnitude."""
     size = len(columns)
     weighted = columns * weights
-    # The photo shows the render's gradients times the gain.
-    factor = np.where((np.arange(size) == 6) | (np.arange(size) == 7), 1.0, state.gain)
+    factor = state.slopes[:size]
     hessian = (weighted @ columns.T).astype(np.float64) * np.outer(factor, factor)
     right = factor * (weighted @ residuals)
     if state.focal_sigma:
         trust = CORRELATED * loss * lens_precision(state.focal_sigma)
-        hessian[range(8, 11), range(8, 11)] += trust
-        right[8:] -= trust * lens_state(state.lens)
+        hessian[range(10, 13), range(10, 13)] += trust
+        right[LENS] -= trust * lens_state(state.lens)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     damped = hessian * np.outer(scale, scale) + 1e-6 * np.eye(size)
-    step = np.zeros(11)
+    step = np.zeros(13)
     step[:size] = scale * np.linalg.solve(damped, scale * right)
     return step
+
+
+def _cut_off(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> Float32[np.ndarray, "h w 3"]:
+    """Return the render, and if the photo is saturated, as bright as the photo and cut off at 1.
+
+    The photo's luma doesn't follow from the render's where single channels are cut off.
+    """
+    if (photo >= SATURATED).mean() < SATURATED_SHARE:
+        return frame.rgb
+    size = (photo.shape[1] // BLOCK_PX, photo.shape[0] // BLOCK_PX)
+    shown, expected = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (photo / 255.0, frame.rgb))
+    factors = []
+    for a, b in zip(np.moveaxis(shown, 2, 0), np.moveaxis(expected, 2, 0), strict=True):
+        fair = (a > 0.05) & (a < 0.9) & (b > 0.05)  # a black rim is none of the exposure's
+        factors.append(max(1.0, float(np.median(a[fair] / b[fair]))) if fair.any() else 1.0)
+    return np.minimum(frame.rgb * np.array(factors, np.float32), np.float32(1))
 
 
 def _luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
@@ -314,7 +356,7 @@ def _depth_pyramid(depth: Float32[np.ndarray, "h w"], levels: int) -> list[Float
 
 @kernel
 def _linearize(render, depth, pixels, k):
-    """Return the points in the render's camera frame, and the columns d value / d (twist, gain, bias, lens).
+    """Return the points in the render's camera frame, and the columns d value / d (twist, look, lens).
 
     The twist moves the points, the gain's column is the render's value. The lens (see `lens_state`) is the photo's.
     """
@@ -322,7 +364,7 @@ def _linearize(render, depth, pixels, k):
     inner = render.shape[1] - 2
     n = len(pixels)
     points = np.empty((3, n), np.float32)
-    columns = np.empty((11, n), np.float32)
+    columns = np.empty((13, n), np.float32)
     side = max(render.shape)
     for i in range(n):
         row, column = pixels[i] // inner + 1, pixels[i] % inner + 1
@@ -341,18 +383,22 @@ def _linearize(render, depth, pixels, k):
         columns[5, i] = -along / z
         columns[6, i] = render[row, column]
         columns[7, i] = 1.0
-        columns[8, i] = -along
-        columns[9, i] = -du / fx * side
-        columns[10, i] = -dv / fy * side
+        columns[8, i] = render[row, column] * (np.float32(1) - render[row, column])
+        around = render[row, column + 1] + render[row, column - 1] + render[row + 1, column] + render[row - 1, column]
+        columns[9, i] = around - np.float32(4) * render[row, column]
+        columns[10, i] = -along
+        columns[11, i] = -du / fx * side
+        columns[12, i] = -dv / fy * side
     return points, columns
 
 
 @kernel
-def _residuals(photo, points, values, transform, k, gain, bias, delta, residuals, weights):
-    """Fill residuals and weights, 0 outside the photo; return the sum of |r| and how many pixels are inside."""
+def _residuals(photo, points, basis, transform, k, look, delta, residuals, weights):
+    """Fill residuals and weights, 0 where the photo doesn't say; return the sum of |r| and how many pixels it has."""
     t = transform.astype(np.float32)
     fx, fy, cx, cy = np.float32(k[0]), np.float32(k[1]), np.float32(k[2] - 0.5), np.float32(k[3] - 0.5)
-    gain, bias, delta = np.float32(gain), np.float32(bias), np.float32(delta)
+    gain, bias, curve, blur = np.float32(look[0]), np.float32(look[1]), np.float32(look[2]), np.float32(look[3])
+    delta = np.float32(delta)
     right, bottom = np.float32(photo.shape[1] - 1), np.float32(photo.shape[0] - 1)
     total, count = 0.0, 0
     for i in range(points.shape[1]):
@@ -367,7 +413,11 @@ def _residuals(photo, points, values, transform, k, gain, bias, delta, residuals
         a, b = u - np.float32(left), v - np.float32(above)
         upper = photo[above, left] + a * (photo[above, left + 1] - photo[above, left])
         lower = photo[above + 1, left] + a * (photo[above + 1, left + 1] - photo[above + 1, left])
-        residual = upper + b * (lower - upper) - gain * values[i] - bias
+        shown = upper + b * (lower - upper)
+        if shown < 0:
+            residuals[i], weights[i] = 0.0, 0.0
+            continue
+        residual = shown - gain * basis[0, i] - bias - curve * basis[2, i] - blur * basis[3, i]
         residuals[i] = residual
         weights[i] = np.float32(1) / max(abs(residual), delta)
         total += abs(residual)

@@ -1,63 +1,92 @@
 """The verification gate: one rule that says of any estimator's answer whether to believe it.
 
-Independent signals must all agree: the render at the pose must have the photo's gradients (fine structure, whatever
-the exposure) and its colours (a row of equal things seen one further has the right edges and the wrong colours),
-and fresh matches between photo and render must agree with the pose itself, to the pixel and without any fit. The
-weakest signal is the score.
+Signals of several kinds are measured at the pose: whether the render there has the photo's gradients (fine structure,
+whatever the exposure) and its colours (a row of equal things seen one further has the right edges and the wrong
+colours), each over most of the photo and over its better half (the other may be hidden); how many fresh matches
+between photo and render agree with the pose, to the pixel and without any fit, what share that is, and how they are
+spread; and by how much alignment would still move the pose. Together they give a probability that the pose is right
+(within 5 degrees and 1/80 of the distance), by a logistic model whose weights `splatfix bench gate` fits and tests:
+each signal is cut off at both ends, so that none makes up for another, and weighs positively.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 
 from service.interfaces import Frame, Tools
 from service.pose.alignment import Evidence, evidence
 from service.pose.pnp import reprojection_error_px
 from service.pose.views import (
+    Correspondences,
     correspondences,
+    known_at,
     photo_at,
     photo_features,
     rendered_view,
     to_uint8,
 )
-from service.types import Camera, Pose, Query, Reason, Status, Verdict
+from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
 
 GRADIENTS_PX = 192
 """Long side at which photo and render are compared: coarse enough to forgive what training left blurred."""
 COLOUR_PX = 64
 SIGMA_PX = 0.7
 BLOCK_PX = 8
-HIDDEN_SHARE = 0.25
+HIDDEN_SHARE, HALF = 0.25, 0.5
+"""Of the photo, that may be hidden."""
 MIN_ALPHA = 0.5
 MAX_ERROR_PX = 4.0
 """At RENDER_PX. XFeat's points scatter by 1.5."""
 MIN_FEATURES = 30
+CELLS = 6
+"""Of a photo's side, over which matches are spread."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Maps a signal to 0..1, linear between four points: 0, `hopeless` = 0.25, `enough` = 0.5, `certain` = 1."""
+    """Maps a signal to 0..1: 0 at `hopeless` and beyond, 1 at `certain` and beyond."""
 
     hopeless: float
-    enough: float
     certain: float
+    ratio: bool = False
+    """Compare by ratios."""
 
-    def __call__(self, value: float) -> float:
-        return float(np.interp(value, [0.0, self.hopeless, self.enough, self.certain], [0.0, 0.25, 0.5, 1.0]))
+    def __call__(self, value: Float[np.ndarray, "*n"] | float) -> Float64[np.ndarray, "*n"]:
+        ends = np.array([self.hopeless, self.certain])
+        if self.ratio:
+            value, ends = np.log(np.maximum(value, 1e-6)), np.log(ends)
+        return np.clip((np.asarray(value) - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
 
 
-# On the six test scenes, each photo as it is, with other tones, blurred, halved, cropped, turned, a fifth hidden: 370
-# right poses have gradients of 0.78, colours of 0.67, 64 inliers or more. The worst wrong ones: 0.72, 0.20 and 106
-# (mirrored view of repeated spheres), 0.81, 0.60 and 91 (seen one sphere further); the next 0.37 and 14.
-GRADIENTS = Scale(0.4, 0.65, 0.95)
-COLOURS = Scale(0.3, 0.62, 0.95)
-INLIERS = Scale(15.0, 50.0, 400.0)
-COVERAGE = Scale(0.02, 0.04, 0.3)
-FOCAL = Scale(0.25, 1.0, 10.0)
+SCALES = {
+    "gradients": Scale(0.3, 0.95),
+    "gradients_half": Scale(0.5, 0.99),
+    "colours": Scale(0.2, 0.97),
+    "colours_half": Scale(0.5, 0.99),
+    "drift_px": Scale(20.0, 0.3, ratio=True),
+    "inliers": Scale(10.0, 300.0, ratio=True),
+    "inlier_share": Scale(0.1, 0.8),
+    "inlier_spread": Scale(0.1, 0.9),
+}
+WITH_MATCHES = {
+    "bias": -12.0, "gradients": 2.0, "gradients_half": 2.0, "colours": 2.0, "colours_half": 2.0,
+    "drift_px": 2.0, "inliers": 4.0, "inlier_share": 4.0, "inlier_spread": 2.0,
+}  # fmt: skip
+BY_PIXELS = {
+    "bias": -12.0, "gradients": 4.0, "gradients_half": 4.0, "colours": 4.0, "colours_half": 4.0, "drift_px": 4.0,
+}  # fmt: skip
+LOCALIZED, UNCERTAIN = 0.9, 0.1
+"""Least probabilities."""
+DOUBTFUL = 0.5
+"""What remains of a good score where the lens is in doubt, or hardly anything is seen."""
+HOPELESS = 0.35
+"""Mean of the scaled signals of a kind, below which nothing was recognised: foreign photos have 0.0 to 0.3."""
+MIN_COVERAGE = 0.04
 ENOUGH_FOCAL_SIGMA = 0.008
 """Of the logarithm: a focal length 1 % off moves the camera by 1 % of the distance."""
 CONTRADICTION = 0.02
@@ -74,88 +103,171 @@ def verify(query: Query, pose: Pose, tools: Tools) -> Verdict:
 
 def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     view, frame = rendered_view(pose, query, tools)
-    photo = photo_features(query, tools)
+    photo, camera = photo_features(query, tools), view.camera
     found = correspondences(photo, view, tools.matcher)
-    intrinsics = view.camera.intrinsics
-    error = reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
-    inlier = error * (intrinsics.long_side / query.intrinsics.long_side) < MAX_ERROR_PX
-    inliers = int(inlier.sum())
-    resized = photo_at(query, tools, intrinsics)
-    agreement, colours = gradient_agreement(resized, frame), colour_agreement(resized, frame)
-    coverage = float((frame.alpha > MIN_ALPHA).mean())
-    answer = Camera(query.intrinsics.resized(intrinsics.width, intrinsics.height), pose)
-    pixels = evidence(resized, frame, view.camera, answer, query.focal_sigma)
-    focal, covariance, focal_sigma = _of_lens(pixels, query.focal_sigma)
-    score, reason = min(
-        (GRADIENTS(agreement), Reason.RENDER_DISAGREES),
-        (COLOURS(colours), Reason.RENDER_DISAGREES),
-        (INLIERS(float(inliers)), Reason.FEW_INLIERS),
-        (COVERAGE(coverage), Reason.LITTLE_SCENE_IN_VIEW),
-        focal,
-    )
-    status = Status.LOCALIZED if score >= 0.5 else Status.UNCERTAIN if score >= 0.25 else Status.NOT_LOCALIZED
-    if status is Status.LOCALIZED:
+    size = camera.intrinsics
+    resized, known = photo_at(query, tools, size), known_at(query, tools, size)
+    answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
+    pixels = evidence(resized, frame, camera, answer, query.focal_sigma, known)
+    signals = pixel_signals(resized, frame, known, size, pixels) | _match_signals(found, frame, query, size, pose)
+    return judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
+
+
+def pixel_signals(
+    photo: UInt8[np.ndarray, "h w 3"],
+    frame: Frame,
+    known: Bool[np.ndarray, "h w"] | None,
+    size: Intrinsics,
+    pixels: Evidence | None,
+) -> dict[str, float]:
+    """Return the signals that need no matches; `pixels` is the evidence for the pose on this frame."""
+    gradients, gradients_half = gradient_agreement(photo, frame, known)
+    colours, colours_half = colour_agreement(photo, frame, known)
+    depth = frame.median_depth[::4, ::4]
+    typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    drift = np.inf
+    if pixels is not None:
+        drift = size.fx * float(np.linalg.norm(pixels.pull[:3]) + np.linalg.norm(pixels.pull[3:]) / typical_depth)
+    return {
+        "gradients": gradients,
+        "gradients_half": gradients_half,
+        "colours": colours,
+        "colours_half": colours_half,
+        "coverage": float((frame.alpha > MIN_ALPHA).mean()),
+        "drift_px": min(drift, 1e3),
+    }
+
+
+def _match_signals(
+    found: Correspondences, frame: Frame, query: Query, size: Intrinsics, pose: Pose
+) -> dict[str, float]:
+    scale = size.long_side / query.intrinsics.long_side
+    error = scale * reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
+    inlier = error < MAX_ERROR_PX
+    opaque = cv2.resize(frame.alpha, (CELLS, CELLS), interpolation=cv2.INTER_AREA) > 0.5 * MIN_ALPHA
+    cell = (found.photo_px[inlier] * (CELLS / np.array([query.intrinsics.width, query.intrinsics.height]))).astype(int)
+    held = np.zeros((CELLS, CELLS), bool)
+    held[tuple(np.clip(cell[:, ::-1], 0, CELLS - 1).T)] = True
+    return {
+        "inliers": float(inlier.sum()),
+        "inlier_share": float(inlier.mean()) if len(inlier) else 0.0,
+        "inlier_spread": float((held & opaque).sum() / max(opaque.sum(), 1)),
+    }
+
+
+def probability(signals: Mapping[str, float]) -> float:
+    """Return how probably a pose with these signals is right, 0..1; without signals of matches by the others."""
+    weights = WITH_MATCHES if "inliers" in signals else BY_PIXELS
+    logit = weights["bias"] + sum(weights[name] * SCALES[name](signals[name]) for name in weights if name != "bias")
+    return float(1.0 / (1.0 + np.exp(-logit)))
+
+
+def judged(
+    signals: Mapping[str, float], pixels: Evidence | None, focal_sigma: float, few_features: bool = False
+) -> Verdict:
+    """Return the verdict on a pose; `focal_sigma` is what was known of the lens."""
+    score = probability(signals)
+    doubt, covariance, sigma = _of_lens(pixels, focal_sigma)
+    if signals["coverage"] < MIN_COVERAGE:
+        doubt = Reason.LITTLE_SCENE_IN_VIEW
+    if score < LOCALIZED:
+        reason = Reason.FEW_FEATURES if few_features else _weakest(signals)
+    elif doubt:
+        score, reason = DOUBTFUL, doubt
+    else:
         reason = Reason.AGREES
-    elif len(photo.scores) < MIN_FEATURES:
-        reason = Reason.FEW_FEATURES
-    elif status is Status.NOT_LOCALIZED and GRADIENTS(agreement) < 0.25 and INLIERS(float(inliers)) < 0.25:
-        reason = Reason.NO_MATCHING_VIEW
-    return Verdict(status, reason, score, inliers, agreement, coverage, covariance, focal_sigma)
+    status = (
+        Status.LOCALIZED if score >= LOCALIZED else Status.UNCERTAIN if score >= UNCERTAIN else Status.NOT_LOCALIZED
+    )
+    inliers, agreement = int(signals.get("inliers", 0)), signals["gradients"]
+    return Verdict(status, reason, score, inliers, agreement, signals["coverage"], covariance, sigma, signals)
+
+
+def _weakest(signals: Mapping[str, float]) -> Reason:
+    """Return why the pose is not believed."""
+    scaled = {name: float(SCALES[name](value)) for name, value in signals.items() if name in SCALES}
+    matches = np.mean([value for name, value in scaled.items() if name.startswith("inlier")] or [1.0])
+    pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")])
+    if max(matches, pixels) < HOPELESS:
+        return Reason.NO_MATCHING_VIEW
+    return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_DISAGREES
 
 
 def _of_lens(
     pixels: Evidence | None, known_sigma: float
-) -> tuple[tuple[float, Reason], Float64[np.ndarray, "6 6"] | None, float]:
-    """Return what the lens does to the score, the pose's covariance, and that of the focal length's logarithm."""
+) -> tuple[Reason | None, Float64[np.ndarray, "6 6"] | None, float]:
+    """Return a doubt about the lens, the pose's covariance, and that of the focal length's logarithm."""
     if pixels is None:
-        return (1.0, Reason.AGREES), None, known_sigma
+        return None, None, known_sigma
     covariance = pixels.covariance[:6, :6] + np.outer(pixels.pull, pixels.pull)
     if known_sigma:
         sigma = max(float(np.sqrt(pixels.covariance[6, 6])), abs(pixels.focal_pull))  # a method may not estimate it
-        return (FOCAL(ENOUGH_FOCAL_SIGMA / sigma), Reason.FOCAL_UNCERTAIN), covariance, sigma
+        return (Reason.FOCAL_UNCERTAIN if sigma > ENOUGH_FOCAL_SIGMA else None), covariance, sigma
     off = abs(pixels.focal_pull)
     contradicted = off > CONTRADICTION and off > 3 * pixels.focal_sigma
-    return (0.4 if contradicted else 1.0, Reason.INTRINSICS_CONTRADICTED), covariance, 0.0
+    return (Reason.INTRINSICS_CONTRADICTED if contradicted else None), covariance, 0.0
 
 
-def gradient_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
-    """Return how well the gradients correlate, -1..1, block by block, where the scene is opaque.
+def gradient_agreement(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
+) -> tuple[float, float]:
+    """Return how well the gradients correlate, -1..1, block by block, where scene and photo are known.
 
-    Blocks weigh by what the render has in them. Those that agree best and hold three quarters of the weight count:
-    a passer-by spoils a few blocks, a wrong pose all.
+    Blocks weigh by what the render has in them. Those that agree best and hold three quarters of the weight count,
+    and for the second value, half of it: a passer-by spoils a few blocks, a wrong pose all.
     """
     height, width = frame.alpha.shape
     factor = GRADIENTS_PX / max(height, width)
     size = (max(BLOCK_PX, round(width * factor)), max(BLOCK_PX, round(height * factor)))
-    opaque = cv2.resize(frame.alpha, size, interpolation=cv2.INTER_AREA) > MIN_ALPHA
+    opaque = cv2.resize(_both_known(frame, known), size, interpolation=cv2.INTER_AREA) > MIN_ALPHA
+    if known is not None:  # the gradients along the unknown's edge are its own
+        opaque = cv2.erode(opaque.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     a, b = (_gradients(image, size) * opaque[..., None] for image in (photo, to_uint8(frame.rgb)))
     ab, aa, weight = _block_sums(a * b), _block_sums(a * a), _block_sums(b * b)
     correlation = ab / np.sqrt(aa * weight + 1e-6)
     worst_first = np.argsort(correlation)
     below = np.cumsum(weight[worst_first])
-    kept = worst_first[below > HIDDEN_SHARE * below[-1]]
-    return float(correlation[kept] @ weight[kept] / max(weight[kept].sum(), 1e-6))
+
+    def best(hidden: float) -> float:
+        kept = worst_first[below > hidden * below[-1]]
+        return float(correlation[kept] @ weight[kept] / max(weight[kept].sum(), 1e-6))
+
+    return best(HIDDEN_SHARE), best(HALF)
 
 
-def colour_agreement(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> float:
-    """Return the correlation of the colours of two thumbnails, -1..1, where the scene is opaque.
+def _both_known(frame: Frame, known: Bool[np.ndarray, "h w"] | None) -> Float32[np.ndarray, "h w"]:
+    return frame.alpha if known is None else frame.alpha * known
 
-    Each channel has its own gain and offset (exposure, white balance); the quarter that fits them worst is left out.
+
+def colour_agreement(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
+) -> tuple[float, float]:
+    """Return the correlation of the colours of two thumbnails, -1..1, where scene and photo are known.
+
+    Each channel has its own gain and offset (exposure, white balance); the quarter, and for the second value the
+    half, that fits them worst is left out.
     """
     height, width = frame.alpha.shape
     factor = COLOUR_PX / max(height, width)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (photo, to_uint8(frame.rgb), frame.alpha)]
+    layers = (photo, to_uint8(frame.rgb), _both_known(frame, known))
+    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in layers]
     opaque = small[2] > MIN_ALPHA
     a, b = (image[opaque].astype(np.float64) for image in small[:2])
     if len(a) < 8:
-        return 0.0
+        return 0.0, 0.0
+    return _correlation(a, b, HIDDEN_SHARE), _correlation(a, b, HALF)
+
+
+def _correlation(a: Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "n 3"], hidden: float) -> float:
+    """Return the correlation of what is left when the share that fits worst is left out, after three fits."""
     kept = np.ones(len(a), bool)
     for _ in range(3):
         x, y = a - a[kept].mean(0), b - b[kept].mean(0)
         gain = (x * y)[kept].sum(0) / np.maximum((y * y)[kept].sum(0), 1e-6)
         misfit = np.abs(x - gain * y).sum(1)
-        kept = misfit <= np.quantile(misfit, 1 - HIDDEN_SHARE)
+        count = len(a) - int(hidden * len(a))
+        kept = misfit <= np.partition(misfit, count - 1)[count - 1]
     x, y = a[kept] - a[kept].mean(0), b[kept] - b[kept].mean(0)
     return float((x * y).sum() / max(np.sqrt((x * x).sum() * (y * y).sum()), 1e-6))
 

@@ -7,9 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from service.geometry import so3_exp
+from service.geometry import look_at, so3_exp
 from service.pose.focus import Focus
+from service.pose.views import View
 from service.types import Pose
+
+NEARER, ROLL_RAD = (-0.4, 0.6), 0.2
+"""How far a sampled pose goes from a view towards what it looks at (share of the way), and how it is turned."""
 
 
 def even_points(count: int, dimensions: int, rng: np.random.Generator) -> Float64[np.ndarray, "count dimensions"]:
@@ -49,3 +53,31 @@ def _undone(pose: Pose, focus: Focus, angles: Float64[np.ndarray, "3"], shift: F
     matrix[:3, :3] = rotation @ pose.world_from_camera[:3, :3]
     matrix[:3, 3] = rotation @ (pose.position_in_world - focus.point_in_world - shift) + focus.point_in_world
     return Pose(matrix)
+
+
+def poses_near_views(
+    views: Sequence[View],
+    scores: Float64[np.ndarray, "views"],
+    roll_rad: float,
+    count: int,
+    rng: np.random.Generator,
+) -> list[Pose]:
+    """Return poses that look at things the views see, from near the views; those with higher scores are likelier.
+
+    `roll_rad` turns the poses about their axes.
+    """
+    weights = np.array([score if len(view.points_in_world) else 0.0 for view, score in zip(views, scores, strict=True)])
+    weights = np.maximum(weights - 0.5 * weights.max(), 1e-9) ** 2
+    poses = []
+    for i in rng.choice(len(views), count, p=weights / weights.sum()):
+        view = views[i]
+        target = view.points_in_world[rng.integers(len(view.points_in_world))].astype(np.float64)
+        from_target = view.camera.pose.position_in_world - target
+        distance = float(np.linalg.norm(from_target))
+        aside = 0.15 * distance * rng.standard_normal(3)
+        position = target + (1 - rng.uniform(*NEARER)) * from_target + aside
+        upright = look_at(position, target, -view.camera.pose.world_from_camera[:3, 1])
+        turn = np.eye(4)
+        turn[:3, :3] = so3_exp(np.array([0.0, 0.0, roll_rad + ROLL_RAD * rng.standard_normal()]))
+        poses.append(Pose(upright.world_from_camera @ turn))
+    return poses

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float32
 
-from service.interfaces import Features, Rasterizer, Tools
+from service.interfaces import Features, Frame, ImageMatcher, Rasterizer, Tools
 from service.pose.views import (
     PHOTO_FEATURES,
     VIEW_FEATURES,
@@ -27,10 +27,27 @@ from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pos
 def render_and_match(
     camera: Camera, rasterizer: Rasterizer, query: Query, tools: Tools
 ) -> tuple[Correspondences, View]:
-    """Render, find features, lift them and match; `camera` has the photo's lens at any size."""
+    """Render, match and lift the matches; `camera` has the photo's lens at any size."""
     (frame,) = rasterizer.render([camera])
+    if tools.image_matcher:
+        return _matched_images(frame, camera, tools.image_matcher, query, tools)
     view = lifted(tools.matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
     return correspondences(_photo_features(camera, query, tools), view, tools.matcher), view
+
+
+def _matched_images(
+    frame: Frame, camera: Camera, matcher: ImageMatcher, query: Query, tools: Tools
+) -> tuple[Correspondences, View]:
+    photo = photo_at(query, tools, camera.intrinsics)
+    pairs = matcher.match_images(photo, to_uint8(frame.rgb))
+    # A point of the render carries its partner in the photo where a feature has its description.
+    view = lifted(Features(pairs.b_px, pairs.confidence, pairs.a_px), frame, camera)
+    partners = view.features.descriptors * _photo_scale(camera.intrinsics, query)
+    return Correspondences(partners, view.features.points_px, view.points_in_world), view
+
+
+def _photo_scale(size: Intrinsics, query: Query) -> Float32[np.ndarray, "2"]:
+    return np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height], np.float32)
 
 
 def match_record(
@@ -53,8 +70,7 @@ def _photo_features(camera: Camera, query: Query, tools: Tools) -> Features:
     key = ("photo_features_at", size.width, size.height)
     if key not in tools.memo:
         found = tools.matcher.extract(photo_at(query, tools, size), PHOTO_FEATURES)
-        scale = np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height], np.float32)
-        tools.memo[key] = Features(found.points_px * scale, found.scores, found.descriptors)
+        tools.memo[key] = Features(found.points_px * _photo_scale(size, query), found.scores, found.descriptors)
     return tools.memo[key]
 
 

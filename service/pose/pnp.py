@@ -35,7 +35,8 @@ def resection(
 ) -> Resection | None:
     """Return the pose that most of the matches agree with, refined on them; None if there is none.
 
-    500 trials find it with 98 % certainty where one match in five is right, 2000 where one in eight is. PoseLib's
+    Matches come surest first: the sampler begins with those (PROSAC, Chum and Matas, CVPR 2005). Without that, 500
+    trials find the pose with 98 % certainty where one match in five is right, 2000 where one in eight is. PoseLib's
     sampler starts from a constant, so the answer is a function of the arguments.
     """
     if len(photo_px) < MIN_POINTS:
@@ -50,6 +51,8 @@ def resection(
         "max_reproj_error": max_error_px,
         "min_iterations": 100,
         "max_iterations": max_trials,
+        "progressive_sampling": True,
+        "max_prosac_iterations": max_trials,
         "seed": 0,
     }
     found, info = poselib.estimate_absolute_pose(

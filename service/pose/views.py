@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.geometry import transformed, unproject
 from service.interfaces import Features, Frame, Matcher, Rasterizer, Tools
@@ -25,6 +25,8 @@ RENDER_PX = 416
 PHOTO_PX = 512
 PHOTO_FEATURES = 2048
 VIEW_FEATURES = 800
+MARGIN_PX = 6
+"""From what is unknown: features there are of its edge."""
 MAX_DEPTH_RANGE = 0.06
 """Relative, over 3x3 pixels: a feature on a depth edge has no certain place."""
 MIN_ALPHA = 0.5
@@ -41,7 +43,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Correspondences:
-    """Matches between the photo and a view, with the scene points behind them."""
+    """Matches between the photo and a view, surest first, with the scene points behind them."""
 
     photo_px: Float32[np.ndarray, "m 2"]
     """In pixels of `Query.rgb`."""
@@ -50,11 +52,12 @@ class Correspondences:
 
     @classmethod
     def pooled(cls, parts: Sequence[Correspondences]) -> Correspondences:
-        """Put the matches with several views together; `view_px` then refers to none of them."""
+        """Put the matches with several views together, by their rank; `view_px` then refers to none of the views."""
+        by_rank = np.argsort(np.concatenate([np.arange(len(part.photo_px)) for part in parts]), kind="stable")
         return cls(
-            np.concatenate([part.photo_px for part in parts]),
-            np.concatenate([part.view_px for part in parts]),
-            np.concatenate([part.points_in_world for part in parts]),
+            np.concatenate([part.photo_px for part in parts])[by_rank],
+            np.concatenate([part.view_px for part in parts])[by_rank],
+            np.concatenate([part.points_in_world for part in parts])[by_rank],
         )
 
 
@@ -75,36 +78,70 @@ def photo_at(query: Query, tools: Tools, size: Intrinsics) -> UInt8[np.ndarray, 
     return tools.memo[key]
 
 
-def photo_features(query: Query, tools: Tools, quarter_turns: int = 0) -> Features:
-    """Return the photo's features, in pixels of `Query.rgb`.
-
-    With `quarter_turns` the photo is turned counter-clockwise before its features are described (learned
-    descriptors stand some 40 degrees of roll); their places are still given in the photo as it is.
-    """
-    key = ("photo_features", quarter_turns)
+def known_at(query: Query, tools: Tools, size: Intrinsics) -> Bool[np.ndarray, "h w"] | None:
+    """Return where the resampled photo is known, pixels that mix with unknown ones left out; None: everywhere."""
+    if query.known is None:
+        return None
+    key = ("known", size.width, size.height)
     if key not in tools.memo:
-        size = sized(query.intrinsics, PHOTO_PX)
-        rgb = photo_at(query, tools, size)
-        found = tools.matcher.extract(np.ascontiguousarray(np.rot90(rgb, quarter_turns)), PHOTO_FEATURES)
-        points = _turned_back(found.points_px, quarter_turns, size.width, size.height)
-        scale = np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height], np.float32)
-        tools.memo[key] = Features(points * scale, found.scores, found.descriptors)
+        share = cv2.resize(query.known.astype(np.float32), (size.width, size.height), interpolation=cv2.INTER_AREA)
+        tools.memo[key] = np.asarray(share) > 0.99
     return tools.memo[key]
 
 
-def _turned_back(
-    points: Float32[np.ndarray, "n 2"], quarter_turns: int, width: int, height: int
-) -> Float32[np.ndarray, "n 2"]:
-    """Return where points of the image turned counter-clockwise lie in the image of width x height."""
-    x, y = points[:, 0], points[:, 1]
-    match quarter_turns % 4:
-        case 1:
-            return np.stack([width - y, x], 1)
-        case 2:
-            return np.stack([width - x, height - y], 1)
-        case 3:
-            return np.stack([y, height - x], 1)
-    return points
+def photo_features(query: Query, tools: Tools, long_side: int = PHOTO_PX, eighths: int = 0) -> Features:
+    """Return the photo's features, found at this size, in pixels of `Query.rgb`.
+
+    The photo is turned counter-clockwise by `eighths` of a turn before its features are described (learned
+    descriptors stand some 30 degrees of roll); their places are still given in the photo as it is.
+    """
+    key = ("photo_features", long_side, eighths)
+    if key not in tools.memo:
+        size = sized(query.intrinsics, long_side)
+        rgb, known = photo_at(query, tools, size), known_at(query, tools, size)
+        turned, turned_from_photo = _turned(rgb, eighths)
+        found = tools.matcher.extract(turned, PHOTO_FEATURES)
+        points = (found.points_px - turned_from_photo[:, 2]) @ turned_from_photo[:, :2]
+        keep = _well_inside(points, known, size, bool(eighths % 2))
+        scale = np.array([query.rgb.shape[1] / size.width, query.rgb.shape[0] / size.height])
+        tools.memo[key] = Features(
+            (points[keep] * scale).astype(np.float32), found.scores[keep], found.descriptors[keep]
+        )
+    return tools.memo[key]
+
+
+def _turned(
+    rgb: UInt8[np.ndarray, "h w 3"], eighths: int
+) -> tuple[UInt8[np.ndarray, "_ _ 3"], Float64[np.ndarray, "2 3"]]:
+    """Return the image turned about its middle on a canvas that holds it, and where its pixels went."""
+    height, width = rgb.shape[:2]
+    if eighths % 8 == 0:
+        return rgb, np.eye(2, 3)
+    cosine, sine = np.cos(eighths * np.pi / 4), np.sin(eighths * np.pi / 4)
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
+    extent = np.abs(rotation) @ [width, height]
+    canvas = (np.ceil(extent / SIZE_MULTIPLE_PX - 1e-6) * SIZE_MULTIPLE_PX).astype(int)
+    shift = canvas / 2 - rotation @ [width / 2, height / 2]
+    # OpenCV counts from the centre of the first pixel.
+    shift_cv = shift - 0.5 + rotation @ [0.5, 0.5]
+    matrix = np.concatenate([rotation, shift_cv[:, None]], 1)
+    turned = cv2.warpAffine(rgb, matrix, (int(canvas[0]), int(canvas[1])), flags=cv2.INTER_LINEAR)
+    return np.asarray(turned), np.concatenate([rotation, shift[:, None]], 1)
+
+
+def _well_inside(
+    points: Float64[np.ndarray, "n 2"], known: Bool[np.ndarray, "h w"] | None, size: Intrinsics, cut: bool
+) -> Bool[np.ndarray, "n"]:
+    """Return which points lie away from what is unknown and, if the image's edges became lines in it, from those."""
+    keep = np.ones(len(points), bool)
+    if cut:
+        keep &= ((points > MARGIN_PX) & (points < np.array([size.width, size.height]) - MARGIN_PX)).all(1)
+    if known is not None:
+        around = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+        safe = cv2.erode(known.astype(np.uint8), around, borderType=cv2.BORDER_REPLICATE) > 0
+        column, row = np.clip(points.astype(int), 0, [size.width - 1, size.height - 1]).T
+        keep &= safe[row, column]
+    return keep
 
 
 def render_views(cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Matcher) -> list[tuple[View, Frame]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from types import ModuleType
@@ -28,11 +28,18 @@ SCENE_SUFFIXES = (".ply", ".splat", ".spz", ".ksplat", ".sog")
 log = logging.getLogger(__name__)
 
 
-def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: bool = True) -> GaussianScene:
+def load_scene(
+    path: Path,
+    *,
+    without_photos: Collection[str] = (),
+    cameras: bool = True,
+    training: Sequence[NamedCamera] | None = None,
+) -> GaussianScene:
     """Read a scene folder, or a bare scene file. Raises SceneError.
 
     `without_photos` are names of photos whose cameras are not even read (a bench's queries); see `same_photo`.
-    With `cameras=False` nothing is taken from the training cameras but the size of their photos.
+    With `cameras=False` nothing is taken from the training cameras but the size of their photos. `training` are
+    cameras in the scene file's frame in the place of those that the folder has.
     """
     path = Path(path)
     if not path.exists():
@@ -45,9 +52,9 @@ def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: boo
     def keep(name: str) -> bool:
         return not any(same_photo(name, photo) for photo in without_photos)
 
-    training = _training(path, manifest, keep) if path.is_dir() else _Training()
-    size = manifest.training_size or _median_size(training.cameras)
-    used = training.cameras if cameras else ()
+    found = _training(path, manifest, keep) if path.is_dir() and training is None else _Training(tuple(training or ()))
+    size = manifest.training_size or _median_size(found.cameras)
+    used = found.cameras if cameras else ()
     focal_px = _training_focal_px(used, manifest.training_size)
     if manifest.world_from_scene is not None:
         raw = moved_gaussians(raw, manifest.world_from_scene)
@@ -55,9 +62,9 @@ def load_scene(path: Path, *, without_photos: Collection[str] = (), cameras: boo
     info = SceneInfo(
         id=path.resolve().name if path.is_dir() else path.stem,
         name=manifest.name or (path.resolve().name if path.is_dir() else path.stem),
-        sha256=_digest(file, path, used, (training.background, size, focal_px)),
+        sha256=_digest(file, path, used, (found.background, size, focal_px)),
         format=reader.__name__.rsplit(".", 1)[-1],
-        background_rgb=manifest.background or training.background or (0.0, 0.0, 0.0),
+        background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
         up_in_world=manifest.up,
         metres_per_unit=manifest.metres_per_unit,
         render_mode=mode,

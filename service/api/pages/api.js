@@ -10,16 +10,20 @@ export class Problem extends Error {
   }
 }
 
-export async function ask(path, init) {
+/** Return the service's answer. Raises Problem. */
+export async function send(path, init) {
   let response;
   try {
     response = await fetch(path, init);
   } catch {
     throw new Problem({ detail: "The service can't be reached.", hint: "Is it running?" }, 0);
   }
-  const body = await response.json().catch(() => null);
-  if (!response.ok) throw new Problem(body, response.status);
-  return body;
+  if (!response.ok) throw new Problem(await response.json().catch(() => null), response.status);
+  return response;
+}
+
+export async function ask(path, init) {
+  return (await send(path, init)).json().catch(() => null);
 }
 
 /** Tell whether the service answers only those who have a key: this page itself has a cookie instead. */

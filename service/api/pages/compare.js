@@ -28,7 +28,7 @@ function compared(jobs, [sceneA, sceneB]) {
       job.result ? pairs[i].element : h("p", {}, "There is no result.")))),
     blendSlider(pairs),
     h("div", { class: "scroll" }, h("table", {}, h("thead", {}, h("tr", {}, h("td", {}),
-      jobs.map((_, i) => h("th", { scope: "col" }, "AB"[i])))), h("tbody", {}, differences(jobs)))),
+      jobs.map((_, i) => h("th", { scope: "col" }, "AB"[i])))), h("tbody", {}, differences(jobs, sceneA)))),
     h("p", { class: "buttons" }, jobs.map((job, i) => h("a", { class: "button", href: job.links.viewer }, `${"AB"[i]} in the viewer`))),
   ];
 }
@@ -40,12 +40,18 @@ function apart([a, b], sceneA, sceneB) {
   return `The poses are ${degrees(angle)} and ${length(distance, sceneA?.metres_per_unit)} apart.`;
 }
 
-function differences(jobs) {
+/** How far the answer is from the true pose, where that was sent. */
+function error({ result, truth }) {
+  return result && truth ? poseDistance(result.pose, truth) : [null, null];
+}
+
+function differences(jobs, scene) {
   const rows = {
     scene: job => job.scene, estimator: job => job.estimator, options: job => JSON.stringify(job.options), seed: job => job.seed,
     prior: job => (job.prior ? "given" : "none"), "intrinsics from": job => job.result?.intrinsics_source,
     reason: job => words(job.result?.reason), score: job => job.result?.score.toFixed(3), inliers: job => job.result?.inliers,
     agreement: job => job.result?.agreement.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
+    "error of rotation": job => degrees(error(job)[0]), "error of position": job => length(error(job)[1], scene?.metres_per_unit),
     "σ of rotation": job => degrees(job.result?.covariance?.sigma_deg), steps: job => job.records,
     "wall time": job => seconds(sum(job, "wall_s")), "CPU time": job => seconds(sum(job, "cpu_s")),
   };

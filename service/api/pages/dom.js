@@ -21,6 +21,11 @@ export function words(name) {
   return (name ?? "").replaceAll("_", " ");
 }
 
+/** The words of a name, as a sentence begins. */
+export function sentence(name) {
+  return words(name).replace(/^./, letter => letter.toUpperCase());
+}
+
 export function count(number) {
   return number === null || number === undefined ? "–" : number.toLocaleString("en");
 }
@@ -30,7 +35,7 @@ export function bytes(number) {
   const units = ["B", "kB", "MB", "GB"];
   let power = 0;
   while (number >= 1000 && power < units.length - 1) [number, power] = [number / 1000, power + 1];
-  return `${number < 10 && power ? number.toFixed(1) : Math.round(number)} ${units[power]}`;
+  return `${number < 10 && power ? number.toFixed(1) : Math.round(number)}\u00a0${units[power]}`;
 }
 
 export function seconds(value) {

@@ -1,7 +1,7 @@
 // All jobs, newest first, with filters; two of them can be compared.
 
 import { ask } from "./api.js";
-import { badge, h, seconds, when, words } from "./dom.js";
+import { badge, h, seconds, when } from "./dom.js";
 
 const PAGE = 30;
 const FILTERS = {
@@ -72,7 +72,7 @@ function row(job, marked, compare) {
     h("td", {}, h("a", { href: `#/jobs/${job.id}`, class: "photo" }, picture, h("span", {}, name))),
     h("td", {}, badge(job.status ?? job.state)),
     h("td", { class: "number" }, job.score === null ? "–" : job.score.toFixed(2)),
-    h("td", {}, job.scene), h("td", {}, words(job.estimator)),
+    h("td", {}, job.scene), h("td", {}, job.estimator),
     h("td", { class: "number" }, seconds(took)), h("td", {}, when(job.created)),
     h("td", {}, h("a", { href: job.links.viewer, "aria-label": `${name} in the viewer` }, "viewer")));
 }

@@ -44,7 +44,8 @@ function progress(view, job) {
     await ask(job.links.self, { method: "DELETE" }).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
   });
   view.main.replaceChildren(h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
-    h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages, cancel)));
+    h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages,
+      h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Watch it in the viewer"), cancel))));
 
   const state = { latest: null, usual: null, from: job.started ? Date.parse(job.started) : null };
   usualTime(job).then(usual => { state.usual = usual; });

@@ -15,6 +15,7 @@ export class OptionsForm {
     this.budget = input({ type: "number", min: 0, step: "any", placeholder: "none" });
     this.keep = h("input", { type: "checkbox" });
     this.numbers = Object.fromEntries(NUMBERS.map(name => [name, input({ type: "number", step: "any" })]));
+    this.approximate = h("input", { type: "checkbox" });
     this.model = input({ placeholder: "PINHOLE" });
     this.distortion = input({ placeholder: "k1, k2, …" });
     this.poses = { prior: new PoseField(), truth: new PoseField() };
@@ -25,10 +26,10 @@ export class OptionsForm {
         field("Time budget, seconds", this.budget),
         field("Keep the photo", this.keep, "As long as the job; else it is deleted soon after it.")), this.options),
       group("Intrinsics of the upright photo, in pixels",
-        h("div", { class: "grid" }, NUMBERS.map(name => field(name, this.numbers[name])),
-          field("Camera model (COLMAP's name)", this.model), field("Distortion", this.distortion)),
-        h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data, or guessed; "
-          + "with a guess the answer is at best uncertain.")),
+        h("div", { class: "grid narrow" }, NUMBERS.map(name => field(name, this.numbers[name]))),
+        h("div", { class: "grid" }, field("Camera model, by COLMAP's name", this.model), field("Distortion", this.distortion),
+          field("Approximate", this.approximate, "The focal length is where the search begins.")),
+        h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data or guessed, then estimated with the pose.")),
       group("Prior pose, a guess to start from", this.poses.prior.element),
       group("True pose, to measure errors against: the search does not see it", this.poses.truth.element));
   }
@@ -50,6 +51,7 @@ export class OptionsForm {
     const intrinsics = Object.fromEntries(
       NUMBERS.filter(name => this.numbers[name].value).map(name => [name, Number(this.numbers[name].value)]));
     if (this.model.value.trim()) intrinsics.model = this.model.value.trim();
+    if (this.approximate.checked) intrinsics.trust = "approximate";
     if (this.distortion.value.trim()) intrinsics.distortion = numbersIn(this.distortion.value);
     if (Object.keys(intrinsics).length) fields.intrinsics = JSON.stringify(intrinsics);
     for (const [name, pose] of Object.entries(this.poses)) {
@@ -80,7 +82,7 @@ class PoseField {
       ["world_from_camera opengl", "world from camera, OpenGL axes (Blender, nerfstudio)"],
       ["camera_from_world opencv", "camera from world, OpenCV axes (COLMAP)"],
     ]);
-    this.element = h("div", {}, h("div", { class: "grid" }, field("Given as", this.kind)), field("Matrix", this.matrix));
+    this.element = h("div", {}, field("Given as", this.kind), field("Matrix", this.matrix));
   }
 
   value() {

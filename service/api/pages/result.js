@@ -2,7 +2,7 @@
 
 import { ask, asksForKey } from "./api.js";
 import { blend, blendSlider } from "./blend.js";
-import { badge, copyButton, degrees, facts, h, length, seconds, when, words } from "./dom.js";
+import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
 import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
 import { submit, told } from "./start.js";
 import { recalled } from "./sent.js";
@@ -25,7 +25,7 @@ function verdict({ result, error, state }) {
   if (!result) return [h("p", { class: "lead" }, error ? `${error.detail} ${error.hint}` : `The job was ${state}.`)];
   const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
   return [
-    h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, words(result.reason)), ". ", lead)),
+    h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, `${sentence(result.reason)}.`), " ", lead)),
     ...result.warnings.map(warning => h("p", { class: "warning" }, warning)),
   ];
 }
@@ -41,12 +41,12 @@ function pictures(job) {
 }
 
 function poses(job) {
-  const unsure = job.result.status !== "localized";
+  const { status } = job.result;
   return [
     h("h2", {}, "Pose"),
-    ...(unsure ? [h("p", { class: "warning" }, "The best guess. Don't rely on it.")] : []),
+    ...(status !== "localized" ? [h("p", { class: "warning" }, "The best guess. Don't rely on it.")] : []),
     ...poseFormats(job).map(([name, text], index) => {
-      const details = h("details", { class: "pose", open: index === 0 }, h("summary", {}, name), h("pre", { tabIndex: 0 }, text));
+      const details = h("details", { class: "pose", open: index === 0 && status !== "not_localized" }, h("summary", {}, name), h("pre", { tabIndex: 0 }, text));
       return h("div", { class: "poserow" }, details, copyButton(() => text, name));
     }),
   ];
@@ -68,10 +68,15 @@ function numbers(job, scene) {
     ["σ of position", covariance && length(covariance.sigma_units, scale)],
     ["Error of rotation", job.truth && degrees(angle)],
     ["Error of position", job.truth && length(distance, scale)],
-    ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${result.intrinsics_source}`],
+    ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${lens(result)}`],
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(
     result.timings.map(t => [words(t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
+}
+
+function lens({ intrinsics, intrinsics_source: source }) {
+  const from = source === "exif" ? "from EXIF" : source;
+  return intrinsics.trust === "approximate" ? `${from}, then estimated with the pose` : from;
 }
 
 function taking(job) {

@@ -2,6 +2,7 @@
 
 import { ask } from "./api.js";
 import { bytes, count, h, words } from "./dom.js";
+import { viewOf } from "./example.js";
 import { OptionsForm } from "./options.js";
 import { remember } from "./sent.js";
 
@@ -13,21 +14,22 @@ export function show(main) {
   document.title = "splatfix";
   alertLine = h("p", { class: "trouble", role: "alert", hidden: true });
   const scenes = h("fieldset", { class: "scenes" }, h("legend", {}, "Scene"), h("p", { class: "quiet" }, "Loading…"));
+  const example = exampleButton();
   main.append(
     h("h1", {}, "Where was this photo taken?"),
     h("p", { class: "lead" }, "splatfix finds the camera's pose of a photo inside a 3D Gaussian Splatting scene."),
-    alertLine, picker(), scenes, more(),
+    alertLine, picker(example), scenes, more(),
   );
   const timer = { id: null };
-  listScenes(scenes, timer);
+  listScenes(scenes, timer, example);
   return () => { clearTimeout(timer.id); alertLine = null; };
 }
 
-/** Send a photo with what is chosen, and go to its job. Raises Problem. */
-export async function submit(file) {
+/** Send a photo with what is chosen, and go to its job; `known` are fields that go before those. Raises Problem. */
+export async function submit(file, known = {}) {
   if (!file) return;
   if (alertLine) alertLine.hidden = true;
-  const fields = chosen.form ? chosen.form.fields() : {};
+  const fields = { ...(chosen.form ? chosen.form.fields() : {}), ...known };
   const scene = chosen.scene ?? await onlyScene();
   if (scene) fields.scene = scene;
   const body = new FormData();
@@ -56,7 +58,23 @@ async function onlyScene() {
   return scenes.find(scene => scene.state === "ready")?.id ?? null;
 }
 
-function picker() {
+/** For who has no photo of the scene; hidden where the scene has no cameras to look from. */
+function exampleButton() {
+  const button = h("button", { type: "button", hidden: true }, "Try a view of the scene");
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    try {
+      const { file, fields } = await viewOf(chosen.scene);
+      await submit(file, fields);
+    } catch (error) {
+      told(error);
+    }
+    button.disabled = false;
+  });
+  return button;
+}
+
+function picker(example) {
   const hasCamera = navigator.maxTouchPoints > 0;  // a phone or tablet
   const pick = h("input", { type: "file", accept: "image/*,.heic,.heif", id: "photo", class: "sr" });
   const shoot = h("input", { type: "file", accept: "image/*", id: "shoot", class: "sr", capture: "environment" });
@@ -71,7 +89,7 @@ function picker() {
     h("p", {}, h("strong", {}, "Drop a photo here"), ", paste it, or"),
     h("div", { class: "buttons" },
       pick, h("label", { for: "photo", class: "button primary" }, "Choose a photo"),
-      ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : [])));
+      ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : []), example));
 }
 
 function more() {
@@ -92,7 +110,7 @@ function more() {
   return details;
 }
 
-async function listScenes(place, timer) {
+async function listScenes(place, timer, example) {
   let scenes;
   try {
     ({ scenes } = await ask("scenes"));
@@ -103,10 +121,15 @@ async function listScenes(place, timer) {
   }
   if (!scenes.some(scene => scene.id === chosen.scene)) chosen.scene = null;
   chosen.scene ??= (scenes.find(scene => scene.state === "ready") ?? scenes[0])?.id ?? null;
+  const choose = id => {
+    chosen.scene = id;
+    example.hidden = !scenes.some(scene => scene.id === id && scene.state === "ready" && scene.cameras);
+  };
+  choose(chosen.scene);
   place.replaceChildren(h("legend", {}, "Scene"),
-    scenes.length ? h("div", { class: "cards" }, scenes.map(card)) : h("p", {}, "No scene is loaded."));
+    scenes.length ? h("div", { class: "cards" }, scenes.map(scene => card(scene, choose))) : h("p", {}, "No scene is loaded."));
   if (scenes.some(scene => ["loading", "preparing"].includes(scene.state))) {
-    timer.id = setTimeout(() => listScenes(place, timer), 1000);
+    timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
   }
 }
 
@@ -119,15 +142,15 @@ function keyForm() {
       h("button", {}, "Enter")));
 }
 
-function card(scene) {
+function card(scene, choose) {
   const radio = h("input", { type: "radio", name: "scene", value: scene.id, checked: scene.id === chosen.scene });
-  radio.addEventListener("change", () => { chosen.scene = scene.id; });
+  radio.addEventListener("change", () => choose(scene.id));
   const ready = scene.gaussians !== null;
   const picture = ready
     ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
     : h("span", { class: "nopicture" });
   const size = ready
-    ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)} cameras · ${bytes(scene.memory_bytes)}`
+    ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)}`
     : scene.error?.detail ?? "";
   return h("label", { class: "card" }, radio, picture,
     h("span", { class: "name" }, scene.name),

@@ -1,0 +1,199 @@
+"""Data sets in the layouts that they are published in: photos to localize with their truth, and training cameras.
+
+    nerf_synthetic  transforms_train.json, transforms_test.json (Blender); cut-out photos over white
+    llff            poses_bounds.npy and images*/; every eighth photo by name is a test photo
+    mipnerf360      sparse/0 (COLMAP) and images*/; likewise
+    deep_blending   sparse/0 and images/; likewise
+    nerfstudio      transforms.json; its test_filenames, else a tenth of the photos, evenly spread
+    scene           our scene folder, see `find_photos`
+
+The trained scene lies in the folder, too, or elsewhere; it must be in the data set's world frame. Where photos come
+in several sizes (images, images_2, ...), the smallest with a long side of 800 px or more are taken: the supplement's
+size, and what scenes of these data sets are trained at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.bench.queries import HOLD_OUT_EVERY, BenchPhoto, find_photos, moved_camera
+from service.errors import CorruptScene, InvalidImage, InvalidPrior, SceneNotFound, UnknownName
+from service.images import photo_size
+from service.scene_formats.colmap import read_cameras
+from service.scene_formats.folder import COLMAP_FOLDER
+from service.scene_formats.manifest import MANIFEST, read_manifest
+from service.scene_formats.nerfstudio import TransformsFile
+from service.types import Camera, Intrinsics, NamedCamera, Pose
+
+WHITE = (1.0, 1.0, 1.0)
+NERFSTUDIO_TRAINS_ON = 0.9
+LEAST_LONG_SIDE_PX = 800
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic")
+OPENCV_FROM_LLFF = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""LLFF's camera axes are down, right, backwards."""
+
+
+@dataclass(frozen=True, slots=True)
+class DataSet:
+    layout: str
+    test: tuple[BenchPhoto, ...]
+    """With their truth in the world frame."""
+    training: tuple[NamedCamera, ...] | None
+    """In the scene file's frame; None: those that the scene folder has, less the test photos."""
+    background_rgb: tuple[float, float, float] | None = None
+    """The layout's own; None: the scene's."""
+
+    @property
+    def held_back(self) -> list[str]:
+        return [name for photo in self.test for name in photo.names]
+
+
+@dataclass(frozen=True, slots=True)
+class _Photo:
+    file: Path
+    camera: NamedCamera
+
+
+def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None) -> DataSet:
+    """Read a data set; `scene` is the folder or file of its trained scene. Raises UnknownName, SceneError."""
+    if layout not in ("auto", *LAYOUTS):
+        raise UnknownName(f"there is no layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
+    if not folder.is_dir():
+        raise SceneNotFound("there is no such folder.", where=str(folder))
+    if layout == "auto":
+        layout = detected(folder)
+    if layout == "scene":
+        return DataSet(layout, tuple(find_photos(folder)), None)
+    test, training = LAYOUTS[layout](folder)
+    if not test:
+        raise SceneNotFound(f"there are no test photos in layout '{layout}'.", where=str(folder))
+    place = scene if scene is not None and scene.is_dir() else folder
+    world_from_scene = read_manifest(place).world_from_scene
+    photos = [
+        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), (p.file.name,)) for p in test
+    ]
+    background = WHITE if layout == "nerf_synthetic" else None
+    return DataSet(layout, tuple(photos), tuple(p.camera for p in training), background)
+
+
+def detected(folder: Path) -> str:
+    """Return the layout that the folder's files tell. Raises SceneNotFound."""
+    has = {name: (folder / name).exists() for name in ("truth.json", MANIFEST, "poses_bounds.npy", "transforms.json")}
+    if has["truth.json"] or has[MANIFEST]:
+        return "scene"
+    if (folder / "transforms_train.json").is_file() and (folder / "transforms_test.json").is_file():
+        return "nerf_synthetic"
+    if (folder / COLMAP_FOLDER).is_dir() and not has["transforms.json"]:
+        return "mipnerf360" if has["poses_bounds.npy"] else "deep_blending"
+    if has["poses_bounds.npy"]:
+        return "llff"
+    if has["transforms.json"]:
+        return "scene"
+    raise SceneNotFound(f"no layout of a data set; known: {', '.join(LAYOUTS)}.", where=str(folder))
+
+
+def _nerf_synthetic(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
+    return tuple(  # type: ignore[return-value]
+        _of_transforms(TransformsFile.open(folder / f"transforms_{part}.json"), None) for part in ("test", "train")
+    )
+
+
+def _nerfstudio(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
+    file = TransformsFile.open(folder / "transforms.json")
+    names, listed = sorted(file.frames), file.split("test")
+    if listed is None:
+        count = int(np.ceil(NERFSTUDIO_TRAINS_ON * len(names)))
+        kept = {names[i] for i in np.linspace(0, len(names) - 1, count, dtype=int)}
+        return _of_transforms(file, [n for n in names if n not in kept]), _of_transforms(file, sorted(kept))
+    return _of_transforms(file, listed), _of_transforms(file, [n for n in file.training_photos() if n not in listed])
+
+
+def _of_transforms(file: TransformsFile, names: Sequence[str] | None) -> list[_Photo]:
+    folder = file.path.parent
+    manifest = read_manifest(folder)
+    return [
+        _Photo(file.photo_file(name) or folder / name, file.camera(name, manifest)) for name in names or file.frames
+    ]
+
+
+def _llff(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
+    """Rows of 17 numbers: a 3 x 5 matrix (camera axes, position, height-width-focal), near and far."""
+    path = folder / "poses_bounds.npy"
+    try:
+        rows = np.load(path, allow_pickle=False)
+        if rows.ndim != 2 or rows.shape[1] != 17:
+            raise ValueError(f"its shape is {rows.shape}, not (photos, 17)")
+    except (ValueError, OSError, EOFError) as error:
+        raise CorruptScene(f"not LLFF's poses: {error}.", where=path.name) from None
+    files = _photo_files(folder, len(rows))
+    photos = [_Photo(file, _llff_camera(file, row[:15].reshape(3, 5))) for file, row in zip(files, rows, strict=True)]
+    return _held_out(photos)
+
+
+def _llff_camera(file: Path, values: Float64[np.ndarray, "3 5"]) -> NamedCamera:
+    matrix = np.eye(4)
+    matrix[:3, :3] = values[:, :3] @ OPENCV_FROM_LLFF.T
+    matrix[:3, 3] = values[:, 3]
+    height, width, focal = values[:, 4]
+    try:
+        camera = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
+        return NamedCamera(file.name, Camera(_at_size_of(file, camera), Pose(matrix)))
+    except InvalidPrior as error:
+        raise CorruptScene(str(error), where=f"poses_bounds.npy, {file.name}") from None
+
+
+def _colmap(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
+    cameras = read_cameras(folder / COLMAP_FOLDER, lambda name: True)
+    files = {file.stem: file for file in _photo_files(folder, None)}
+    photos = []
+    for named in cameras:
+        file = files.get(Path(named.name).stem, folder / "images" / named.name)
+        camera = Camera(_at_size_of(file, named.camera.intrinsics), named.camera.pose)
+        photos.append(_Photo(file, NamedCamera(named.name, camera)))
+    return _held_out(photos)
+
+
+def _held_out(photos: list[_Photo]) -> tuple[list[_Photo], list[_Photo]]:
+    """Every eighth by name, from the first."""
+    return photos[::HOLD_OUT_EVERY], [p for i, p in enumerate(photos) if i % HOLD_OUT_EVERY]
+
+
+def _photo_files(folder: Path, count: int | None) -> list[Path]:
+    """Return the photos of the size to use, by name. Raises SceneNotFound, CorruptScene."""
+    sizes = {}
+    for place in sorted(folder.glob("images*")):
+        files = sorted(p for p in place.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES) if place.is_dir() else []
+        if files and count in (None, len(files)):
+            sizes[max(_size_of(files[0]))] = files
+    if not sizes:
+        number = "" if count is None else f"{count} "
+        raise SceneNotFound(f"there is no images folder with {number}photos.", where=str(folder))
+    enough = [size for size in sizes if size >= LEAST_LONG_SIDE_PX]
+    return sizes[min(enough) if enough else max(sizes)]
+
+
+def _at_size_of(file: Path, intrinsics: Intrinsics) -> Intrinsics:
+    return intrinsics.resized(*_size_of(file))
+
+
+def _size_of(file: Path) -> tuple[int, int]:
+    try:
+        return photo_size(file)
+    except (InvalidImage, OSError) as error:
+        raise CorruptScene(f"the photo has no size: {error}", where=str(file.name)) from None
+
+
+LAYOUTS: dict[str, Callable[[Path], tuple[list[_Photo], list[_Photo]]]] = {
+    "nerf_synthetic": _nerf_synthetic,
+    "llff": _llff,
+    "mipnerf360": _colmap,
+    "deep_blending": _colmap,
+    "nerfstudio": _nerfstudio,
+    "scene": lambda folder: ([], []),
+}
+"""Name -> test and training photos, in the scene file's frame."""

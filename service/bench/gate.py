@@ -1,0 +1,297 @@
+"""`splatfix bench gate`: gather right and wrong poses, fit the verification gate's weights, and test them.
+
+Right poses are the estimator's answers to test photos, as they are and spoilt within reason, that lie within the
+bound. Wrong ones are made by stress:
+
+    foreign     photos of the other scenes, localized in this one      garbage   patterns, noise and text, localized
+    mirrored    the test photos, left and right exchanged, localized   beyond    spoilt beyond reason, localized
+    moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are
+    drifted     the same, aligned from there, where that doesn't lead back
+
+The weights are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a result is
+of those tests. The weights in `service/pose/gate.py` are the fit on all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from service.bench.localize import Subject, subject
+from service.bench.metrics import COARSE, errors, nees
+from service.bench.queries import sent
+from service.estimators.view_index import Options
+from service.geometry import moved
+from service.images import encode_image, read_query, resized
+from service.interfaces import Tools
+from service.localize import Request, localize
+from service.pose.alignment import align
+from service.pose.gate import BY_PIXELS, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.views import photo_at, rendered_frame
+from service.types import Camera, Intrinsics, Pose, Query, Reason, Verdict
+
+WITHIN_REASON: tuple[tuple[str, ...], ...] = (
+    (), ("gain=0.7",), ("gain=1.4",), ("gamma=0.6",), ("gamma=1.6",), ("white_balance=1.25",), ("blur=4",),
+    ("noise=0.1",), ("jpeg=20",), ("scale=0.5",), ("occlusion=0.2",), ("occlusion=0.35",), ("roll=45",), ("crop=0.5",),
+)  # fmt: skip
+BEYOND: tuple[tuple[str, ...], ...] = (
+    ("occlusion=0.6",), ("occlusion=0.75",), ("blur=14",), ("noise=0.4",), ("crop=0.2",), ("crop=0.12",),
+)  # fmt: skip
+MOVES = 6
+"""A photo."""
+MOVED_UNITS, MOVED_DEG = (0.06, 1.5), 8.0
+FOREIGN = 8
+"""Photos of each other scene."""
+GARBAGE = 8
+PENALTY = 0.02
+"""On the squared weights, against certainty that few samples don't give."""
+BINS = 10
+OF_THE_LENS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED, Reason.LITTLE_SCENE_IN_VIEW)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    scene: str
+    kind: str
+    photo: str
+    right: bool
+    signals: Mapping[str, float]
+    doubted: bool
+    """For another reason than the signals: never localized."""
+    nees: float | None
+
+
+def run(
+    folders: Sequence[Path],
+    *,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+    cache_dir: Path | None = None,
+) -> dict[str, Any]:
+    """Return the object that `--json` writes. Raises SceneError."""
+    subjects = [subject(Path(folder), cache_dir=cache_dir) for folder in folders]
+    samples: list[Sample] = []
+    total = sum(len(one.photos) for one in subjects)
+    done = 0
+    for one in subjects:
+        one.loaded.prepare("view_index")
+        rng = np.random.default_rng(seed)
+        for photo in one.photos:
+            samples += _of_photo(one, photo, rng)
+            done += 1
+            if progress:
+                progress(done, total)
+        samples += _foreign(one, [other for other in subjects if other is not one])
+    return summary(samples) | {"samples": [_line(sample) for sample in samples]}
+
+
+def _line(sample: Sample) -> dict[str, Any]:
+    names = ("scene", "kind", "photo", "right", "doubted", "nees")
+    return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
+
+
+def _of_photo(one: Subject, photo: Any, rng: np.random.Generator) -> Iterator[Sample]:
+    """Yield the samples of one test photo."""
+    for modify in (*WITHIN_REASON, *BEYOND):
+        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)))
+        query = read_query(file.data, intrinsics=file.told, background_rgb=one.background_rgb)
+        kind = ("beyond " if modify in BEYOND else "") + ("clean" if not modify else modify[0])
+        yield _localized(one, kind, photo.name, query, file.truth.pose)
+    data = photo.path.read_bytes()
+    query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=one.background_rgb)
+    yield _localized(one, "mirrored", photo.name, _mirrored(query), None)
+    for _ in range(MOVES):
+        pose = _moved(photo.camera.pose, one, rng)
+        tools = _tools(one)
+        yield _sample(one, "moved", photo.name, photo.camera.pose, pose, verify(query, pose, tools))
+        frame, camera = rendered_frame(pose, query, tools)
+        size = camera.intrinsics
+        start = Camera(query.intrinsics.resized(size.width, size.height), pose)
+        found = align(photo_at(query, tools, size), frame, camera, start, 2)
+        if np.isfinite(found.loss):
+            verdict = verify(query, found.pose, _tools(one))
+            yield _sample(one, "drifted", photo.name, photo.camera.pose, found.pose, verdict)
+
+
+def _foreign(one: Subject, others: Sequence[Subject]) -> Iterator[Sample]:
+    """Yield what becomes of photos that don't show the scene."""
+    for other in others:
+        for photo in other.photos[:FOREIGN]:
+            lens, data = photo.camera.intrinsics, photo.path.read_bytes()
+            query = read_query(data, intrinsics=lens, background_rgb=one.background_rgb)
+            yield _localized(one, "foreign", photo.name, query, None)
+    for number in range(GARBAGE):
+        picture = garbage(number)
+        height, width = picture.shape[:2]
+        lens = Intrinsics(width, height, 0.8 * width, 0.8 * width, width / 2, height / 2)
+        query = read_query(encode_image(picture, "png"), intrinsics=lens, background_rgb=one.background_rgb)
+        yield _localized(one, "garbage", str(number), query, None)
+
+
+def garbage(number: int) -> np.ndarray:
+    """Return a picture of nothing: one colour, noise, ramp, blotches, chequers, stripes, rectangles, soft noise."""
+    rng = np.random.default_rng(number)
+    height, width = 480, 640
+    picture = np.full((height, width, 3), 0.5, np.float32)
+    match number % GARBAGE:
+        case 1:
+            picture = rng.uniform(size=picture.shape)
+        case 2:
+            picture[:] = np.linspace(0, 1, width)[None, :, None]
+        case 3:
+            picture = resized(rng.uniform(size=(12, 16, 3)).astype(np.float32), width, height)
+        case 4:
+            picture[:] = (np.indices((height, width)).sum(0) // 20 % 2)[..., None]
+        case 5:
+            picture[:] = rng.integers(0, 2, width // 4).repeat(4)[None, :, None]
+        case 6:
+            for _ in range(200):
+                (left, right), (top, bottom) = rng.integers(0, width, 2), rng.integers(0, height, 2)
+                picture[min(top, bottom) : max(top, bottom), min(left, right) : max(left, right)] = rng.uniform(size=3)
+        case 7:
+            picture = resized(rng.uniform(size=(120, 160, 3)).astype(np.float32), width, height)
+    return np.clip(picture, 0, 1).astype(np.float32)
+
+
+def _mirrored(query: Query) -> Query:
+    lens = replace(query.intrinsics, cx=query.intrinsics.width - query.intrinsics.cx)
+    return replace(query, rgb=np.ascontiguousarray(query.rgb[:, ::-1]), intrinsics=lens)
+
+
+def _moved(pose: Pose, one: Subject, rng: np.random.Generator) -> Pose:
+    """Return the pose turned and shifted in a random direction, by a distance even on a logarithmic scale."""
+    turn, shift = rng.standard_normal((2, 3))
+    turn *= np.radians(rng.uniform(0, MOVED_DEG)) / np.linalg.norm(turn)
+    units = np.exp(rng.uniform(*np.log(MOVED_UNITS)))
+    shift *= units / one.units.units_per_scene_unit / np.linalg.norm(shift)
+    return moved(pose, np.concatenate([turn, shift]))
+
+
+def _tools(one: Subject) -> Tools:
+    loaded = one.loaded
+    rng = np.random.default_rng(0)
+    return Tools(loaded.scene, loaded.rasterizer, loaded.matcher, rng, loaded.prepare("view_index"))
+
+
+def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | None) -> Sample:
+    estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
+    weighed = nees(estimate, truth) if truth else None
+    return _sample(one, kind, photo, truth, estimate.pose, estimate.verdict, weighed)
+
+
+def _sample(
+    one: Subject, kind: str, photo: str, truth: Pose | None, pose: Pose, verdict: Verdict, weighed: float | None = None
+) -> Sample:
+    right = False
+    if truth is not None:
+        degrees, units = errors(pose, truth, one.units)
+        right = degrees <= COARSE[0] and units <= COARSE[1]
+    doubted = verdict.reason in OF_THE_LENS
+    return Sample(one.loaded.scene.info.name, kind, photo, right, verdict.signals, doubted, weighed)
+
+
+def summary(samples: Sequence[Sample]) -> dict[str, Any]:
+    """Return weights fitted on all samples, and what such weights say of scenes that they were not fitted on."""
+    right = np.array([sample.right for sample in samples])
+    scenes = np.array([sample.scene for sample in samples])
+    kinds = np.array([sample.kind for sample in samples])
+    doubted = np.array([sample.doubted for sample in samples])
+    result: dict[str, Any] = {}
+    for name, model in (("with_matches", WITH_MATCHES), ("by_pixels", BY_PIXELS)):
+        features = scaled(samples, model)
+        tested = np.zeros(len(samples))
+        for scene in np.unique(scenes):
+            here = scenes == scene
+            tested[here] = probabilities(features[here], fitted(features[~here], right[~here]))
+        weights = fitted(features, right)
+        result[name] = {
+            "weights": dict(zip(model, np.round(weights, 2).tolist(), strict=True)),
+            **_counts(tested, right, kinds, doubted),
+            "reliability": _reliability(tested, right),
+        }
+    return result
+
+
+def scaled(samples: Sequence[Sample], model: Mapping[str, float]) -> Float64[np.ndarray, "n k"]:
+    """Return the samples' scaled signals in the model's order; the bias comes first and is 1."""
+    columns = [np.ones(len(samples))]
+    columns += [SCALES[name](np.array([s.signals[name] for s in samples])) for name in model if name != "bias"]
+    return np.stack(columns, 1)
+
+
+def probabilities(features: Float64[np.ndarray, "n k"], weights: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "n"]:
+    """Return the logistic model's values."""
+    return 1.0 / (1.0 + np.exp(-np.clip(features @ weights, -50, 50)))
+
+
+def fitted(features: Float64[np.ndarray, "n k"], right: Bool[np.ndarray, "n"]) -> Float64[np.ndarray, "k"]:
+    """Return the weights, none negative but the bias', that the samples make likeliest; both classes weigh alike.
+
+    Newton's steps on the free weights; one that would turn negative is fixed at 0.
+    """
+    weights = np.zeros(features.shape[1])
+    each = np.where(right, 0.5 / max(right.sum(), 1), 0.5 / max((~right).sum(), 1)) * len(right)
+    penalty = PENALTY * np.r_[0.0, np.ones(features.shape[1] - 1)] * len(right) / 100
+    free = np.ones(len(weights), bool)
+    for _ in range(100):
+        p = probabilities(features, weights)
+        gradient = features.T @ (each * (right - p)) - penalty * weights
+        hessian = (features * (each * p * (1 - p))[:, None]).T @ features + np.diag(penalty + 1e-9)
+        step = np.zeros_like(weights)
+        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
+        weights = weights + step * min(1.0, 5.0 / max(np.abs(step).max(), 1e-9))
+        below = np.r_[False, weights[1:] < 0]
+        weights[below], free[below] = 0.0, False
+        if np.abs(step).max() < 1e-6:
+            break
+    return weights
+
+
+def _counts(
+    tested: Float64[np.ndarray, "n"],
+    right: Bool[np.ndarray, "n"],
+    kinds: np.ndarray,
+    doubted: Bool[np.ndarray, "n"],
+) -> dict[str, Any]:
+    """Return how many of each kind are called localized, apart from those that are in doubt for other reasons."""
+    called = (tested >= LOCALIZED) & ~doubted
+    nothing = np.isin(kinds, ["foreign", "garbage"])
+    wrong = ~right & ~nothing
+    return {
+        "foreign_or_garbage": int(nothing.sum()),
+        "foreign_or_garbage_localized": int((called & nothing).sum()),
+        "wrong": int(wrong.sum()),
+        "wrong_localized": int((called & wrong).sum()),
+        "right": int(right.sum()),
+        "right_localized": int((called & right).sum()),
+        "by_kind": {
+            str(kind): {
+                "right": int((right & (kinds == kind)).sum()),
+                "right_localized": int((called & right & (kinds == kind)).sum()),
+                "wrong": int((~right & (kinds == kind)).sum()),
+                "wrong_localized": int((called & ~right & (kinds == kind)).sum()),
+            }
+            for kind in np.unique(kinds)
+        },
+    }
+
+
+def _reliability(tested: Float64[np.ndarray, "n"], right: Bool[np.ndarray, "n"]) -> list[dict[str, float]]:
+    """Return, for equal intervals of the probability, what was said and what came true."""
+    bins = np.minimum((tested * BINS).astype(int), BINS - 1)
+    return [
+        {
+            "from": k / BINS,
+            "to": (k + 1) / BINS,
+            "count": int((bins == k).sum()),
+            "said": float(tested[bins == k].mean()),
+            "true": float(right[bins == k].mean()),
+        }
+        for k in range(BINS)
+        if (bins == k).any()
+    ]

@@ -1,0 +1,100 @@
+"""What the supplement says of the methods, held against the results: which is ahead, and by which counts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from service.bench.paper.tables import Line
+
+REFINING = ("l1", "blur", "relative", "l2", "feature", "corner")
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    said: str
+    """By whom, and what."""
+    found: str
+    holds: bool | None
+    """None: the counts are equal, or there are none."""
+
+
+def claims(lines: Sequence[Line]) -> list[Claim]:
+    """Return the claims of which there are results."""
+    return [claim for claim in (*_stages(lines), *_methods(lines), *_losses(lines), *_default(lines)) if claim]
+
+
+def _within(lines: Sequence[Line], key: str = "within_5deg_0p05", **wanted: str) -> tuple[int, int]:
+    chosen = [line for line in lines if all(line[k] == v for k, v in wanted.items())]
+    return sum(bool(line[key]) for line in chosen), len(chosen)
+
+
+def _ahead(said: str, better: tuple[str, tuple[int, int]], worse: tuple[str, tuple[int, int]]) -> Claim | None:
+    (name, (a, n)), (other, (b, m)) = better, worse
+    if not n or not m:
+        return None
+    difference = a / n - b / m
+    return Claim(said, f"{name} {a}/{n}, {other} {b}/{m}", None if difference == 0 else difference > 0)
+
+
+def _stages(lines: Sequence[Line]) -> Iterator[Claim | None]:
+    def row(name: str) -> tuple[str, tuple[int, int]]:
+        return name, _within(lines, study="table5", method=f"mc_do:{name}")
+
+    yield _ahead("Table 5: MC alone is ahead of DO alone", row("mc"), row("do"))
+    yield _ahead("Table 5: MC + DO is ahead of MC alone", row("mc+do"), row("mc"))
+    yield _ahead("Table 5: the loss adds to MC + DO", row("mc+do+loss"), row("mc+do"))
+    yield _ahead("Section H: DO alone may be worse than going without it", row("descent"), row("do"))
+
+
+def _methods(lines: Sequence[Line]) -> Iterator[Claim | None]:
+    order = ("mc_do", "icomma", "inerf_dagger", "inerf")
+    shared = [line for line in lines if line["study"] == "table2" and line["protocol"] == "hard"]
+    for better, worse in pairwise(order):
+        pair = [(name, _within(_common(shared, better, worse), method=name)) for name in (better, worse)]
+        yield _ahead(f"Table 2: {better} is ahead of {worse}", *pair)
+    pair = [(n, _within(_common(shared, "mc_do", "mc_do_gradient"), method=n)) for n in ("mc_do", "mc_do_gradient")]
+    yield _ahead("Ours: DO by least squares is ahead of DO by gradient", *pair)
+
+
+def _common(lines: Sequence[Line], *methods: str) -> list[Line]:
+    """Keep the queries that all of the methods answered: otherwise counts would compare different queries."""
+    answered = [
+        {(line["scene"], line["photo"], line["trial"]) for line in lines if line["method"] == method}
+        for method in methods
+    ]
+    both = set.intersection(*answered)
+    return [line for line in lines if (line["scene"], line["photo"], line["trial"]) in both]
+
+
+def _losses(lines: Sequence[Line]) -> Iterator[Claim | None]:
+    near = [line for line in lines if line["study"] == "table1"]
+    counts = {loss: _within(near, method=f"mc_do:{loss}") for loss in REFINING}
+    if all(n for _, n in counts.values()):
+        ranked = sorted(counts, key=lambda loss: -counts[loss][0] / counts[loss][1])
+        told = ", ".join(f"{loss} {counts[loss][0]}/{counts[loss][1]}" for loss in ranked)
+        best = counts[ranked[0]][0] / counts[ranked[0]][1]
+        holds = counts["l1"][0] / counts["l1"][1] >= best
+        yield Claim("Table 1: L1 is the best loss near the optimum (or as good as any)", told, holds)
+
+
+def _default(lines: Sequence[Line]) -> Iterator[Claim | None]:
+    """The default against the paper's method, on the queries that both answered."""
+    for protocol in ("hard", "easy"):
+        chosen = [line for line in lines if line["study"] == "table2" and line["protocol"] == protocol]
+        for scene in dict.fromkeys(line["scene"] for line in chosen):
+            both = _common([line for line in chosen if line["scene"] == scene], "view_index", "mc_do")
+            ours, paper = (_within(both, method=name) for name in ("view_index", "mc_do"))
+            if ours[1]:
+                times = [_median_s(both, name) for name in ("view_index", "mc_do")]
+                told = f"{ours[0]}/{ours[1]} in {times[0]:.2f} s of CPU time, {paper[0]}/{paper[1]} in {times[1]:.2f} s"
+                holds = ours[0] >= paper[0] and times[0] < times[1]
+                said = f"Ours: view_index is never worse than mc_do, and faster: {scene}, start '{protocol}'"
+                yield Claim(said, told, holds)
+
+
+def _median_s(lines: Sequence[Line], method: str) -> float:
+    return float(np.median([line["cpu_ms"] for line in lines if line["method"] == method])) / 1e3

@@ -1,0 +1,145 @@
+"""The supplement's figures, drawn with matplotlib. Data comes in as arrays; nothing is run or rendered here."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+DPI = 110
+GREEN, RED = "#2a9d4a", "#d1372c"
+COLOURS = {"view_index": "#1b1b1b", "mc_do": "#2f6fde", "icomma": "#d1372c", "inerf_dagger": "#e0952b"}
+
+
+@dataclass(frozen=True, slots=True)
+class Vectors:
+    """Match vectors over a photo: from where points are rendered to where the photo shows them."""
+
+    title: str
+    photo: UInt8[np.ndarray, "h w 3"]
+    rendered_px: Float[np.ndarray, "m 2"]
+    """In the photo's pixels."""
+    photo_px: Float[np.ndarray, "m 2"]
+
+
+@dataclass(frozen=True, slots=True)
+class Path3D:
+    """Where a method's camera went."""
+
+    name: str
+    positions: Float[np.ndarray, "n 3"]
+    rotation_deg: Float[np.ndarray, "n"]
+
+
+def vectors_and_paths(
+    rows: Sequence[Sequence[Vectors]], paths: Sequence[Path3D], truth: Float[np.ndarray, "3"]
+) -> bytes:
+    """Figure 1: rows of match vectors, and below them the paths of the cameras and their rotation errors."""
+    columns = max(len(row) for row in rows)
+    figure = Figure(figsize=(3.1 * columns, 2.7 * (len(rows) + 1.1)), layout="constrained")
+    grid = figure.add_gridspec(len(rows) + 1, 2 * columns)
+    for r, row in enumerate(rows):
+        for c, vectors in enumerate(row):
+            _draw_vectors(figure.add_subplot(grid[r, 2 * c : 2 * c + 2]), vectors)
+    _draw_paths(figure.add_subplot(grid[-1, :columns]), paths, truth)
+    errors = figure.add_subplot(grid[-1, columns:])
+    for path in paths:
+        errors.plot(np.arange(len(path.rotation_deg)) + 1, path.rotation_deg, label=path.name)
+    errors.set(xscale="log", yscale="log", xlabel="step", ylabel="rotation error, deg", title="(c) rotation error")
+    errors.legend(fontsize=7)
+    return _png(figure)
+
+
+def pictures(
+    rows: Sequence[Sequence[UInt8[np.ndarray, "_ _ 3"] | None]], columns: Sequence[str], names: Sequence[str]
+) -> bytes:
+    """Figures 2 and 3: a row a query, a column a method; None: there is no answer of it."""
+    figure = Figure(figsize=(1.9 * len(columns), 1.75 * len(rows) + 0.3), layout="constrained")
+    axes = figure.subplots(len(rows), len(columns), squeeze=False)
+    for r, row in enumerate(rows):
+        for c, image in enumerate(row):
+            place: Axes = axes[r, c]
+            place.set_xticks([])
+            place.set_yticks([])
+            if image is None:
+                place.text(0.5, 0.5, "not run", ha="center", va="center", fontsize=8, transform=place.transAxes)
+            else:
+                place.imshow(image)
+            if r == 0:
+                place.set_title(columns[c], fontsize=8)
+            if c == 0:
+                place.set_ylabel(names[r], fontsize=8)
+    return _png(figure)
+
+
+def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float], int]]]) -> bytes:
+    """Figure 4: for each start a panel; method -> steps, share of queries within the bound, number of queries."""
+    figure = Figure(figsize=(5.2 * len(panels), 3.6), layout="constrained")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for place, (title, methods) in zip(axes, panels.items(), strict=True):
+        for name, (steps, shares, count) in methods.items():
+            label = f"{name} ({count} queries)"
+            place.step(np.asarray(steps) + 1, shares, where="post", label=label, color=COLOURS.get(name))
+        place.set(xscale="log", ylim=(-0.03, 1.03), xlabel="step (record of the trace)", title=title)
+        place.set_ylabel("share within 5 deg and 0.05 units")
+        place.grid(alpha=0.3)
+        place.legend(fontsize=7, loc="upper left")
+    return _png(figure)
+
+
+def _draw_vectors(place: Axes, vectors: Vectors) -> None:
+    faded = 255 - (255 - vectors.photo.astype(float)) * 0.45
+    place.imshow(faded.astype(np.uint8))
+    a, b = vectors.rendered_px - 0.5, vectors.photo_px - 0.5  # matplotlib has the first pixel's centre at 0
+    shift = b - a
+    place.quiver(*a.T, *shift.T, angles="xy", scale_units="xy", scale=1, width=0.003, color="#3a3a3a")
+    place.scatter(*a.T, s=7, facecolors="none", edgecolors=RED, linewidths=0.8)
+    place.scatter(*b.T, s=7, facecolors="none", edgecolors=GREEN, linewidths=0.8)
+    height, width = vectors.photo.shape[:2]
+    place.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    place.set_title(vectors.title, fontsize=8)
+
+
+def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "3"]) -> None:
+    """In the plane in which they extend most."""
+    every = np.concatenate([path.positions for path in paths] + [truth[None]])
+    axes = np.linalg.svd(every - every.mean(0), full_matrices=False)[2][:2]
+    for path in paths:
+        place.plot(*(axes @ (path.positions - truth).T), marker=".", markersize=3, linewidth=1, label=path.name)
+    place.plot(0, 0, marker="*", markersize=11, color=GREEN, linestyle="none", label="truth")
+    place.set_aspect("equal", adjustable="datalim")
+    place.set_title("(c) the camera's path, units")
+    place.legend(fontsize=7)
+
+
+def reliability(models: Mapping[str, Sequence[Mapping[str, float]]]) -> bytes:
+    """Draw what share of poses came true against the probability that was said, and how many poses that were.
+
+    Each model has rows of `said`, `true`, `count`, `from`, `to`.
+    """
+    figure = Figure(figsize=(6.0, 5.4), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    above.plot([0, 1], [0, 1], color="#999999", linestyle=":", label="calibrated")
+    for (name, rows), colour in zip(models.items(), (GREEN, COLOURS["mc_do"]), strict=False):
+        said, true = [row["said"] for row in rows], [row["true"] for row in rows]
+        above.plot(said, true, "o-", color=colour, label=name.replace("_", " "))
+        middles = [0.5 * (row["from"] + row["to"]) for row in rows]
+        below.bar(middles, [row["count"] for row in rows], 0.08, color=colour, alpha=0.5)
+    above.set(
+        ylabel="share that was right", xlim=(0, 1), ylim=(-0.02, 1.02), title="The gate on scenes it was not fitted on"
+    )
+    above.legend()
+    below.set(xlabel="probability that was said", ylabel="poses", yscale="log")
+    return _png(figure)
+
+
+def _png(figure: Figure) -> bytes:
+    stream = io.BytesIO()
+    FigureCanvasAgg(figure).print_figure(stream, dpi=DPI, format="png")
+    return stream.getvalue()

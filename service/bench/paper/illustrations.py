@@ -1,0 +1,172 @@
+"""What the figures show, run and rendered: match vectors with and without decoupling, and methods' answers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from service.bench.localize import Subject, Trial, trials_of
+from service.bench.paper import figures
+from service.bench.paper.plan import MAIN
+from service.bench.paper.tables import Line
+from service.estimators import ESTIMATORS
+from service.geometry import pose_distance, so3_exp
+from service.images import read_query, resized
+from service.localize import Request, localize
+from service.types import Camera, IterationRecord, Pose, PoseEstimate, Query
+
+PICTURE_PX = 240
+ONLY_TURNED_DEG, ONLY_SHIFTED = 20.0, 0.35
+"""Figure 1 (a): about the scene's centre; units, sidewards."""
+BOTH_DEG, BOTH_UNITS = (18.0, -14.0, 22.0), (0.3, -0.2, 0.25)
+"""Figure 1 (b): per axis."""
+SHOWN_STEPS = 4
+METHODS = ("inerf", "inerf_dagger", "icomma", "mc_do", "view_index")
+
+
+def figure_1(one: Subject) -> bytes:
+    """Run DO and, without decoupling, iComMa from the same start on the first test photo."""
+    trial = next(trials_of(one, "none", 1, 0))
+    truth = trial.truth.pose
+    turned = _moved(one, truth, np.radians([0.0, ONLY_TURNED_DEG, 0.0]), np.zeros(3))
+    sidewards = ONLY_SHIFTED * truth.world_from_camera[:3, 0]
+    shifted = _moved(one, truth, np.zeros(3), sidewards)
+    both = _moved(one, truth, np.radians(BOTH_DEG), np.array(BOTH_UNITS))
+    first = {"hypotheses": 0, "iterations": 1, "refinement_steps": 0}
+    causes = [
+        _shown(f"(a) {name}", trial, one, _ran(one, trial, start, "mc_do", first).records, 1)[0]
+        for name, start in (
+            (f"turned about the centre, {ONLY_TURNED_DEG:g} deg", turned),
+            (f"shifted, {ONLY_SHIFTED:g} units", shifted),
+        )
+    ]
+    decoupled = _ran(one, trial, both, "mc_do", {"hypotheses": 0, "iterations": 10, "refinement_steps": 0})
+    joint = _ran(one, trial, both, "icomma", {"rematch_every": 10, "long_side_px": 256})
+    rows = [
+        causes,
+        _shown("(b) not decoupled", trial, one, joint.records, SHOWN_STEPS),
+        _shown("(b) decoupled", trial, one, decoupled.records, SHOWN_STEPS),
+    ]
+    paths = [
+        _path("not decoupled (icomma)", joint, truth, one),
+        _path("decoupled (mc_do's DO)", decoupled, truth, one),
+    ]
+    return figures.vectors_and_paths(rows, paths, truth.position_in_world * one.units.units_per_scene_unit)
+
+
+def _moved(one: Subject, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> Pose:
+    """Turn about the focus, then shift in normalized units; both in world axes."""
+    rotation = np.eye(3)
+    for axis in range(3):
+        rotation = so3_exp(angles[axis] * np.eye(3)[axis]) @ rotation
+    matrix = pose.world_from_camera.copy()
+    matrix[:3, :3] = rotation @ matrix[:3, :3]
+    arm = pose.position_in_world - one.units.focus_in_world
+    matrix[:3, 3] = one.units.focus_in_world + rotation @ arm + shift / one.units.units_per_scene_unit
+    return Pose(matrix)
+
+
+def _ran(one: Subject, trial: Trial, start: Pose, estimator: str, changed: Mapping[str, Any]) -> PoseEstimate:
+    options = ESTIMATORS.load(estimator).Options(**changed)
+    return localize(replace(_query(one, trial), prior=start), one.loaded, Request(estimator, options))
+
+
+def _query(one: Subject, trial: Trial) -> Query:
+    return read_query(trial.data, intrinsics=trial.told, background_rgb=one.background_rgb)
+
+
+def _shown(
+    title: str, trial: Trial, one: Subject, records: Sequence[IterationRecord], count: int
+) -> list[figures.Vectors]:
+    """Return the match vectors of some steps: the first ones tell most, so they are spread geometrically."""
+    photo = _query(one, trial).rgb
+    matched = [(number, record.matches) for number, record in enumerate(records) if record.matches is not None]
+    picked = np.unique(np.geomspace(1, len(matched), count).round().astype(int)) - 1 if matched else []
+    found = []
+    for index in picked:
+        number, matches = matched[index]
+        size = matches.render_camera.intrinsics
+        scale = np.array([photo.shape[1] / size.width, photo.shape[0] / size.height])
+        keep = matches.inlier if matches.inlier.any() else np.ones(len(matches.inlier), bool)
+        vectors = matches.render_px[keep] * scale, matches.photo_px[keep]
+        label = title if count == 1 else f"{title}, step {number}"
+        found.append(figures.Vectors(label, photo, *vectors))
+    return found
+
+
+def _path(name: str, estimate: PoseEstimate, truth: Pose, one: Subject) -> figures.Path3D:
+    poses = [record.pose for record in estimate.records]
+    positions = np.stack([pose.position_in_world for pose in poses]) * one.units.units_per_scene_unit
+    return figures.Path3D(name, positions, np.array([max(pose_distance(p, truth)[0], 1e-3) for p in poses]))
+
+
+def figures_2_and_3(subjects: Mapping[str, Subject], lines: Sequence[Line]) -> tuple[bytes, bytes] | None:
+    """Render each method's answer to one query of each scene, blended with the photo, and as it is."""
+    blended, plain, names = [], [], []
+    for scene, one in subjects.items():
+        of_query = _most_answered([line for line in lines if line["scene"] == scene and line["protocol"] == "hard"])
+        if not of_query:
+            continue
+        trial = next(
+            t for t in trials_of(one, "none", len(one.photos), 0) if t.photo == next(iter(of_query.values()))["photo"]
+        )
+        photo, camera = _photo_and_camera(one, trial)
+        start = next(iter(of_query.values()))["start_world_from_camera"]
+        matrices = [start, *(of_query[m]["world_from_camera"] if m in of_query else None for m in METHODS)]
+        renders = [None if m is None else _rendered(one, camera, np.array(m)) for m in matrices]
+        blended.append([*(None if r is None else (r // 2 + photo // 2) for r in renders), photo])
+        plain.append([*renders, photo])
+        names.append(scene)
+    if not names:
+        return None
+    starred = {m.name: f"{m.name}*" if m.profile else m.name for m in MAIN}
+    columns = ["start", *(starred[m] for m in METHODS), "photo"]
+    return figures.pictures(blended, columns, names), figures.pictures(plain, columns, names)
+
+
+def _most_answered(lines: Sequence[Line]) -> dict[str, Line]:
+    """Return the lines, by method, of the query that most methods answered; the first of several."""
+    queries: dict[tuple[str, int], dict[str, Line]] = {}
+    for line in lines:
+        if line["study"] == "table2" and line["method"] in METHODS:
+            queries.setdefault((line["photo"], line["trial"]), {})[line["method"]] = line
+    return max(queries.values(), key=len, default={})
+
+
+def _photo_and_camera(one: Subject, trial: Trial) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
+    query = _query(one, trial)
+    lens = query.intrinsics.with_long_side(PICTURE_PX)
+    photo = resized(query.rgb.astype(np.float32), lens.width, lens.height)
+    return np.rint(photo).astype(np.uint8), Camera(lens, trial.truth.pose)
+
+
+def _rendered(one: Subject, camera: Camera, world_from_camera: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+    (frame,) = one.loaded.rasterizer.render([replace(camera, pose=Pose(world_from_camera))])
+    return np.rint(255 * np.clip(frame.rgb, 0, 1)).astype(np.uint8)
+
+
+def figure_4(lines: Sequence[Line]) -> bytes | None:
+    """Return the share of queries within 5 deg and 0.05 units after each step."""
+    panels: dict[str, dict[str, tuple[Sequence[float], Sequence[float], int]]] = {}
+    for protocol in ("easy", "hard"):
+        chosen = [line for line in lines if line["protocol"] == protocol and line.get("curve")]
+        for method in METHODS:
+            curves = [line["curve"] for line in chosen if line["method"] == method]
+            if curves:
+                panels.setdefault(f"start '{protocol}'", {})[method] = (*_share_curve(curves), len(curves))
+    return figures.shares_by_step(panels) if panels else None
+
+
+def _share_curve(curves: Sequence[Sequence[Sequence[float]]]) -> tuple[list[float], list[float]]:
+    """A query that has ended stays where it is."""
+    steps = sorted({point[0] for curve in curves for point in curve})
+    good = np.zeros(len(steps))
+    for curve in curves:
+        numbers, degrees, units = np.array(curve).T
+        within = (degrees <= 5) & (units <= 0.05)
+        good += within[np.searchsorted(numbers, steps, side="right") - 1]
+    return [float(s) for s in steps], (good / len(curves)).tolist()

@@ -1,0 +1,34 @@
+"""DISK (Tyszkiewicz et al., 2020) with LightGlue; the weights come from a folder, see `service.matchers.networks`."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int32, UInt8
+
+from service.interfaces import Features
+from service.matchers import networks
+
+WEIGHTS = ("depth-save.pth", "disk_lightglue.pth")
+
+
+class DiskLightGlue:
+    name = "disk_lightglue"
+
+    def __init__(self) -> None:
+        self._extract, self._network = networks.disk(WEIGHTS[0]), networks.lightglue(WEIGHTS[1])
+
+    def extract(self, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
+        return networks.extracted(self._extract, rgb, limit)
+
+    def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
+        return networks.glued(self._network, a, b)
+
+
+def create() -> DiskLightGlue:
+    """Return a matcher. Raises BackendMissing for files that are not its weights."""
+    return DiskLightGlue()
+
+
+def missing() -> str | None:
+    """Return what is not there to run it."""
+    return networks.missing_weights(*WEIGHTS)

