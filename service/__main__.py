@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 import json
 import logging
 import os
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,6 +23,8 @@ from service.errors import InvalidRequest, SplatfixError
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from service.api.intake import Body
+    from service.api.requests import LocalizeFields
     from service.api.schemas import Result
     from service.api.settings import Settings
     from service.bench.paper.runs import Progress
@@ -97,64 +99,95 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 @app.command()
 def localize(
-    photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC.")],
+    photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC; or one video.")],
     scene: SceneOption,
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="One camera's photos in their order: follow it. A video always is.")
+    ] = False,
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
     matcher: MatcherOption = "",
     seed: int = 0,
     budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Of a sequence: use each Nth.")] = 1,
+    times: Annotated[str, typer.Option(help="Of a sequence's photos: JSON list of seconds, or a file of it.")] = "",
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
+    tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
 ) -> None:
-    """Find where photos were taken in a scene."""
+    """Find where photos, or a video's frames, were taken in a scene."""
+    from service.api.intake import Body, body_of, read_fields
+    from service.api.sequence import is_sequence
+    from service.localize import DEFAULT_ESTIMATOR
+
+    given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every}
+    nested = {"intrinsics": intrinsics, "prior": prior, "times_s": times}
+    given |= {name: _json(text, name) for name, text in nested.items()}
+    fields = read_fields({name: value for name, value in given.items() if value is not None})
+    files = [(str(photo), _bytes(photo)) for photo in photos]
+    if tum_file and not (sequence or is_sequence(files[0][1])):
+        raise InvalidRequest("a trajectory is a sequence's: add --sequence.", where="--tum")
+    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
+    if sequence or any(is_sequence(data) for _, data in files):
+        _localize_sequence(body_of(files, {}), fields, loaded, csv_file, tum_file, as_json)
+    else:
+        _localize_each([Body(data, name, {}) for name, data in files], fields, loaded, csv_file, as_json)
+
+
+def _localize_each(
+    bodies: list[Body], fields: LocalizeFields, loaded: LoadedScene, csv_file: Path | None, as_json: bool
+) -> None:
+    from service import answers
     from service.api.convert import result_out, timing_out
     from service.api.documents import versions
-    from service.api.intake import Body, make_task, read_fields
-    from service.localize import DEFAULT_ESTIMATOR
+    from service.api.intake import make_task
     from service.localize import localize as run
 
-    given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s}
-    given |= {"intrinsics": _json(intrinsics, "intrinsics"), "prior": _json(prior, "prior")}
-    fields = read_fields({name: value for name, value in given.items() if value is not None})
-    bodies = [Body(_bytes(photo), str(photo), {}) for photo in photos]
-    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         task, query = make_task(body, fields, loaded)
         estimate = run(query, loaded, task.request)
-        results.append(
-            (body.name, result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor))
-        )
+        result = result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor)
+        results.append((body.name, result))
         if not as_json:
-            out.print(_line(*results[-1]), markup=False, highlight=False, soft_wrap=True)
+            _say(answers.photo_line(*results[-1]))
     if as_json:
         _print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
     if csv_file:
-        _write_csv(csv_file, results)
+        answers.write_photo_table(csv_file, results)
 
 
-def _line(name: str, result: Result) -> str:
-    place = " ".join(f"{value:.4f}" for value in result.pose.position)
-    turn = " ".join(f"{value:.4f}" for value in result.pose.world_from_camera.quaternion_wxyz)
-    told = f"{name}: {result.status}, score {result.score:.2f}, position {place}, quaternion_wxyz {turn}"
-    return f"{told}. {result.hint}" if result.hint else told
+def _localize_sequence(
+    body: Body,
+    fields: LocalizeFields,
+    loaded: LoadedScene,
+    csv_file: Path | None,
+    tum_file: Path | None,
+    as_json: bool,
+) -> None:
+    from service import answers
+    from service.api.exports import trajectory_of
+    from service.api.intake import make_task
+    from service.api.sequence import read_sequence
+    from service.api.trajectory import Trajectory
+    from service.track import localize_sequence
 
-
-_POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
-
-
-def _write_csv(path: Path, results: list[tuple[str, Result]]) -> None:
-    """One row a photo; the pose is world_from_camera in OpenCV axes."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        table = csv.writer(file)
-        table.writerow(["photo", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"])
-        for name, result in results:
-            spent = sum(timing.wall_s for timing in result.timings)
-            turn = result.pose.world_from_camera.quaternion_wxyz
-            row = [name, result.status, result.reason, result.score, *result.pose.position, *turn]
-            table.writerow([*row, result.inliers, round(1000 * spent, 1)])
+    task, _ = make_task(body, fields, loaded, max_frames=sys.maxsize)
+    if task.reading is None:
+        raise InvalidRequest("a sequence has two photos or more, or is a video.", where="photos")
+    trajectory = Trajectory()
+    for found in localize_sequence(read_sequence(body.photo, task.reading), loaded, task.request):
+        frame = trajectory.add(found).frame
+        if frame and not as_json:
+            _say(answers.frame_line(frame))
+    result = trajectory.result(loaded.scene.info.geo_anchor)
+    if as_json:
+        _print_json({"photo": body.name, **result.model_dump(mode="json")})
+    if csv_file:
+        answers.write_frame_table(csv_file, result.frames or [])
+    if tum_file:
+        tum_file.write_text(trajectory_of(result.frames or []), encoding="utf-8")
 
 
 @app.command()
@@ -194,7 +227,7 @@ def bench_localize(
     start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
     trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
     seed: int = 0,
-    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    intrinsics: Annotated[Literal["given", "approximate", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
@@ -232,7 +265,38 @@ def bench_localize(
     _write_json(json_file, outcome)
     for name, value in outcome.items():
         if name != "per_query":
-            out.print(f"{name:28} {_short(value)}", markup=False, highlight=False, soft_wrap=True)
+            _say(f"{name:28} {_short(value)}")
+
+
+@bench_app.command("track")
+def bench_track(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with training cameras.")],
+    frames: Annotated[int, typer.Option(min=2, help="Of the path.")] = 300,
+    seed: int = 0,
+    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Follow a camera along a smooth path through a scene."""
+    from service.bench.track import run
+
+    _tell_machine()
+    with _progress() as progress:
+        outcome = run(
+            folder,
+            frames=frames,
+            seed=seed,
+            intrinsics=intrinsics,
+            progress=_counter(progress, "frames"),
+            cache_dir=_settings({}).cache_dir,
+        )
+    _write_json(json_file, outcome)
+    for name, value in outcome.items():
+        if name != "per_frame":
+            _say(f"{name:28} {_short(value)}")
+
+
+def _say(text: str) -> None:
+    out.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _short(value: Any) -> str:
@@ -381,7 +445,7 @@ def list_scenes(
     from service.scene_formats.discovery import find_scenes
 
     for scene in find_scenes(folder):
-        out.print(str(scene), markup=False, highlight=False, soft_wrap=True)
+        _say(str(scene))
 
 
 @scenes_app.command("inspect")
@@ -395,7 +459,7 @@ def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or sc
     facts = {"gaussians": found.count, "sh_degree": found.sh_degree, "training cameras": len(found.cameras)}
     facts |= {"memory": f"{found.nbytes / 1e6:.1f} MB", "extent": f"{lower.tolist()} to {upper.tolist()}"}
     for name, value in (facts | dataclasses.asdict(found.info)).items():
-        out.print(f"{name:22} {value}", markup=False, highlight=False, soft_wrap=True)
+        _say(f"{name:22} {value}")
 
 
 @keys_app.command("add")
@@ -415,7 +479,7 @@ def list_keys() -> None:
     from service.api import keys
 
     for key in keys.read_keys(_keys_file()):
-        out.print(f"{key.role:9} {key.name}", markup=False, highlight=False, soft_wrap=True)
+        _say(f"{key.role:9} {key.name}")
 
 
 @keys_app.command("remove")
@@ -448,10 +512,10 @@ def doctor(
     with err.status("examining"):
         for finding in findings():
             mark = "ok  " if finding.ok else "FAIL" if finding.needed else "no  "
-            out.print(f"{mark} {finding.subject:24} {finding.detail}", markup=False, highlight=False, soft_wrap=True)
+            _say(f"{mark} {finding.subject:24} {finding.detail}")
             healthy &= finding.ok or not finding.needed
     for name, value in _settings({}).model_dump().items():
-        out.print(f"     SPLATFIX_{name.upper():22} {value}", markup=False, highlight=False, soft_wrap=True)
+        _say(f"     SPLATFIX_{name.upper():22} {value}")
     if not healthy:
         raise typer.Exit(1)
 
@@ -470,7 +534,7 @@ def _json(text: str, where: str) -> Any:
 
     if not text:
         return None
-    return parsed_json(text if text.lstrip().startswith("{") else _bytes(Path(text)), where)
+    return parsed_json(text if text.lstrip()[:1] in ("{", "[") else _bytes(Path(text)), where)
 
 
 def _bytes(path: Path) -> bytes:

@@ -22,7 +22,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from io import BytesIO
-from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -64,7 +63,7 @@ _DECODERS = (
     ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
     ("PNG", PngImageFile, MAX_PIXELS_WHOLE, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
     ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
-    ("HEIC", lambda file: _heic(file.read()), MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
+    ("HEIC", None, MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
 )
 _HEIC_S = 30
 """Wall time; 64 megapixels take two seconds."""
@@ -92,21 +91,44 @@ def read_query(
     intrinsics: Intrinsics | None = None,
     prior: Pose | None = None,
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    long_side: int = LONG_SIDE,
 ) -> Query:
     """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
 
     `intrinsics` refer to the upright photo in its full size. Transparent parts are unknown: nothing is expected
     there. They are filled with `background_rgb` (0..1): pass the scene's, then a cut-out object has the edges that
-    it has in a render.
+    it has in a render. `long_side` is the most that the
+    query's picture may have.
     """
     name, photo = _open(data)
-    decoded = _decode(photo, name, background_rgb)
+    decoded = _decode(photo, name, background_rgb, long_side)
+    focal_mm = _focal_35mm(photo) if intrinsics is None else None
+    return _query(decoded, focal_mm, intrinsics, prior)
+
+
+def query_of(
+    rgb: UInt8[np.ndarray, "h w 3"],
+    *,
+    intrinsics: Intrinsics | None = None,
+    prior: Pose | None = None,
+    long_side: int = LONG_SIDE,
+) -> Query:
+    """Return the query of an upright photo that is decoded already. Raises InvalidImage, InvalidIntrinsics."""
+    height, width = rgb.shape[:2]
+    target = _target((width, height), long_side)
+    if target != (width, height):
+        rgb = np.asarray(cv2.resize(rgb, target, interpolation=cv2.INTER_AREA))
+    scale = (target[0] / width, target[1] / height)
+    return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, prior)
+
+
+def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | None, prior: Pose | None) -> Query:
+    """Find out about the camera, and take its distortion out."""
     warnings = list(decoded.warnings)
     if intrinsics is not None:
         _require_size(intrinsics, decoded.width, decoded.height)
         source = "given"
     else:
-        focal_mm = _focal_35mm(photo)
         source = "exif" if focal_mm else "guessed"
         if not focal_mm:
             warnings.append(
@@ -149,9 +171,9 @@ def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=mode), np.float32)
 
 
-def photo_size(path: Path) -> tuple[int, int]:
+def photo_size(data: bytes) -> tuple[int, int]:
     """Return width and height of the upright photo, from its header. Raises InvalidImage."""
-    _, photo = _open(path.read_bytes())
+    _, photo = _open(data, header_only=True)
     transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
 
@@ -284,7 +306,7 @@ class _Decoded:
         )
 
 
-def _open(data: bytes) -> tuple[str, Image.Image]:
+def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
     """Read the header and check the size. Raises InvalidImage."""
     if not data:
         raise InvalidImage("the photo is empty (0 bytes).", where="photo")
@@ -293,7 +315,7 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
         raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
     name, decoder, limit = fitting[0]
     try:
-        photo = decoder(BytesIO(data))
+        photo = _heic(data, 0 if header_only else limit) if decoder is None else decoder(BytesIO(data))
     except Image.DecompressionBombError as error:
         raise InvalidImage(f"too many pixels: {error}", where="photo") from None
     except Exception as error:  # decoders raise almost anything on a broken file
@@ -310,9 +332,9 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
     return name, photo
 
 
-def _heic(data: bytes) -> Image.Image:
-    """Decode in another process, which may crash. Raises ValueError."""
-    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(MAX_PIXELS)]
+def _heic(data: bytes, max_pixels: int) -> Image.Image:
+    """Decode in another process, which may crash; larger ones not. Raises ValueError."""
+    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(max_pixels)]
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
     try:
         told = subprocess.run(command, input=data, capture_output=True, timeout=_HEIC_S, check=True, env=kept).stdout
@@ -329,7 +351,7 @@ def _heic(data: bytes) -> Image.Image:
 
 
 class _Large(Image.Image):
-    """Of a photo that wasn't decoded: nothing but its size, to be refused."""
+    """A photo that wasn't decoded: its size, and what EXIF says."""
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__()
@@ -348,16 +370,21 @@ def _scans(data: bytes) -> int:
     return scans
 
 
-def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float]) -> _Decoded:
-    raw_size = photo.size
-    factor = min(1.0, LONG_SIDE / max(raw_size))
-    target = [max(1, round(side * factor)) for side in raw_size]
-    if min(target) < MIN_SIDE:
+def _target(size: tuple[int, int], long_side: int) -> tuple[int, int]:
+    """Return the size to reduce a photo to. Raises InvalidImage if it is too small."""
+    if min(size) * min(1.0, LONG_SIDE / max(size)) < MIN_SIDE - 0.5:
         raise InvalidImage(
-            f"{raw_size[0]} x {raw_size[1]} is too small or too narrow to localize: the short side must have "
+            f"{size[0]} x {size[1]} is too small or too narrow to localize: the short side must have "
             f"{MIN_SIDE} pixels when the long one has at most {LONG_SIDE}.",
             where="photo",
         )
+    factor = min(1.0, long_side / max(size))
+    return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
+
+
+def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float], long_side: int) -> _Decoded:
+    raw_size = photo.size
+    target = _target(raw_size, long_side)
     step = (1.0, 1.0)
     if isinstance(photo, JpegImageFile):
         drafted = photo.draft(None, (target[0], target[1]))  # decodes at 1/2, 1/4 or 1/8, never below target
@@ -376,7 +403,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
     layers = [pixels] if alpha is None else [pixels, alpha]
-    if pixels.shape[:2] != (target[1], target[0]):
+    if pixels.shape[:2] != target[::-1]:
         layers = [cv2.resize(layer, target, interpolation=cv2.INTER_AREA) for layer in layers]
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]

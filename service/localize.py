@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -148,7 +148,7 @@ def localize(
         image_matcher=loaded.image_matcher,
         tally=tally,
     )
-    clock = _Clock()
+    clock = Clock()
     records: list[IterationRecord] = []
     exhausted = False
     with closing(plugin.run(query, tools, options)) as steps:
@@ -161,24 +161,42 @@ def localize(
                 break
     if not records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
-    pose, renders = records[-1].pose, tally.count
+    renders = tally.count
     query = query.corrected(records[-1].lens)
-    verdict = _qualified(verify(query, pose, tools), exhausted)
+    verdict = _qualified(verify(query, records[-1].pose, tools), exhausted)
+    return estimate_of(
+        query, loaded, request, verdict, records, timings=_timings(records, clock), renders=renders, exhausted=exhausted
+    )
+
+
+def estimate_of(
+    query: Query,
+    loaded: LoadedScene,
+    request: Request,
+    verdict: Verdict,
+    records: Sequence[IterationRecord],
+    *,
+    timings: Sequence[StageTiming],
+    renders: int,
+    exhausted: bool = False,
+) -> PoseEstimate:
+    """Put an estimate together; the last record's pose is the answer, the query has the lens that goes with it."""
+    info = loaded.scene.info
     return PoseEstimate(
-        pose=pose,
+        pose=records[-1].pose,
         verdict=verdict,
         intrinsics=query.photo_intrinsics,
         intrinsics_source=query.intrinsics_source,
-        scene_id=loaded.scene.info.id,
-        scene_sha256=loaded.scene.info.sha256,
+        scene_id=info.id,
+        scene_sha256=info.sha256,
         estimator=request.estimator,
         rasterizer=loaded.rasterizer.name,
         matcher=(loaded.image_matcher or loaded.matcher).name,
         seed=request.seed,
         budget_exhausted=exhausted,
         renders=renders,
-        timings=_timings(records, clock),
-        warnings=query.warnings + loaded.scene.info.warnings,
+        timings=tuple(timings),
+        warnings=query.warnings + info.warnings,
         records=tuple(records),
     )
 
@@ -193,7 +211,7 @@ def _require_matching(estimator: str, loaded: LoadedScene) -> None:
         )
 
 
-def _exhausted(request: Request, clock: _Clock, tally: RenderTally) -> bool:
+def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
     late = request.budget_s is not None and clock.wall_s > request.budget_s
     return late or (request.budget_renders is not None and tally.count >= request.budget_renders)
 
@@ -206,7 +224,7 @@ def _qualified(verdict: Verdict, exhausted: bool) -> Verdict:
 
 
 def _driven(
-    steps: Iterator[IterationRecord], clock: _Clock, cancel: threading.Event | None
+    steps: Iterator[IterationRecord], clock: Clock, cancel: threading.Event | None
 ) -> Iterator[IterationRecord]:
     """Number and stamp the records; stop between two of them when cancelled."""
     for index, record in enumerate(steps):
@@ -215,7 +233,7 @@ def _driven(
         yield replace(record, index=index, elapsed_s=clock.wall_s, cpu_s=clock.cpu_s)
 
 
-class _Clock:
+class Clock:
     """Wall time, and CPU time of the calling thread: a job runs on one thread."""
 
     def __init__(self) -> None:
@@ -230,7 +248,7 @@ class _Clock:
         return time.thread_time() - self._cpu
 
 
-def _timings(records: list[IterationRecord], clock: _Clock) -> tuple[StageTiming, ...]:
+def _timings(records: list[IterationRecord], clock: Clock) -> tuple[StageTiming, ...]:
     """Time by stage: a record's stage is charged with the time since the record before; the rest is the gate's."""
     spent: dict[str, list[float]] = {}
     wall = cpu = 0.0

@@ -36,6 +36,10 @@ class Lens:
     """Of the principal point, in long sides of the image: the same at every size."""
     shift_y: float = 0.0
 
+    def then(self, other: Lens) -> Lens:
+        """Return the difference of a lens that differs by `other` from what this one gives."""
+        return Lens(self.focal_factor * other.focal_factor, self.shift_x + other.shift_x, self.shift_y + other.shift_y)
+
 
 EXACT = Lens()
 """No difference."""
@@ -252,6 +256,8 @@ class Query:
     warnings: tuple[str, ...] = ()
     known: Bool[np.ndarray, "h w"] | None = None
     """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
+    told_focal_sigma: float | None = None
+    """As `focal_sigma`, where other photos of the camera have told more than the source of the intrinsics does."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
@@ -263,6 +269,8 @@ class Query:
         """Standard deviation of the logarithm of the focal length before the scene was looked at; 0: it is exact."""
         if self.intrinsics.trust == "exact":
             return 0.0
+        if self.told_focal_sigma is not None:
+            return self.told_focal_sigma
         return FOCAL_SIGMA[self.intrinsics_source]
 
     def corrected(self, lens: Lens) -> Query:
@@ -393,9 +401,10 @@ class Verdict:
     reason: Reason
     score: float
     """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
-    every estimator; at most 0.5 where the lens is in doubt. At least 0.9 is `localized`."""
+    every estimator; at most 0.5 where the lens is in doubt. At least 0.8 is `localized`."""
     inliers: int
-    """Matches between the photo and the render at the pose that agree with it."""
+    """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
+    photo of a sequence that its alignment alone makes clear."""
     agreement: float
     """Normalized cross-correlation of the gradients of photo and render, -1..1, where they agree best: a quarter
     of the photo may be hidden."""

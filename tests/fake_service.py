@@ -211,6 +211,8 @@ class FakeService:
         """Ids; all have the same content."""
         self.version = {"viser": "1"}
         self.photos_kept = True
+        self.loading_s = 0.0
+        """How long splats take."""
         self.asked: list[str] = []
         """Paths, in order."""
         self.renders: list[dict] = []
@@ -241,6 +243,7 @@ class FakeService:
         if kind == "scenes" and rest == ["render"]:
             return self._render(json.loads(request.content))
         if kind == "scenes" and rest == ["splats"]:
+            time.sleep(self.loading_s)
             return httpx.Response(200, content=packed_splats(self.scene, int(request.url.params["max"])))
         match = re.fullmatch(r"/jobs/(\w+)(/.*)?", path)
         job = next((j for j in self.jobs if match and j.id == match[1]), None)

@@ -19,12 +19,13 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Bottom to top: a part imports from the lines below its own, and from itself.
 LAYERS = [
     {"types", "errors", "plugins", "logs", "heic_child"},
-    {"interfaces", "images", "geometry", "jit"},
+    {"interfaces", "images", "video", "geometry", "jit"},
     {"scene_formats", "render", "matchers", "pose"},
     {"estimators"},
     {"localize"},
+    {"track"},
     {"api", "bench"},
-    {"doctor", "example"},
+    {"doctor", "example", "answers"},
     {"serve"},
     {"__main__"},
 ]
@@ -35,7 +36,7 @@ FOUNDATIONS = {("types", "errors"), ("plugins", "errors"), ("images", "geometry"
 WRAPPED = {
     "PIL": {"service/images.py"},
     "pi_heif": {"service/heic_child.py"},
-    "cv2": {"service/images.py", "service/matchers", "service/pose", "viewer/draw.py"},
+    "cv2": {"service/images.py", "service/video.py", "service/matchers", "service/pose", "viewer/draw.py"},
     "numba": {"service/jit.py", "service/render/simd.py"},
     "llvmlite": {"service/render/simd.py"},
     "torch": {"service/matchers/xfeat.py", "service/matchers/networks.py"},

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -14,6 +16,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -21,7 +24,7 @@ from PIL import Image
 import service
 import service.__main__
 from service import jit
-from service.geometry import pose_distance
+from service.geometry import moved, pose_distance
 from service.types import Pose
 from tests.small_room import INTRINSICS, pose_at, write_room
 
@@ -95,6 +98,40 @@ def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo,
     assert told.startswith(f"{photo}: localized, score ")
 
 
+def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
+    film, table, trajectory = (tmp_path / name for name in ("walk.avi", "poses.csv", "poses.tum"))
+    truth = [moved(pose_at(1.0 + 0.02 * i, 0.1), np.array([0.15, 0, 0, 0, 0, 0])) for i in range(4)]
+    frames = []
+    for i, pose in enumerate(truth):
+        frames.append(tmp_path / f"{i}.png")
+        service.__main__.render(room, json.dumps({"world_from_camera": pose.world_from_camera.tolist()}), frames[-1])
+    size = (INTRINSICS["width"], INTRINSICS["height"])
+    writer = cv2.VideoWriter(str(film), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size)
+    for frame in frames:
+        writer.write(cv2.imread(str(frame)))
+    writer.release()
+    given = ("--scene", room, "--intrinsics", json.dumps(INTRINSICS))
+    code, told, _ = splatfix("localize", film, *given, "--json", "--csv", table, "--tum", trajectory)
+    assert code == 0
+    found = json.loads(told)["frames"]
+    for frame, pose in zip(found, truth, strict=True):
+        degrees, units = pose_distance(Pose(np.array(frame["world_from_camera"]["matrix"])), pose)
+        assert degrees < 0.2  # seen: 0.02
+        assert units < 0.01  # seen: 0.0006
+    assert [frame["followed"] for frame in found] == [False, True, True, True]
+    rows = list(csv.DictReader(table.read_text().splitlines()))
+    assert [row["time_s"] for row in rows] == ["0.0", "0.1", "0.2", "0.3"]
+    lines = np.loadtxt(trajectory)
+    assert lines[:, 0] == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    places = [frame["world_from_camera"]["translation"] for frame in found]
+    assert lines[:, 1:4] == pytest.approx(np.array(places))
+    assert lines[:, 7] == pytest.approx([frame["world_from_camera"]["quaternion_wxyz"][0] for frame in found])
+    code, told, _ = splatfix("localize", *frames, "--sequence", *given, "--every", 2, "--times", "[5, 6, 7, 8]")
+    first, second = told.splitlines()
+    assert first.startswith(f"5.000 s, {frames[0]}: localized")
+    assert second.startswith(f"7.000 s, {frames[2]}: localized")
+
+
 def test_scenes_are_listed_and_inspected(splatfix, room):
     assert splatfix("scenes", "list", room.parent)[:2] == (0, f"{room}\n")
     code, told, _ = splatfix("scenes", "inspect", room)
@@ -119,6 +156,10 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         (("localize", photo, "--scene", room, "--intrinsics", "none.json"), "none.json"),
         (("localize", photo, "--scene", room, "--prior", "{"), "prior"),
         (("localize", photo, "--scene", room, "--budget-s", "-1"), "budget_s"),
+        (("localize", photo, "--scene", room, "--sequence"), "two photos"),
+        (("localize", photo, photo, "--scene", room, "--sequence", "--times", "[1]"), "times_s"),
+        (("localize", photo, photo, "--scene", room, "--every", "2"), "every"),
+        (("localize", photo, "--scene", room, "--tum", tmp_path / "t.txt"), "--sequence"),
         (("render", "--scene", room, "--pose", pose, "--out", tmp_path / "a.png"), "not a rotation"),
         (("render", "--scene", room, "--pose", "{}", "--out", tmp_path / "a.gif"), ".png"),
         (("scenes", "list", tmp_path / "none"), "none"),
@@ -211,3 +252,43 @@ def test_serve_prints_a_line_that_works_and_ends_when_told(room, photo):
             server.wait(20)
     assert time.monotonic() - began < 10
     assert server.returncode in (0, -signal.SIGTERM)
+
+
+def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monkeypatch, tmp_path):
+    from service.bench.paper import runs
+
+    seen = []
+    monkeypatch.setattr(runs, "run", lambda asked, show: seen.append(asked))
+    scenes = [tmp_path / "chair", f"{tmp_path / 'fern.ply'}={tmp_path / 'llff'}"]
+    flags = "--trials 7 --slow-trials 1 --seed 3 --study table2 --protocol hard --method mc_do --matcher sift"
+    assert splatfix("bench", "paper", *scenes, "--out", tmp_path / "out", *flags.split())[0] == 0
+    (asked,) = seen
+    assert asked.scenes == {"chair": (scenes[0], None), "fern": (tmp_path / "fern.ply", tmp_path / "llff")}
+    assert [cell.name for cell in asked.cells] == ["table2/mc_do/hard"]
+    assert (asked.trials, asked.slow_trials, asked.seed, asked.matcher) == (7, 1, 3, "sift")
+    for flag, known in (("--study", "table5"), ("--protocol", "hard"), ("--method", "view_index")):
+        code, _, complaint = splatfix("bench", "paper", scenes[0], "--out", tmp_path / "out", flag, "magic")
+        assert (code, "magic" in complaint, known in complaint) == (2, True, True)
+    code, _, complaint = splatfix("bench", "paper", tmp_path / "a", f"{tmp_path / 'b' / 'a'}", "--out", tmp_path)
+    assert (code, "two scenes 'a'" in complaint) == (2, True)
+
+
+def test_bench_paper_shows_how_far_it_is():
+    from rich.console import Console
+
+    from service.__main__ import _progress_table
+    from service.bench.paper.runs import Progress
+
+    cells = ("table2/mc_do/hard", "table2/icomma/hard", "table5/mc_do:mc/random")
+    progress = Progress(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})
+    progress.done |= {("chair", cells[0]): 3, ("chair", cells[1]): 1}
+    progress.within |= {("chair", cells[0]): 2}
+    progress.seconds |= {cells[0]: [4.0, 6.0], cells[1]: [60.0]}
+    # mc_do: 7 to go at 5 s; icomma: 9 at 60 s; the third has no pace yet: 10 at the mean of all, 70 / 3 s
+    assert progress.eta_s == pytest.approx(35 + 540 + 700 / 3)
+    console = Console(width=100, record=True, file=io.StringIO())
+    console.print(_progress_table(progress))
+    told = console.export_text()
+    assert re.search(r"mc_do/hard .*2 / 3 / 5 .*0 / 0 / 5", told)
+    assert "table5" not in told
+    assert "4 of 30 queries, 13 minutes to go" in told

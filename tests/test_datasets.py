@@ -154,6 +154,7 @@ def test_background(background: str, expected: tuple, tmp_path: Path) -> None:
     (trial,) = bench.trials_of(one, "none", 1, 0)
     query = read_query(trial.data, intrinsics=trial.told, background_rgb=one.background_rgb)
     assert np.all(query.rgb == np.array(expected) * 255)  # the pictures are transparent all over
+    assert query.known is None  # that there is nothing is known
 
 
 def test_photos_of_the_size_that_is_used_in_training(tmp_path: Path) -> None:
@@ -194,6 +195,9 @@ def test_what_is_no_data_set_is_told(tmp_path: Path) -> None:
         read_data_set(tmp_path)
     with pytest.raises(SceneNotFound, match="no such folder"):
         read_data_set(tmp_path / "none")
+    scene_ply(tmp_path / "scene.ply")
+    with pytest.raises(SceneNotFound, match="has no photos"):
+        bench.subject(tmp_path / "scene.ply")
     (tmp_path / "poses_bounds.npy").write_bytes(b"no array")
     with pytest.raises(CorruptScene, match="not LLFF's poses"):
         read_data_set(tmp_path)

@@ -176,6 +176,21 @@ class TestLosses:
         assert value == 0
         assert np.all(gradient == 0)
 
+    @pytest.mark.parametrize("name", LOSSES)
+    def test_what_is_unknown_has_no_part(self, name: str) -> None:
+        rng = np.random.default_rng(2)
+        known = np.zeros(self.PHOTO.shape[:2], bool)
+        known[:30] = True
+        loss = loss_against(name, self.PHOTO, known)
+        render = rng.uniform(0, 1, self.PHOTO.shape).astype(np.float32)
+        other = render.copy()
+        other[30:] = rng.uniform(0, 1, other[30:].shape)
+        (a, by_a), (b, by_b) = loss(render), loss(other)
+        assert a == b > 0
+        assert np.array_equal(by_a, by_b)
+        assert np.all(by_a[30:] == 0)
+        assert np.any(by_a[:30] != 0)
+
     def test_weights_by_hand(self) -> None:
         """A difference of 0.1 everywhere on a photo with one bright square: its features and corners are known."""
         photo = np.zeros((200, 200, 3), np.uint8)

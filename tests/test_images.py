@@ -153,12 +153,12 @@ def pinhole(rays, camera):
 RAYS = np.array([[-0.42, -0.25], [0.4, -0.28], [0.05, 0.02], [-0.35, 0.27], [0.43, 0.26]])
 
 
+SMALL = 200
+"""JPEG's reduced decode starts at 400 then."""
+
+
 class TestGeometry:
     """A spot on a ray must appear where `Query.intrinsics` project that ray, whatever happened to the pixels."""
-
-    @pytest.fixture(autouse=True)
-    def small(self, monkeypatch):
-        monkeypatch.setattr(images, "LONG_SIDE", 200)  # JPEG's reduced decode starts at 400
 
     @pytest.mark.parametrize("kind", ["JPEG", "PNG"])
     @pytest.mark.parametrize("size", [(160, 120), (249, 187), (413, 275), (827, 551), (1655, 1103)])
@@ -167,8 +167,8 @@ class TestGeometry:
         camera = Intrinsics(width, height, 1.0 * width, 0.98 * width, 0.51 * width, 0.49 * height)
         photo = Image.fromarray(spots(camera, RAYS, pinhole, size))
         options = {"quality": 95} if kind == "JPEG" else {"compress_level": 1}
-        query = read_query(encoded(photo, kind, **options), intrinsics=camera)
-        assert max(query.rgb.shape) == min(200, width)
+        query = read_query(encoded(photo, kind, **options), intrinsics=camera, long_side=SMALL)
+        assert max(query.rgb.shape) == min(SMALL, width)
         for ray, expected in zip(RAYS, pinhole(RAYS, query.intrinsics), strict=True):
             found = centroid(query.rgb, expected, int(0.04 * query.rgb.shape[1]))
             # Seen: 0.027; 0.46 if the reduced width were taken for the exact half of an odd one.
@@ -183,7 +183,8 @@ class TestGeometry:
         upright = Image.fromarray(spots(camera, rays, pinhole, upright_size))
         back = {2: 0, 3: 3, 4: 1, 5: 5, 6: 2, 7: 6, 8: 4}  # Pillow's transpositions that undo the orientation
         stored = upright.transpose(Image.Transpose(back[orientation])) if orientation > 1 else upright
-        query = read_query(encoded(stored, "JPEG", quality=95, exif=exif_with(orientation)), intrinsics=camera)
+        data = encoded(stored, "JPEG", quality=95, exif=exif_with(orientation))
+        query = read_query(data, intrinsics=camera, long_side=SMALL)
         for expected in pinhole(rays, query.intrinsics):
             found = centroid(query.rgb, expected, 8)
             assert np.abs(found - expected).max() < 0.05  # seen: 0.019

@@ -76,6 +76,18 @@ def test_every_query_is_one_line(scene, monkeypatch):
     assert next(line for line in lines if line["method"] == "icomma")["profile"].startswith("256 px, XFeat re-matched")
 
 
+def test_facts_of_a_scene(scene, monkeypatch):
+    """The six training cameras stand on a circle of radius 3 and height 1, from 57 to 286 degrees."""
+    fake_answers(monkeypatch.setattr)
+    runs.run(asked_for(scene, trials=1, slow_trials=0))
+    facts = json.loads((scene.parent / "out" / "config.json").read_text())["scenes"]["s"]
+    angles = np.linspace(0, 5, 8)[[1, 2, 3, 4, 6, 7]]
+    places = 3 * np.stack([np.cos(angles), np.sin(angles)], 1)
+    radius = np.linalg.norm(places - places.mean(0), axis=1).mean()
+    assert facts["trajectory_radius_units"] == pytest.approx(radius * facts["units_per_scene_unit"])
+    assert (facts["test_photos"], facts["training_cameras"], facts["gaussians"]) == (2, 6, 10)
+
+
 def test_a_few_of_everything_come_first(scene, monkeypatch):
     fake_answers(monkeypatch.setattr)
     lines = runs.run(asked_for(scene, trials=20))

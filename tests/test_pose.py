@@ -385,7 +385,7 @@ def test_the_gate_accepts_the_truth_and_refuses_the_rest() -> None:
     verdict = verify(query, true_pose(), tools_for())
     assert verdict.status is Status.LOCALIZED
     assert verdict.reason is Reason.AGREES
-    assert verdict.score >= 0.9
+    assert verdict.score >= 0.8
     assert verdict.coverage > 0.9
     for twist in ([0, 0, 0, 0.5, 0, 0], [0.15, 0, 0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], [0, 3.0, 0, 0, 0, 0]):
         refused = verify(query, moved(true_pose(), np.array(twist)), tools_for())

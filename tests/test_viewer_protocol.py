@@ -22,7 +22,7 @@ from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
 from service.types import Lens, Reason, Status
-from viewer import app, draw, private, shapes
+from viewer import app, draw, private, session, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble
 from viewer.feed import JobFeed
@@ -200,6 +200,24 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
         # viser leaves out changes below 1e-5 of the value.
         browser.wait(lambda: np.allclose(client.camera.position, goal.position, atol=1e-4), "arrival")
         browser.wait(lambda: np.allclose(client.camera.look_at, goal.look_at, atol=1e-4), "looking there")
+
+
+def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
+    fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "_ARRIVAL_S", 0.0)
+    job = fake.job("j")
+    fake.loading_s = 0.5
+    with _browser(viewer, "/jobs/j") as browser:
+        until(lambda: "/scenes/ball/splats" in fake.asked, "the scene is being loaded")
+        for record in records(3):
+            job.add(record)
+        job.finish()
+        browser.wait(lambda: browser.widget("step")["value"] == 2 and "15 agree" in browser.text(), "the last step")
+        (client,) = viewer.server.get_clients().values()
+        ball = viewer._library.scene("ball")
+        there = shapes.behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
+        assert np.allclose(client.camera.position, there, atol=1e-4)
 
 
 def _click(browser: FakeBrowser, origin: np.ndarray, direction: np.ndarray) -> None:

@@ -64,8 +64,8 @@ class Detail:
         record = feed.records[index]
         try:
             view = self._matches(feed, record)
-            self._flow(feed, record, view)
             self._picture(feed, record, view)
+            self._flow(feed, record, view)
         except (ServiceTrouble, ValueError) as error:
             self._panel.caption.content = small_html(f"There is no picture of this step: {error}")
         truth = feed.job.truth if feed.job else None

@@ -201,8 +201,9 @@ class Session:
         if feed.job is None:
             return
         self.panel.legend.content = legend_html(feed.job.answer, truth=feed.job.truth is not None)
+        self._show_scene(feed.job.scene, feed.records[count - 1].pose if count else None)
+        count = len(feed.records)  # again: loading a scene takes a while
         newest = feed.records[count - 1].pose if count else None
-        self._show_scene(feed.job.scene, newest)
         self._playback.grow(count)
         self._enable(count)
         self.stage.show_trajectory(feed.records[:count], feed.job)
@@ -224,6 +225,7 @@ class Session:
             return
         content = self._library.scene(scene_id)
         self.stage.show_scene(content, pose)
+        self._opened = time.monotonic()
         self._scene_id = self.panel.scenes.value = scene_id
         self._exact.use(scene_id)
         self.panel.scene.content = scene_html(
@@ -233,7 +235,7 @@ class Session:
     def _show(self) -> None:
         """Show the record at the playback's position; its picture follows when nothing else waits."""
         feed, index = self._feed, self._playback.index
-        if feed is not None and index < len(feed.records):
+        if feed is not None and index < self._playback.count:
             self._detail.show(feed, index)
 
     def _draw(self) -> None:

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
+from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 
 from service.api.convert import record_out, result_out, timing_out
 from service.api.desk import Desk, ending
 from service.api.documents import versions
-from service.api.intake import Task
 from service.api.live import LiveJob
 from service.api.requests import LocalizeFields
+from service.api.schemas import Record, Result
+from service.api.sequence import Reading, read_sequence
 from service.api.store import Batch, Ending, StoredJob
+from service.api.trajectory import Trajectory
 from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFailed
-from service.localize import Cancelled, LoadedScene, localize
+from service.localize import Cancelled, LoadedScene, Request, localize
 from service.logs import bound
-from service.types import IterationRecord, PoseEstimate
+from service.track import localize_sequence
+from service.types import IterationRecord
 
 _log = logging.getLogger(__name__)
 
@@ -72,11 +77,17 @@ class Attempts:
             if live.task is None or live.query is None:
                 live.task, live.query = desk.decoded(job, loaded)
             request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
-            estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
-            for timing in estimate.timings:
+            if live.task.reading is not None:
+                result, renders = self._sequence(live, live.task.reading, request, loaded, sent)
+            else:
+                told = partial(self._tell_step, live, sent)
+                estimate = localize(live.query, loaded, request, told)
+                anchor, renders = loaded.scene.info.geo_anchor, estimate.renders
+                result = result_out(estimate, timing_out(live.task.decode), versions(), anchor)
+            for timing in result.timings[1:]:
                 desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
-            desk.metrics.renders(job.estimator, estimate.renders)
-            return _success(estimate, live.task, loaded)
+            desk.metrics.renders(job.estimator, renders)
+            return Ending("succeeded", result.status, result.score, result.model_dump_json())
         except Cancelled:
             stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled
             return None if stopped else Ending("cancelled")
@@ -85,8 +96,25 @@ class Attempts:
             _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
             return ending("interrupted" if isinstance(error, SceneError) else "failed", error)
 
-    def _tell(self, live: LiveJob, record: IterationRecord, sent: _Sent) -> None:
-        live.tell(record_out(record).model_dump_json(), record.stage)
+    def _sequence(
+        self, live: LiveJob, reading: Reading, request: Request, loaded: LoadedScene, sent: _Sent
+    ) -> tuple[Result, int]:
+        """Localize several photos; the one that the result shows becomes the job's photo. Return renders, too."""
+        trajectory = Trajectory()
+        photos = read_sequence(self._desk.photos.original(live.id), reading)
+        with closing(photos), closing(localize_sequence(photos, loaded, request)) as poses:
+            for found in poses:
+                record = trajectory.add(found)
+                if trajectory.shown is found.estimate:
+                    live.query = found.photo.query
+                self._tell(live, sent, record)
+        return trajectory.result(loaded.scene.info.geo_anchor), trajectory.renders
+
+    def _tell_step(self, live: LiveJob, sent: _Sent, record: IterationRecord) -> None:
+        self._tell(live, sent, record_out(record))
+
+    def _tell(self, live: LiveJob, sent: _Sent, record: Record) -> None:
+        live.tell(record.model_dump_json(), record.stage)
         if time.monotonic() - sent.at < _BATCH_S:
             return
         batch = Batch(sent.count, live.records[sent.count :], live.stage)
@@ -113,8 +141,3 @@ class _Sent:
 
     count: int = 0
     at: float = 0.0
-
-
-def _success(estimate: PoseEstimate, task: Task, loaded: LoadedScene) -> Ending:
-    result = result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor)
-    return Ending("succeeded", result.status, result.score, result.model_dump_json())

@@ -45,7 +45,9 @@ class Desk:
     def decoded(self, job: StoredJob, loaded: LoadedScene) -> tuple[Task, Query]:
         """Read a stored request again. Raises PhotoGone."""
         body = Body(self.photos.original(job.id), "", {})
-        return make_task(body, LocalizeFields.model_validate_json(job.fields), loaded, job.estimator)
+        return make_task(
+            body, LocalizeFields.model_validate_json(job.fields), loaded, job.estimator, self.settings.max_frames
+        )
 
     def persisted(self, live: LiveJob, write: Callable[[], _T]) -> _T | None:
         """Write to the store, again and again while the disk is full. None if the service ends before that."""

@@ -1,16 +1,21 @@
-"""A job's pose in the words of other programs."""
+"""A job's pose, or a sequence's, in the words of other programs."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
-from service.api.schemas import IntrinsicsOut, Result
+import numpy as np
+
+from service.api.convert import pose_out
+from service.api.schemas import FrameOut, IntrinsicsOut, PoseOut, Result
 from service.errors import NoGeoAnchor
 from service.images import ONE_FOCAL
+from service.types import Pose, Status
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "geopose"]
 EXPORT_TYPES: dict[ExportFormat, str] = {
@@ -22,22 +27,48 @@ EXPORT_TYPES: dict[ExportFormat, str] = {
 
 
 def exported(kind: ExportFormat, photo_name: str, created: datetime, result: Result) -> str:
-    """Return the pose as text. Raises NoGeoAnchor."""
-    name = re.sub(r"[^\w./+-]+", "_", photo_name) or "photo.jpg"  # a space or line break would end the field
-    return _FORMATS[kind](name, created, result)
+    """Return the pose, or those of a sequence that were localized, as text. Raises NoGeoAnchor."""
+    if result.frames is None:
+        places = [_Place(_field(photo_name), created.timestamp(), result.pose)]
+    else:
+        places = _places(result.frames)
+    return _FORMATS[kind](places, result)
 
 
-def _colmap(name: str, created: datetime, result: Result) -> str:
-    """Two lines of images.txt (the second lists observed points: none), after comments with the camera."""
-    pose = result.pose.camera_from_world
+def trajectory_of(frames: Sequence[FrameOut]) -> str:
+    """Return those that were localized as TUM's tools read them."""
+    return "".join(map(_tum_line, _places(frames)))
+
+
+def _places(frames: Sequence[FrameOut]) -> list[_Place]:
+    found = [frame for frame in frames if frame.status is Status.LOCALIZED]
+    return [_Place(_field(frame.name), frame.time_s, _pose_of(frame)) for frame in found]
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    name: str
+    time_s: float
+    pose: PoseOut
+
+
+def _pose_of(frame: FrameOut) -> PoseOut:
+    return pose_out(Pose(np.array(frame.world_from_camera.matrix)))
+
+
+def _field(name: str) -> str:
+    return re.sub(r"[^\w./+-]+", "_", name) or "photo.jpg"  # a space or line break would end the field
+
+
+def _colmap(places: Sequence[_Place], result: Result) -> str:
+    """Two lines of images.txt each (the second lists observed points: none), after comments with the camera."""
     k = result.intrinsics
-    camera = _numbers(*_colmap_parameters(k))
-    return (
-        f"# cameras.txt: 1 {k.model} {k.width} {k.height} {camera}\n"
-        "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME\n"
-        f"1 {_numbers(*pose.quaternion_wxyz, *pose.translation)} 1 {name}\n"
-        "\n"
-    )
+    lines = [f"# cameras.txt: 1 {k.model} {k.width} {k.height} {_numbers(*_colmap_parameters(k))}"]
+    lines.append("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
+    for number, place in enumerate(places, 1):
+        pose = place.pose.camera_from_world
+        lines += [f"{number} {_numbers(*pose.quaternion_wxyz, *pose.translation)} 1 {place.name}", ""]
+    return "\n".join(lines) + "\n"
 
 
 def _colmap_parameters(k: IntrinsicsOut) -> list[float]:
@@ -57,12 +88,16 @@ _DISTORTION = {
 }
 
 
-def _nerfstudio(name: str, created: datetime, result: Result) -> str:
-    """An entry of `frames`, which brings its own intrinsics."""
-    k = result.intrinsics
-    frame = {
-        "file_path": name,
-        "transform_matrix": result.pose.opengl.world_from_camera.matrix,
+def _nerfstudio(places: Sequence[_Place], result: Result) -> str:
+    """An entry of `frames`, which brings its own intrinsics; of a sequence a file of them."""
+    entries = [_nerfstudio_frame(place, result.intrinsics) for place in places]
+    return json.dumps({"frames": entries} if result.frames is not None else entries[0], indent=2) + "\n"
+
+
+def _nerfstudio_frame(place: _Place, k: IntrinsicsOut) -> dict[str, Any]:
+    return {
+        "file_path": place.name,
+        "transform_matrix": place.pose.opengl.world_from_camera.matrix,
         "camera_model": "OPENCV_FISHEYE" if "FISHEYE" in k.model else "OPENCV",
         "w": k.width,
         "h": k.height,
@@ -72,16 +107,20 @@ def _nerfstudio(name: str, created: datetime, result: Result) -> str:
         "cy": k.cy,
         **dict(zip(_DISTORTION.get(k.model, ()), k.distortion, strict=True)),
     }
-    return json.dumps(frame, indent=2) + "\n"
 
 
-def _tum(name: str, created: datetime, result: Result) -> str:
+def _tum(places: Sequence[_Place], result: Result) -> str:
     """`timestamp tx ty tz qx qy qz qw`, of world_from_camera."""
-    w, x, y, z = result.pose.world_from_camera.quaternion_wxyz
-    return f"{created.timestamp():.6f} {_numbers(*result.pose.position, x, y, z, w)}\n"
+    return "".join(map(_tum_line, places))
 
 
-def _geopose(name: str, created: datetime, result: Result) -> str:
+def _tum_line(place: _Place) -> str:
+    w, x, y, z = place.pose.world_from_camera.quaternion_wxyz
+    return f"{place.time_s:.6f} {_numbers(*place.pose.position, x, y, z, w)}\n"
+
+
+def _geopose(places: Sequence[_Place], result: Result) -> str:
+    """Of a sequence the last."""
     if result.geopose is None:
         raise NoGeoAnchor(
             f"scene '{result.scene.id}' has no place on Earth.",
@@ -95,7 +134,7 @@ def _numbers(*values: float) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-_FORMATS: dict[ExportFormat, Callable[[str, datetime, Result], str]] = {
+_FORMATS: dict[ExportFormat, Callable[[Sequence[_Place], Result], str]] = {
     "colmap": _colmap,
     "nerfstudio": _nerfstudio,
     "tum": _tum,

@@ -6,7 +6,7 @@ import base64
 import dataclasses
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,9 @@ from starlette.requests import Request as HttpRequest
 from service.api.convert import OPENCV_FROM_OPENGL
 from service.api.problems import described
 from service.api.requests import LocalizeFields, LocalizeIn, PriorIn
+from service.api.sequence import Reading, check_sequence, is_packed, is_sequence, packed, read_sequence
 from service.errors import (
+    InvalidImage,
     InvalidIntrinsics,
     InvalidOptions,
     InvalidPrior,
@@ -33,9 +35,17 @@ from service.images import intrinsics_from, read_query
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 from service.types import Intrinsics, Pose, Query, StageTiming
 
-_NESTED = ("options", "intrinsics", "prior")
 _FIELDS = frozenset(LocalizeIn.model_fields)
-_ERRORS = {"options": InvalidOptions, "intrinsics": InvalidIntrinsics, "prior": InvalidPrior, "truth": InvalidPrior}
+_ERRORS = {
+    "options": InvalidOptions,
+    "intrinsics": InvalidIntrinsics,
+    "prior": InvalidPrior,
+    "truth": InvalidPrior,
+    "times_s": InvalidRequest,
+}
+"""Fields that a form has as JSON text."""
+MAX_FRAMES = 1000
+"""Photos of a sequence, unless an operator sets another limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +54,9 @@ class Task:
 
     request: Request
     decode: StageTiming
+    """Of the photo, or of the first one."""
+    reading: Reading | None = None
+    """How to read several photos, or a video; None: it is a single photo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,35 +64,37 @@ class Body:
     """What was sent, taken apart but not yet judged."""
 
     photo: bytes
+    """A photo or a video; several photos are packed together."""
     name: str
     """Of the file; empty if it has none."""
     fields: Mapping[str, Any]
 
 
-async def read_body(request: HttpRequest) -> Body:
+async def read_body(request: HttpRequest, max_frames: int = MAX_FRAMES) -> Body:
     """Take a multipart form or a JSON body apart. Raises InvalidRequest; HTTPException 415 for others."""
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
-        return await _form_body(request)
+        return await _form_body(request, max_frames)
     if media_type == "application/json":
         return await to_thread.run_sync(_json_body, await request.body())
     raise HTTPException(415, f"Send multipart/form-data or application/json, not '{media_type}'.")
 
 
-async def _form_body(request: HttpRequest) -> Body:
-    async with request.form(max_files=1, max_fields=16) as form:
+async def _form_body(request: HttpRequest, max_frames: int) -> Body:
+    async with request.form(max_files=max_frames, max_fields=16) as form:
         names = [name for name, _ in form.multi_items()]
         _refuse_unknown(names)
-        repeated = sorted({name for name in names if names.count(name) > 1})
+        repeated = sorted({name for name in names if name != "photo" and names.count(name) > 1})
         if repeated:
             raise InvalidRequest("given more than once.", where=repeated[0])
-        photo = form.get("photo")
-        if not isinstance(photo, UploadFile):
+        photos = form.getlist("photo")
+        if not photos or not all(isinstance(photo, UploadFile) for photo in photos):
             raise InvalidRequest("a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg")
         # Forms send an empty text for what was left empty.
         texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
         fields = {name: parsed_json(t, name) if name in _ERRORS else t for name, t in texts.items()}
-        return Body(await photo.read(), photo.filename or "", fields)
+        files = [(p.filename or "", await p.read()) for p in photos if isinstance(p, UploadFile)]
+        return await to_thread.run_sync(body_of, files, fields)
 
 
 def _json_body(text: bytes) -> Body:
@@ -94,7 +109,20 @@ def _json_body(text: bytes) -> Body:
         data = base64.b64decode(photo, validate=True)
     except ValueError as error:
         raise InvalidRequest(f"not base64: {error}.", where="photo") from error
-    return Body(data, "", {name: v for name, v in value.items() if v is not None})
+    return body_of([("", data)], {name: v for name, v in value.items() if v is not None})
+
+
+def body_of(files: Sequence[tuple[str, bytes]], fields: Mapping[str, Any]) -> Body:
+    """Put (name, photo) together. Raises InvalidImage, InvalidRequest."""
+    for index, (_, data) in enumerate(files):
+        if is_packed(data):
+            raise InvalidImage("a ZIP is no photo.", where="photo", hint="Send several photos as parts of their own.")
+        if len(files) > 1 and is_sequence(data):
+            raise InvalidRequest("a video is a job of its own.", where=f"photo.{index}")
+    name, data = files[0]
+    if len(files) == 1:
+        return Body(data, name, fields)
+    return Body(packed(files), f"{name} and {len(files) - 1} more", fields)
 
 
 def _refuse_unknown(names: Iterable[str]) -> None:
@@ -122,9 +150,16 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
 
 
 def make_task(
-    body: Body, fields: LocalizeFields, scene: LoadedScene, default_estimator: str = DEFAULT_ESTIMATOR
+    body: Body,
+    fields: LocalizeFields,
+    scene: LoadedScene,
+    default_estimator: str = DEFAULT_ESTIMATOR,
+    max_frames: int = MAX_FRAMES,
 ) -> tuple[Task, Query]:
-    """Decode the photo and parse everything else. Slow: not for the event loop. Raises BadInput."""
+    """Decode the photo, of several the first, and parse everything else. Slow: not for the event loop.
+
+    Raises BadInput.
+    """
     estimator = fields.estimator or default_estimator
     request = Request(
         estimator=estimator,
@@ -138,9 +173,26 @@ def make_task(
         prior_from(fields.truth, "truth")  # only checked: whoever measures errors reads it from the job
     background = scene.scene.info.background_rgb
     wall, cpu = time.perf_counter(), time.thread_time()
-    query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
+    if is_sequence(body.photo):
+        _require_ascending(fields.times_s)
+        if fields.truth is not None:
+            raise InvalidPrior("a single photo's; this is a sequence.", where="truth")
+        reading = Reading(max_frames, fields.every, fields.times_s, intrinsics, prior, background)
+        check_sequence(body.photo, reading)
+        query = next(read_sequence(body.photo, reading)).query
+    else:
+        for name in ("every", "times_s"):
+            if getattr(fields, name) != LocalizeFields.model_fields[name].default:
+                raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
+        reading = None
+        query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
     decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
-    return Task(request, decode), query
+    return Task(request, decode, reading), query
+
+
+def _require_ascending(times_s: Sequence[float] | None) -> None:
+    if times_s is not None and not (np.all(np.isfinite(times_s)) and np.all(np.diff(times_s) > 0)):
+        raise InvalidRequest("must be finite numbers, each greater than the one before.", where="times_s")
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:

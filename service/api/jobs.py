@@ -98,7 +98,9 @@ class Jobs:
         entry = self._scenes.entry(order.fields.scene)
         loaded = self._scenes.acquire(entry.id)
         try:
-            task, query = make_task(order.body, order.fields, loaded, self._settings.estimator)
+            task, query = make_task(
+                order.body, order.fields, loaded, self._settings.estimator, self._settings.max_frames
+            )
             new = _new_job(order, entry.id, task, query)
             job = self._stored(new, order.body.photo)
         except BaseException:

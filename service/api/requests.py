@@ -8,6 +8,7 @@ from annotated_types import Len
 from pydantic import Field
 
 from service.api.schemas import Model
+from service.video import MAX_EVERY
 
 Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
 
@@ -53,6 +54,10 @@ class LocalizeFields(Model):
     prior: PriorIn | None = None
     truth: PriorIn | None = None
     """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
+    every: int = Field(default=1, ge=1, le=MAX_EVERY)
+    """Of a video, or several photos: use each Nth, beginning with the first."""
+    times_s: list[float] | None = Field(default=None, min_length=2)
+    """When each of several photos was taken, in seconds, ascending; a video tells it itself."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
     """Wall time after which the best pose so far is the answer."""
@@ -65,8 +70,9 @@ class LocalizeFields(Model):
 class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same names.
 
-    In a form, `options`, `intrinsics`, `prior` and `truth` are JSON text and `photo` is a file.
+    In a form, `options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text, and `photo` is a file, or several
+    of one camera, in the order in which they were taken.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
-    """JPEG, PNG, WebP or HEIC."""
+    """JPEG, PNG, WebP or HEIC; or a video (MP4, MOV, WebM, Matroska, AVI), whose frames are localized one by one."""

@@ -118,8 +118,40 @@ class CandidatesOut(Model):
     """Higher is better; comparable within this record only."""
 
 
+class Covariance(Model):
+    """Of the right perturbation of world_from_camera: true = estimate @ exp(twist)."""
+
+    frame: Literal["camera"] = "camera"
+    order: list[str] = ["rx_rad", "ry_rad", "rz_rad", "tx_units", "ty_units", "tz_units"]
+    matrix: Matrix
+    """6x6."""
+    sigma_deg: float
+    """Square root of the trace of the rotation's block, in degrees."""
+    sigma_units: float
+    """Square root of the trace of the translation's block."""
+
+
+class FrameOut(Model):
+    """Where one photo of a sequence, or one frame of a video, was taken."""
+
+    index: int
+    """Among those that were looked at, from 0."""
+    name: str
+    """Of the file, or `frame N`: its number in the video, from 0."""
+    time_s: float
+    """As it was sent, or since the video's beginning."""
+    status: Status
+    reason: Reason
+    score: float
+    followed: bool
+    """From the photo before, without a search."""
+    world_from_camera: Transform
+    """The best pose found, in OpenCV camera axes. Don't use it unless `status` is `localized`."""
+    covariance: Covariance | None
+
+
 class Record(Model):
-    """One step of a job."""
+    """One step of a job; of a job with several photos, one photo."""
 
     index: int
     stage: str
@@ -139,6 +171,8 @@ class Record(Model):
     step_units: float | None
     matches: MatchesOut | None
     candidates: CandidatesOut | None
+    frame: FrameOut | None = None
+    """Of a job with several photos: this one's answer. `world_from_camera` is then the last that was localized."""
 
 
 class Trace(Model):
@@ -149,19 +183,6 @@ class Trace(Model):
     attempt: int
     """The one whose records these are."""
     records: list[Record]
-
-
-class Covariance(Model):
-    """Of the right perturbation of world_from_camera: true = estimate @ exp(twist)."""
-
-    frame: Literal["camera"] = "camera"
-    order: list[str] = ["rx_rad", "ry_rad", "rz_rad", "tx_units", "ty_units", "tz_units"]
-    matrix: Matrix
-    """6x6."""
-    sigma_deg: float
-    """Square root of the trace of the rotation's block, in degrees."""
-    sigma_units: float
-    """Square root of the trace of the translation's block."""
 
 
 class Timing(Model):
@@ -212,7 +233,7 @@ class Result(Model):
     hint: str
     """What to do about the reason; empty if all is well."""
     score: float
-    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.9
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.8
     is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
@@ -242,6 +263,9 @@ class Result(Model):
     scene: SceneRef
     versions: dict[str, str]
     warnings: list[str]
+    frames: list[FrameOut] | None = None
+    """Of a job with several photos or a video: each one's answer. All else in the result is of the last photo that was
+    localized, but for `timings`, which are all photos' together; `/jobs/{id}/photo` shows it, too."""
 
 
 class JobLinks(Model):

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
+from service.api.intake import MAX_FRAMES
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
@@ -80,7 +81,9 @@ class Settings(BaseSettings):
     crashes: int = Field(default=3, ge=1)
     """A job that was running in so many crashes is not run again."""
     max_upload_bytes: int = Field(default=50_000_000, ge=1)
-    """Of a photo."""
+    """Of a photo, a video, or several photos together."""
+    max_frames: int = Field(default=MAX_FRAMES, ge=1)
+    """Photos, or frames of a video, in one job."""
     max_uploads: int = Field(default=8, ge=1)
     """Requests whose bodies come in at once."""
     upload_s: float = Field(default=60.0, gt=0)

@@ -63,6 +63,8 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
     """Read a data set; `scene` is the folder or file of its trained scene. Raises UnknownName, SceneError."""
     if layout not in ("auto", *LAYOUTS):
         raise UnknownName(f"there is no layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
+    if folder.is_file():
+        raise SceneNotFound("a scene file has no photos.", where=str(folder), hint="Name the data set: --data FOLDER.")
     if not folder.is_dir():
         raise SceneNotFound("there is no such folder.", where=str(folder))
     if layout == "auto":
@@ -74,10 +76,12 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
         raise SceneNotFound(f"there are no test photos in layout '{layout}'.", where=str(folder))
     place = scene if scene is not None and scene.is_dir() else folder
     world_from_scene = read_manifest(place).world_from_scene
+    cut_out = layout == "nerf_synthetic"
     photos = [
-        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), (p.file.name,)) for p in test
+        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), flatten=cut_out)
+        for p in test
     ]
-    background = WHITE if layout == "nerf_synthetic" else None
+    background = WHITE if cut_out else None
     return DataSet(layout, tuple(photos), tuple(p.camera for p in training), background)
 
 
@@ -183,7 +187,7 @@ def _at_size_of(file: Path, intrinsics: Intrinsics) -> Intrinsics:
 
 def _size_of(file: Path) -> tuple[int, int]:
     try:
-        return photo_size(file)
+        return photo_size(file.read_bytes())
     except (InvalidImage, OSError) as error:
         raise CorruptScene(f"the photo has no size: {error}", where=str(file.name)) from None
 

@@ -8,8 +8,8 @@ bound. Wrong ones are made by stress:
     moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are
     drifted     the same, aligned from there, where that doesn't lead back
 
-The weights are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a result is
-of those tests. The weights in `service/pose/gate.py` are the fit on all.
+Weights and floors are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a
+result is of those tests. Those in `service/pose/gate.py` are the fit on all. Floors are of right poses within reason.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from service.bench.localize import Subject, subject
 from service.bench.metrics import COARSE, errors, nees
-from service.bench.queries import sent
+from service.bench.queries import BenchPhoto, sent
 from service.estimators.view_index import Options
 from service.geometry import moved
 from service.images import encode_image, read_query, resized
 from service.interfaces import Tools
 from service.localize import Request, localize
 from service.pose.alignment import align
-from service.pose.gate import BY_PIXELS, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
 from service.pose.views import photo_at, rendered_frame
 from service.types import Camera, Intrinsics, Pose, Query, Reason, Verdict
 
@@ -48,8 +48,12 @@ MOVED_UNITS, MOVED_DEG = (0.06, 1.5), 8.0
 FOREIGN = 8
 """Photos of each other scene."""
 GARBAGE = 8
+OCCLUDERS = 2
+"""Photos of each other scene that rectangles are cut from."""
 PENALTY = 0.02
 """On the squared weights, against certainty that few samples don't give."""
+BELOW_FLOOR = 0.005
+"""Share of right poses, for each signal."""
 BINS = 10
 OF_THE_LENS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED, Reason.LITTLE_SCENE_IN_VIEW)
 
@@ -81,12 +85,14 @@ def run(
     for one in subjects:
         one.loaded.prepare("view_index")
         rng = np.random.default_rng(seed)
+        others = [other for other in subjects if other is not one]
+        cut = [_pixels(photo) for other in others for photo in other.photos[:OCCLUDERS]]
         for photo in one.photos:
-            samples += _of_photo(one, photo, rng)
+            samples += _of_photo(one, photo, cut, rng)
             done += 1
             if progress:
                 progress(done, total)
-        samples += _foreign(one, [other for other in subjects if other is not one])
+        samples += _foreign(one, others)
     return summary(samples) | {"samples": [_line(sample) for sample in samples]}
 
 
@@ -95,10 +101,16 @@ def _line(sample: Sample) -> dict[str, Any]:
     return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
 
 
-def _of_photo(one: Subject, photo: Any, rng: np.random.Generator) -> Iterator[Sample]:
+def _pixels(photo: BenchPhoto) -> Float32[np.ndarray, "h w 3"]:
+    return read_query(photo.path.read_bytes()).rgb.astype(np.float32) / 255
+
+
+def _of_photo(
+    one: Subject, photo: BenchPhoto, occluders: Sequence[Float32[np.ndarray, "_ _ 3"]], rng: np.random.Generator
+) -> Iterator[Sample]:
     """Yield the samples of one test photo."""
     for modify in (*WITHIN_REASON, *BEYOND):
-        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)))
+        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)), occluders)
         query = read_query(file.data, intrinsics=file.told, background_rgb=one.background_rgb)
         kind = ("beyond " if modify in BEYOND else "") + ("clean" if not modify else modify[0])
         yield _localized(one, kind, photo.name, query, file.truth.pose)
@@ -201,16 +213,21 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     scenes = np.array([sample.scene for sample in samples])
     kinds = np.array([sample.kind for sample in samples])
     doubted = np.array([sample.doubted for sample in samples])
+    usual = right & ~np.char.startswith(kinds, "beyond")
     result: dict[str, Any] = {}
     for name, model in (("with_matches", WITH_MATCHES), ("by_pixels", BY_PIXELS)):
         features = scaled(samples, model)
         tested = np.zeros(len(samples))
         for scene in np.unique(scenes):
             here = scenes == scene
-            tested[here] = probabilities(features[here], fitted(features[~here], right[~here]))
-        weights = fitted(features, right)
+            weights, floor = fitted(features[~here], right[~here]), floors(features[~here & usual])
+            doubtful = (features[here] < floor).any(1)
+            tested[here] = probabilities(features[here], weights)
+            tested[here] = np.minimum(tested[here], np.where(doubtful, DOUBTFUL, 1.0))
+        ends = [SCALES[n].value_at(f) for n, f in zip(list(model)[1:], floors(features[usual])[1:], strict=True)]
         result[name] = {
-            "weights": dict(zip(model, np.round(weights, 2).tolist(), strict=True)),
+            "weights": dict(zip(model, np.round(fitted(features, right), 2).tolist(), strict=True)),
+            "floors": dict(zip(list(model)[1:], np.round(ends, 3).tolist(), strict=True)),
             **_counts(tested, right, kinds, doubted),
             "reliability": _reliability(tested, right),
         }
@@ -250,6 +267,11 @@ def fitted(features: Float64[np.ndarray, "n k"], right: Bool[np.ndarray, "n"]) -
         if np.abs(step).max() < 1e-6:
             break
     return weights
+
+
+def floors(features: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "k"]:
+    """Return what nearly all of these right poses' scaled signals stay above."""
+    return np.quantile(features, BELOW_FLOOR, axis=0)
 
 
 def _counts(

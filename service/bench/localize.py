@@ -75,7 +75,7 @@ def run(
     start: str = "none",
     trials: int = 1,
     seed: int = 0,
-    intrinsics: Literal["given", "withheld"] = "given",
+    intrinsics: Literal["given", "approximate", "withheld"] = "given",
     cameras: Literal["given", "ignored"] = "given",
     modify: Sequence[str] = (),
     occluders: Path | None = None,
@@ -212,7 +212,9 @@ def _pictures(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
 
 def answered(one: Subject, trial: Trial, request: Request, intrinsics: str = "given") -> PoseEstimate:
     """Localize one trial as the service would."""
-    told = trial.told if intrinsics == "given" else None
+    told = None if intrinsics == "withheld" else trial.told
+    if told and intrinsics == "approximate":
+        told = replace(told, trust="approximate")
     query = read_query(trial.data, intrinsics=told, prior=trial.start, background_rgb=one.background_rgb)
     return localize(query, one.loaded, request)
 

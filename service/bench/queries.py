@@ -35,6 +35,8 @@ class BenchPhoto:
     """The truth, in the world frame."""
     aliases: tuple[str, ...] = ()
     """Other names under which the same view may stand among the scene's cameras."""
+    flatten: bool = False
+    """Its transparent parts show the background, not the unknown."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,7 +87,7 @@ def sent(
 ) -> Sent:
     """Return the photo, modified; `occluders` are photos of another scene. Raises UnknownName, InvalidOptions."""
     data = photo.path.read_bytes()
-    if not modify:
+    if not modify and not photo.flatten:
         return Sent(data, photo.camera.intrinsics, photo.camera)
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background_rgb)
     shot = Shot(query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose, occluders=tuple(occluders))

@@ -29,7 +29,7 @@ from service.pose.descent import Se3, photometric, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import loss_against, require_loss
 from service.pose.matching import epipolar_inliers, match_record, render_and_match
-from service.pose.views import RENDER_PX, Correspondences, photo_at, sized
+from service.pose.views import RENDER_PX, Correspondences, known_at, photo_at, sized
 from service.types import Camera, Intrinsics, IterationRecord, Pose, Query
 
 MATCHES_IMAGES = True
@@ -68,7 +68,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Descend from the prior. Raises InvalidPrior without one."""
     start = required_prior(query, "icomma")
     intrinsics = sized(query.intrinsics, options.long_side_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics))
+    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
     pose_of = Se3(start, tools.prepared)
     numbers, adam = np.zeros(6), Adam(6, options.rate)
     matches: Correspondences | None = None

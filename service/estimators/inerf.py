@@ -23,7 +23,7 @@ from service.pose.adam import Adam
 from service.pose.descent import Se3, photometric, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import Loss, interest_region, loss_against, require_loss
-from service.pose.views import RENDER_PX, photo_at, sized
+from service.pose.views import RENDER_PX, known_at, photo_at, sized
 from service.types import IterationRecord, Pose, Query
 
 DECAY, DECAY_STEPS = 0.8, 100
@@ -59,7 +59,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     start = required_prior(query, "inerf")
     intrinsics = sized(query.intrinsics, options.long_side_px)
     photo = photo_at(query, tools, intrinsics)
-    loss = loss_against(options.loss, photo)
+    loss = loss_against(options.loss, photo, known_at(query, tools, intrinsics))
     choose = _chooser(photo, options.rays, tools.rng) if options.rays else None
     pose_of = Se3(start, tools.prepared)
     numbers, adam = np.zeros(6), Adam(6, options.rate)

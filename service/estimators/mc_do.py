@@ -33,7 +33,7 @@ from service.pose.level import contributions, pruned
 from service.pose.losses import loss_against, require_loss
 from service.pose.matching import match_record, render_and_match
 from service.pose.viewpoints import index_cameras
-from service.pose.views import RENDER_PX, Correspondences, View, photo_at, sized
+from service.pose.views import RENDER_PX, Correspondences, View, known_at, photo_at, sized
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.types import Camera, Candidates, IterationRecord, Pose, Query
@@ -197,7 +197,7 @@ def _decoupled(start: Pose, query: Query, tools: Tools, options: Options) -> Gen
 
 def _descended(start: Pose, query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     intrinsics = sized(query.intrinsics, options.render_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics))
+    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
     focus = tools.prepared.focus
     best, least = start, np.inf
     steps = refine(tools.rasterizer, intrinsics, start, loss, focus, options.refinement_steps, RATE, END_RATE)

@@ -27,7 +27,7 @@ from service.pose.adam import Adam
 from service.pose.descent import So3T3, photometric, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import loss_against, require_loss
-from service.pose.views import photo_at, sized
+from service.pose.views import known_at, photo_at, sized
 from service.types import Candidates, IterationRecord, Pose, Query
 
 DECAY, DECAY_STEPS = 0.33, 256
@@ -88,7 +88,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Descend from around the prior. Raises InvalidPrior without one."""
     start, focus = required_prior(query, "pnerf"), tools.prepared
     intrinsics = sized(query.intrinsics, options.long_side_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics))
+    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
     yield IterationRecord("start", start)
     fleet = [_Hypothesis(start, focus)]
     fleet += [_drawn(start, START_DEG, START_UNITS, tools) for _ in range(options.hypotheses - 1)]

@@ -53,7 +53,7 @@ STRONG = 150
 """Inliers with which alignment needs no further match."""
 SAME_SCALE = 1.4
 """Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
-SCALES_PX = (160, 768)
+SCALES_PX = (160, 640)
 VOTE_SHARE, CLOSER_LOOKS = 0.6, 2
 """Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
 TURN_BIAS = 0.77
@@ -63,8 +63,6 @@ ODD_SHRINK = 0.8
 SAMPLE_PX, SAMPLES, SAMPLE_ROUNDS = 256, 8, 4
 MOST_ROUNDS = 100
 """Of an exhaustive search without a budget."""
-RECOGNISED = 14
-"""Inliers of any match that make sampling worth its while."""
 PROMISING = 12
 """Inliers of a sampled pose with which it is worth a larger render."""
 SETTLED_PX = 0.3
@@ -119,14 +117,14 @@ class _Hunt:
     """The one that the gate likes best."""
     score: float = 0.0
     accepted: bool = False
-    most_inliers: int = 0
-    """Of any match: more than chance gives tell that something was recognised."""
+    recognised: bool = False
+    """Whether a render at some pose had more matches with the photo than chance gives: foreign photos never do."""
 
     def follow(self, search: Iterator[IterationRecord]) -> Iterator[IterationRecord]:
         """Yield a search's records, with the best answer so far, and put its end before the gate."""
         last: IterationRecord | None = None
         for last in search:
-            self.most_inliers = max(self.most_inliers, last.num_inliers or 0)
+            self.recognised |= last.stage == "rematch"
             yield self._with_answer(last)
         if last is None or (self.answer and last.stage != "align"):
             return  # the search gave up
@@ -168,7 +166,7 @@ def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iter
     yield _search("retrieve", sight, index.vectors @ words, query, tools, options)
     sight, scores = _turned_sight(sight, query, tools)
     yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options)
-    if options.effort == "fast" or (options.effort == "normal" and hunt.most_inliers < RECOGNISED):
+    if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
         yield _sampled(sight, scores, query, tools)

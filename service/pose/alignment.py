@@ -59,6 +59,8 @@ UNKNOWN = np.float32(-1e4)
 """In a photo; whatever mixes with it is negative, too."""
 UNTOUCHED = np.array([1.0, 0.0, 0.0, 0.0])
 """The look of a photo that is like the render."""
+SUSPICIOUS, FREE_SIGMA = 0.004, 0.15
+"""Pull on a focal length that is said to be exact, from which on it is set free to see how far it goes."""
 CORRELATED = 50.0
 """Neighbouring residuals err together: this many count as one observation against what is known of the lens."""
 
@@ -234,6 +236,11 @@ def evidence(
     if covariance is None or free_focal is None:
         return None
     focal_pull = float(np.linalg.solve(hessian[:focal, :focal], scores[:focal].sum(1, dtype=np.float64))[-1])
+    if not focal_sigma and abs(focal_pull) > SUSPICIOUS:
+        # From a pose that makes up for a wrong focal length one step leads a fifth of the way.
+        free = replace(state, focal_sigma=FREE_SIGMA, look=state.look.copy())
+        _align_level(level, free)
+        focal_pull = float(np.log(free.lens.focal_factor))
     if focal_sigma:
         keep = np.r_[TWIST, LENS]
         information = np.linalg.inv(covariance[np.ix_(keep, keep)])

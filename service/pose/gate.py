@@ -6,7 +6,9 @@ colours), each over most of the photo and over its better half (the other may be
 between photo and render agree with the pose, to the pixel and without any fit, what share that is, and how they are
 spread; and by how much alignment would still move the pose. Together they give a probability that the pose is right
 (within 5 degrees and 1/80 of the distance), by a logistic model whose weights `splatfix bench gate` fits and tests:
-each signal is cut off at both ends, so that none makes up for another, and weighs positively.
+each signal is cut off at both ends and weighs positively. Sums forgive, so each signal has a floor besides, that 199
+of 200 right poses stay above: below it a pose is in doubt, however good the rest (a mirrored picture of a row of
+spheres has all edges in place, and other colours).
 """
 
 from __future__ import annotations
@@ -62,6 +64,12 @@ class Scale:
             value, ends = np.log(np.maximum(value, 1e-6)), np.log(ends)
         return np.clip((np.asarray(value) - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
 
+    def value_at(self, scaled: float) -> float:
+        """Return the signal that is mapped to this."""
+        if self.ratio:
+            return float(self.hopeless * (self.certain / self.hopeless) ** scaled)
+        return self.hopeless + scaled * (self.certain - self.hopeless)
+
 
 SCALES = {
     "gradients": Scale(0.3, 0.95),
@@ -74,16 +82,21 @@ SCALES = {
     "inlier_spread": Scale(0.1, 0.9),
 }
 WITH_MATCHES = {
-    "bias": -12.0, "gradients": 2.0, "gradients_half": 2.0, "colours": 2.0, "colours_half": 2.0,
-    "drift_px": 2.0, "inliers": 4.0, "inlier_share": 4.0, "inlier_spread": 2.0,
+    "bias": -9.63, "gradients": 0.0, "gradients_half": 1.02, "colours": 0.0, "colours_half": 3.48,
+    "drift_px": 6.07, "inliers": 0.0, "inlier_share": 3.49, "inlier_spread": 0.0,
 }  # fmt: skip
 BY_PIXELS = {
-    "bias": -12.0, "gradients": 4.0, "gradients_half": 4.0, "colours": 4.0, "colours_half": 4.0, "drift_px": 4.0,
+    "bias": -9.89, "gradients": 0.86, "gradients_half": 2.88, "colours": 0.0, "colours_half": 3.72, "drift_px": 6.52,
 }  # fmt: skip
-LOCALIZED, UNCERTAIN = 0.9, 0.1
+FLOORS = {
+    "gradients": 0.57, "gradients_half": 0.81, "colours": 0.69, "colours_half": 0.895, "drift_px": 1.58,
+    "inliers": 88.0, "inlier_share": 0.425, "inlier_spread": 0.417,
+}  # fmt: skip
+"""In `drift_px` a ceiling."""
+LOCALIZED, UNCERTAIN = 0.8, 0.1
 """Least probabilities."""
 DOUBTFUL = 0.5
-"""What remains of a good score where the lens is in doubt, or hardly anything is seen."""
+"""What remains of a good score where a signal or the lens is in doubt, or hardly anything is seen."""
 HOPELESS = 0.35
 """Mean of the scaled signals of a kind, below which nothing was recognised: foreign photos have 0.0 to 0.3."""
 MIN_COVERAGE = 0.04
@@ -110,6 +123,8 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
     pixels = evidence(resized, frame, camera, answer, query.focal_sigma, known)
     signals = pixel_signals(resized, frame, known, size, pixels) | _match_signals(found, frame, query, size, pose)
+    if known is not None:  # as many as a whole photo would have
+        signals["inliers"] /= max(float(known.mean()), 0.1)
     return judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
 
 
@@ -162,11 +177,19 @@ def probability(signals: Mapping[str, float]) -> float:
     return float(1.0 / (1.0 + np.exp(-logit)))
 
 
+def in_doubt(signals: Mapping[str, float]) -> list[str]:
+    """Return the signals that are below their floors."""
+    scaled = {
+        name: (SCALES[name](value), SCALES[name](FLOORS[name])) for name, value in signals.items() if name in FLOORS
+    }
+    return [name for name, (value, floor) in scaled.items() if value < floor]
+
+
 def judged(
     signals: Mapping[str, float], pixels: Evidence | None, focal_sigma: float, few_features: bool = False
 ) -> Verdict:
     """Return the verdict on a pose; `focal_sigma` is what was known of the lens."""
-    score = probability(signals)
+    score = min(probability(signals), DOUBTFUL if in_doubt(signals) else 1.0)
     doubt, covariance, sigma = _of_lens(pixels, focal_sigma)
     if signals["coverage"] < MIN_COVERAGE:
         doubt = Reason.LITTLE_SCENE_IN_VIEW
@@ -186,8 +209,9 @@ def judged(
 def _weakest(signals: Mapping[str, float]) -> Reason:
     """Return why the pose is not believed."""
     scaled = {name: float(SCALES[name](value)) for name, value in signals.items() if name in SCALES}
+    scaled = {name: scaled[name] for name in in_doubt(signals)} or scaled
     matches = np.mean([value for name, value in scaled.items() if name.startswith("inlier")] or [1.0])
-    pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")])
+    pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")] or [1.0])
     if max(matches, pixels) < HOPELESS:
         return Reason.NO_MATCHING_VIEW
     return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_DISAGREES

@@ -45,9 +45,18 @@ class Loss:
         return self.of(render)
 
 
-def loss_against(name: str, photo: UInt8[np.ndarray, "h w 3"]) -> Loss:
-    """Return the loss against a photo. Raises UnknownName."""
-    return Loss(_maker(name)(photo))
+def loss_against(name: str, photo: UInt8[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"] | None = None) -> Loss:
+    """Return the loss against a photo; where it is unknown, any render is right. Raises UnknownName."""
+    made = _maker(name)(photo)
+    if known is None:
+        return Loss(made)
+    target, weight = _unit(photo), known[..., None]
+
+    def of(render: Image) -> tuple[float, Image]:
+        value, gradient = made(np.where(weight, render, target))
+        return value, gradient * weight
+
+    return Loss(of)
 
 
 def require_loss(name: str) -> None:

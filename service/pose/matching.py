@@ -12,13 +12,13 @@ from jaxtyping import Bool, Float32
 
 from service.interfaces import Features, Frame, ImageMatcher, Rasterizer, Tools
 from service.pose.views import (
-    PHOTO_FEATURES,
     VIEW_FEATURES,
     Correspondences,
     View,
     correspondences,
     lifted,
     photo_at,
+    photo_features,
     to_uint8,
 )
 from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query
@@ -32,7 +32,7 @@ def render_and_match(
     if tools.image_matcher:
         return _matched_images(frame, camera, tools.image_matcher, query, tools)
     view = lifted(tools.matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
-    return correspondences(_photo_features(camera, query, tools), view, tools.matcher), view
+    return correspondences(photo_features(query, tools, camera.intrinsics.long_side), view, tools.matcher), view
 
 
 def _matched_images(
@@ -62,16 +62,6 @@ def match_record(
         num_inliers=int(inlier.sum()),
         matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),
     )
-
-
-def _photo_features(camera: Camera, query: Query, tools: Tools) -> Features:
-    """Return the features of the photo at the camera's size, in pixels of `Query.rgb`; once a job."""
-    size = camera.intrinsics
-    key = ("photo_features_at", size.width, size.height)
-    if key not in tools.memo:
-        found = tools.matcher.extract(photo_at(query, tools, size), PHOTO_FEATURES)
-        tools.memo[key] = Features(found.points_px * _photo_scale(size, query), found.scores, found.descriptors)
-    return tools.memo[key]
 
 
 def epipolar_inliers(matches: Correspondences, intrinsics: Intrinsics) -> Bool[np.ndarray, "m"]:

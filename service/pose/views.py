@@ -22,6 +22,9 @@ SIZE_MULTIPLE_PX = 32
 """Learned matchers want sides of this multiple; other sizes they would resample once more."""
 RENDER_PX = 416
 """Long side of the renders that are matched and aligned: the dilation is scaled, so small is not biased."""
+LENS_RENDER_PX = 640
+"""The same where the photo's focal length is free: hidden behind the distance, it asks for more pixels (58 photos:
+median error 0.14 % with 416, 0.08 % with 640)."""
 PHOTO_PX = 512
 PHOTO_FEATURES = 2048
 VIEW_FEATURES = 800
@@ -155,7 +158,7 @@ def render_views(cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Mat
 
 def rendered_frame(pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0) -> tuple[Frame, Camera]:
     """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
-    camera = Camera(sized(query.intrinsics, RENDER_PX), pose)
+    camera = Camera(sized(query.intrinsics, LENS_RENDER_PX if query.focal_sigma else RENDER_PX), pose)
     last: tuple[Frame, Camera] | None = tools.memo.get("last_frame")
     if last and _nearly_seen(*last, camera, tolerance_px):
         return last

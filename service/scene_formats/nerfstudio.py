@@ -102,7 +102,7 @@ class TransformsFile:
         file = self.photo_file(photo)
         if file is not None:
             try:
-                return photo_size(file)
+                return photo_size(file.read_bytes())
             except InvalidImage as error:
                 raise CorruptScene(f"the photo has no size: {error}", where=where) from None
         if manifest.training_size:

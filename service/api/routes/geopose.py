@@ -17,7 +17,8 @@ from service.api.problems import problem_answer
 from service.api.requests import LocalizeFields
 from service.api.routes.parts import PartsOf
 from service.api.schemas import Problem
-from service.errors import DeadlineExceeded, NoGeoAnchor
+from service.api.sequence import is_sequence
+from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
 
 GEOPOSE = "application/geopose+json"
 
@@ -55,6 +56,8 @@ async def geopose(
     as long as `Prefer: wait` may.
     """
     photo, intrinsics = gpp.image_of(wanted)
+    if is_sequence(photo):
+        raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
     entry = parts.scenes.entry(scene or gpp.nearest_scene(parts.scenes.entries(), wanted))
     anchor = parts.scenes.get(entry.id).scene.info.geo_anchor
     if anchor is None:

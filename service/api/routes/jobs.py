@@ -173,7 +173,8 @@ def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response
 
     `colmap`: an entry of `images.txt`, its camera in a comment. `nerfstudio`: an entry of `frames` in
     `transforms.json`. `tum`: a line of a trajectory, stamped with the time of the job's acceptance. `geopose`: OGC
-    GeoPose 1.0, if the scene's manifest has a `geo_anchor`.
+    GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
+    an `images.txt`, a `transforms.json` or a trajectory in the photos' own times; `geopose` has the last.
     """
     name, created, result = documents.answer(job)
     return Response(exported(format, name, created, result), media_type=EXPORT_TYPES[format])

@@ -25,8 +25,8 @@ def _form_schema() -> dict[str, Any]:
     """The multipart form: as the JSON body, but the photo is a file and the nested fields are JSON text."""
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
     schema.pop("$defs", None)
-    schema["description"] = "`options`, `intrinsics`, `prior` and `truth` are JSON text."
-    for name in ("options", "intrinsics", "prior", "truth"):
+    schema["description"] = "`options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text."
+    for name in ("options", "intrinsics", "prior", "truth", "times_s"):
         described = LocalizeFields.model_fields[name].description or "See the JSON body."
         schema["properties"][name] = {
             "type": "string",
@@ -34,9 +34,11 @@ def _form_schema() -> dict[str, Any]:
             "description": described,
         }
     schema["properties"]["photo"] = {
-        "type": "string",
-        "format": "binary",
-        "description": "JPEG, PNG, WebP or HEIC.",
+        "type": "array",
+        "items": {"type": "string", "format": "binary"},
+        "minItems": 1,
+        "description": "A photo (JPEG, PNG, WebP, HEIC); several of one camera, in the order in which they were taken; "
+        "or a video (MP4, MOV, WebM, Matroska, AVI).",
     }
     return schema
 
@@ -84,8 +86,12 @@ async def localize_photo(
         Header(max_length=200, description="Send a request again with the same key: it is the same job, not a second"),
     ] = None,
 ) -> JobOut:
-    """Find where a photo was taken. What is wrong with the request is told at once; the search is a job."""
-    body = await read_body(request)
+    """Find where a photo was taken. What is wrong with the request is told at once; the search is a job.
+
+    Several photos of one camera, or a video, are one job: each is followed from the one before, an event `record`
+    tells each one's answer, and the result's `frames` has them all.
+    """
+    body = await read_body(request, parts.settings.max_frames)
     fields = read_fields(body.fields)
     digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
     order = Order(body, fields, client_of(request.scope), idempotency_key, digest)

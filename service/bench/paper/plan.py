@@ -76,7 +76,6 @@ MAIN = (
         "pnerf", "pnerf", {"hypotheses": 4, "long_side_px": 64}, "3DGS in place of Instant-NGP, 4 hypotheses, 64 px"
     ),
 )
-NEEDS_A_START = SLOW
 ABLATION = {"": ("loss",), "mc": ("mc",), "do": ("do",), "mc+do": ("mc", "do"), "mc+do+loss": ("mc", "do", "loss")}
 """Table 5's rows. Of its first one the supplement doesn't say what is left; here it is the descent alone."""
 RESOLUTIONS_PX = (208, 416, 800)

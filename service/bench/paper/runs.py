@@ -258,7 +258,7 @@ def _key(line: Mapping[str, Any]) -> Key:
 @cache
 def code_digest() -> str:
     """Return a digest of the source that decides results: a report says how many versions its lines are of."""
-    root, digest = Path(service.__file__).parent, hashlib.sha256()
+    root, digest = Path(__file__).parents[2], hashlib.sha256()
     for folder in ("estimators", "pose", "render", "matchers"):
         for file in sorted((root / folder).glob("*.py")):
             digest.update(file.read_bytes())

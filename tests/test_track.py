@@ -1,0 +1,228 @@
+"""Following a camera: planted paths through a room, photos with noise and changing exposure."""
+
+from __future__ import annotations
+
+import json
+import threading
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
+
+from service import track
+from service.bench import track as bench
+from service.bench.metrics import Units
+from service.errors import SceneNotFound
+from service.geometry import moved, pose_distance
+from service.images import encode_image, query_of, read_query
+from service.localize import Cancelled, LoadedScene, Request
+from service.pose.gate import verify
+from service.track import SequencePhoto, Tracker, localize_sequence
+from service.types import Camera, Intrinsics, Pose, Query, Status
+
+LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+
+
+TILT = np.array([0.15, 0.0, 0.0, 0.0, 0.0, 0.0])
+"""The walls' Gaussians lie in a plane: seen level, it would be chance which of two covers the other."""
+
+
+def place(angle: float, height: float) -> Pose:
+    return moved(pose_at(angle, height), TILT)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = write_room(tmp_path_factory.mktemp("track") / "room")
+    path = folder / "transforms.json"
+    transforms = json.loads(path.read_text())
+    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
+    for frame in transforms["frames"]:
+        level = Pose(np.array(frame["transform_matrix"]) @ opengl)
+        frame["transform_matrix"] = (moved(level, TILT).world_from_camera @ opengl).tolist()
+    path.write_text(json.dumps(transforms))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def room(folder) -> LoadedScene:
+    loaded = LoadedScene.load(folder, cache_dir=folder / "cache")
+    loaded.prepare("view_index")
+    return loaded
+
+
+def path(count: int, start: float = 1.0) -> list[Pose]:
+    """A turn of 1.1 degrees a photo, while the camera goes up and down."""
+    return [place(start + 0.02 * i, 0.1 + 0.1 * np.sin(0.3 * i)) for i in range(count)]
+
+
+def photo(room: LoadedScene, pose: Pose, number: int = 0, lens: Intrinsics = LENS) -> np.ndarray:
+    rgb = room.rasterizer.render([Camera(lens, pose)])[0].rgb
+    noise = np.random.default_rng(number).normal(0, 0.03, rgb.shape)
+    return np.rint(255 * np.clip((0.9 + 0.2 * np.sin(number)) * rgb + noise, 0, 1)).astype(np.uint8)
+
+
+def query(room: LoadedScene, pose: Pose, number: int = 0, intrinsics: Intrinsics | None = LENS) -> Query:
+    return query_of(photo(room, pose, number), intrinsics=intrinsics)
+
+
+def followed(estimate) -> bool:
+    return estimate.records[-1].stage == "track"
+
+
+def close(pose: Pose, truth: Pose, degrees: float = 0.1, units: float = 0.005) -> bool:
+    turned, shifted = pose_distance(pose, truth)
+    return turned < degrees and shifted < units
+
+
+BLACK = Query(np.zeros((HEIGHT, WIDTH, 3), np.uint8), LENS, "given", LENS)
+
+
+def test_a_smooth_path_is_searched_once_and_then_followed(room):
+    tracker, truth = Tracker(room), path(12)
+    found = [tracker.track(query(room, pose, i)) for i, pose in enumerate(truth)]
+    assert [followed(estimate) for estimate in found] == [False, *[True] * 11]
+    assert {estimate.verdict.status for estimate in found} == {Status.LOCALIZED}
+    errors = [pose_distance(estimate.pose, pose) for estimate, pose in zip(found, truth, strict=True)]
+    assert max(e[0] for e in errors) < 0.1  # seen: 0.013
+    assert max(e[1] for e in errors) < 0.005  # seen: 0.0005
+    # No drift: the last is as good as the first.
+    assert errors[-1][1] < 0.002
+    assert all(estimate.verdict.covariance is not None for estimate in found)
+    assert found[5].renders <= 2
+
+
+def test_a_lost_camera_says_so_and_is_found_again(room):
+    tracker, truth = Tracker(room), path(6)
+    for i in range(2):
+        tracker.track(query(room, truth[i], i))
+    blind = tracker.track(BLACK)
+    assert blind.verdict.status is Status.NOT_LOCALIZED
+    again = tracker.track(query(room, truth[3], 3))
+    assert again.verdict.status is Status.LOCALIZED
+    assert not followed(again)
+    assert close(again.pose, truth[3])
+    assert followed(tracker.track(query(room, truth[4], 4)))
+
+
+def test_a_jump_is_not_followed_into_a_wrong_place(room):
+    tracker = Tracker(room)
+    tracker.track(query(room, place(1.0, 0.1)))
+    there = place(3.5, -0.1)
+    found = tracker.track(query(room, there, 1))
+    assert close(found.pose, there)
+    assert found.verdict.status is Status.LOCALIZED
+    assert not followed(found)
+
+
+def test_a_photo_of_elsewhere_on_the_way_is_not_localized(room):
+    """Every answer that is called localized is right, whatever comes in between."""
+    tracker, truth = Tracker(room), path(4)
+    rng = np.random.default_rng(5)
+    tracker.track(query(room, truth[0]))
+    coarse = rng.integers(0, 255, (12, 16, 3)).astype(np.uint8)
+    foreign = query_of(np.kron(coarse, np.ones((20, 20, 1), np.uint8)).astype(np.uint8), intrinsics=LENS)
+    assert tracker.track(foreign).verdict.status is not Status.LOCALIZED
+    assert close(tracker.track(query(room, truth[2], 2)).pose, truth[2])
+
+
+def test_times_scale_the_expected_motion(room):
+    tracker = Tracker(room)
+    a, b = place(1.0, 0.1), place(1.02, 0.1)
+    for time_s, pose in ((0.0, a), (0.5, b)):
+        tracker.track(query(room, pose), time_s)
+    step = a.camera_from_world @ b.world_from_camera
+    for time_s, intervals in ((1.0, 1), (1.5, 2), (99.0, 2)):  # a velocity isn't believed for long
+        expected = Pose(b.world_from_camera @ np.linalg.matrix_power(step, intervals))
+        assert close(tracker._expected(time_s), expected, 0.1, 0.005), time_s
+
+
+def test_the_gate_is_asked_in_doubt_and_now_and_then(room, monkeypatch):
+    asked = []
+    monkeypatch.setattr(track, "verify", lambda *a: asked.append(1) or verify(*a))
+    monkeypatch.setattr(track, "GATE_EVERY", 3)
+    tracker, truth = Tracker(room), path(7)
+    for i, pose in enumerate(truth):
+        tracker.track(query(room, pose, i))
+    assert len(asked) == 2  # photos 3 and 6 after the first
+    monkeypatch.setattr(track, "LOCALIZED", 1.1)
+    asked.clear()
+    estimate = tracker.track(query(room, path(8)[7], 7))
+    assert asked
+    assert estimate.verdict.inliers > 50
+    assert followed(estimate)
+
+
+def test_photos_tell_their_lens_together(room, monkeypatch):
+    """The focal length isn't told: it comes to be known better than one photo tells it, and the places with it."""
+    monkeypatch.setattr(track, "LENS_SETTLED", 0.0)
+    truth = [place(1.0 + 0.06 * i, 0.3 * np.sin(0.5 * i)) for i in range(10)]
+    guess = replace(LENS, fx=1.08 * FOCAL, fy=1.08 * FOCAL, trust="approximate")
+    tracker = Tracker(room)
+    found = [tracker.track(query(room, pose, i, guess)) for i, pose in enumerate(truth)]
+    alone = found[0]
+    assert abs(found[-1].intrinsics.fx / FOCAL - 1) < 0.005  # seen: 0.0005
+    assert found[-1].verdict.focal_sigma < alone.verdict.focal_sigma
+    assert found[-1].verdict.status is Status.LOCALIZED
+    assert close(found[-1].pose, truth[-1], 0.3, 0.02)
+
+
+def test_a_sequence_ends_with_its_budget_and_on_cancelling(room):
+    photos = [SequencePhoto(f"{i}", i, query(room, pose, i)) for i, pose in enumerate(path(5))]
+    found = list(localize_sequence(photos, room, Request(budget_renders=1)))
+    assert len(found) == 1
+    assert found[0].exhausted
+    cancel = threading.Event()
+    poses = localize_sequence(photos, room, Request(cancel=cancel))
+    next(poses)
+    cancel.set()
+    with pytest.raises(Cancelled):
+        next(poses)
+
+
+def test_photos_of_another_shape_are_searched_for(room):
+    tracker = Tracker(room)
+    tracker.track(query(room, place(1.0, 0.1)))
+    upright = Intrinsics(HEIGHT, WIDTH, FOCAL, FOCAL, HEIGHT / 2, WIDTH / 2)
+    pose = place(1.02, 0.1)
+    found = tracker.track(query_of(photo(room, pose, 1, upright), intrinsics=upright))
+    assert close(found.pose, pose)
+
+
+class TestBench:
+    UNITS = Units(np.zeros(3), 2.0, False)
+
+    def test_the_path_is_smooth_steady_and_goes_through_the_cameras(self):
+        stations = [place(a, 0.3 * np.cos(a)) for a in (0.0, 0.9, 0.4, 1.5)]
+        poses = bench.smooth_path(stations, self.UNITS, 400)
+        assert len(poses) == 400
+        steps = [bench._pace(a, b, self.UNITS) for a, b in pairwise(poses)]
+        assert max(steps) < 1.05  # frames; where it turns back, less
+        assert np.median(steps) > 0.95
+        for station in stations:
+            nearest = min(pose_distance(station, pose) for pose in poses)
+            assert nearest[0] < bench.STEP_DEG
+            assert nearest[1] < bench.STEP_UNITS
+
+    def test_the_outcome_counts_what_happened(self, folder):
+        outcome = bench.run(folder, frames=8, seed=3)
+        assert (outcome["frames"], outcome["followed"], outcome["false_localized"]) == (8, 7, 0)
+        assert outcome["success_1deg_0p01"] == 1.0
+        assert 0 < outcome["rotation_deg_p50"] <= outcome["rotation_deg_p100"] < 0.2
+        assert outcome["latency_ms_p50"] > outcome["decode_ms_p50"] > 0
+        assert len(outcome["per_frame"]) == 8
+
+    def test_a_scene_without_cameras_has_no_path(self, folder, tmp_path):
+        (tmp_path / "scene.ply").write_bytes((folder / "scene.ply").read_bytes())
+        with pytest.raises(SceneNotFound, match="two training cameras"):
+            bench.run(tmp_path)
+
+
+def test_a_photo_and_its_file_are_the_same_query(room):
+    pixels = photo(room, place(1.0, 0.1))
+    a = query_of(pixels, intrinsics=LENS, long_side=200)
+    b = read_query(encode_image(pixels, "png"), intrinsics=LENS, long_side=200)
+    assert a.intrinsics == b.intrinsics
+    assert np.array_equal(a.rgb, b.rgb)
