@@ -111,7 +111,7 @@ def test_photos_truth_and_split(layout: str, tmp_path: Path) -> None:
     for photo, truth in zip(found.test, poses(COUNT)[::8], strict=True):
         assert photo.path.is_file()
         assert np.allclose(photo.camera.pose.world_from_camera, truth.world_from_camera, atol=1e-9)
-        size = photo_size(photo.path)
+        size = photo_size(photo.path.read_bytes())
         lens = photo.camera.intrinsics
         assert (lens.width, lens.height) == size
         assert lens.fx == pytest.approx((40 if layout == "nerf_synthetic" else 36) * size[0] / 40)

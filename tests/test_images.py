@@ -122,7 +122,7 @@ class TestOrientation:
     def test_size_of_the_upright_photo(self, tmp_path):
         file = tmp_path / "photo.jpg"
         file.write_bytes(encoded(Image.fromarray(gradient()), "JPEG", exif=exif_with(8)))
-        assert photo_size(file) == (60, 80)
+        assert photo_size(file.read_bytes()) == (60, 80)
 
 
 def spots(camera: Intrinsics, rays: np.ndarray, to_pixel, size: tuple[int, int]) -> np.ndarray:
