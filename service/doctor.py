@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from service import __version__
 from service.bench.render import room_cameras, synthetic_room
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
-from service.localize import DEFAULT_MATCHER, DEFAULT_RASTERIZER
+from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
 from service.pose.alignment import align
 from service.render import RASTERIZERS
@@ -40,7 +41,10 @@ def findings() -> Iterator[Finding]:
     """Examine the machine; some of it takes seconds, so one after the other."""
     yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
-    yield _tried("renderer", _try_renderer)
+    chosen, passed_over = choose_rasterizer()
+    yield Finding("renders with", True, f"{chosen} ({passed_over})" if passed_over else chosen)
+    for name in dict.fromkeys((chosen, "cpu")):
+        yield _tried(f"renderer {name}", partial(_try_renderer, name))
     yield _tried("matcher", _try_matcher)
     yield _package("pi-heif", "HEIC photos")
     yield from _plugins()
@@ -52,7 +56,7 @@ def findings() -> Iterator[Finding]:
 def warm() -> None:
     """Compile every kernel now, so that nothing has to later: a minute the first time, seconds after that."""
     (camera,) = room_cameras(64)[:1]
-    rasterizer = RASTERIZERS.load(DEFAULT_RASTERIZER).create(synthetic_room(2000))
+    rasterizer = RASTERIZERS.load("cpu").create(synthetic_room(2000))
     frame = rasterizer.render([camera])[0]
     rasterizer.pose_gradient(camera, frame.rgb)
     rasterizer.scene_gradients(camera, frame.rgb)
@@ -80,8 +84,8 @@ def _tried(subject: str, attempt: Callable[[], str]) -> Finding:
     return Finding(subject, True, f"{detail} ({time.perf_counter() - began:.1f} s)")
 
 
-def _try_renderer() -> str:
-    """Render one opaque red Gaussian: the kernels compile for this processor, and the middle is red."""
+def _try_renderer(name: str) -> str:
+    """Render one opaque red Gaussian: the kernels compile for this machine, and the middle is red."""
     scene = GaussianScene(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
@@ -92,10 +96,10 @@ def _try_renderer() -> str:
     )
     pose = look_at(np.array([0.0, 0.0, 3.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
     camera = Camera(Intrinsics(64, 64, 64.0, 64.0, 32.0, 32.0), pose)
-    middle = RASTERIZERS.load(DEFAULT_RASTERIZER).create(scene).render([camera])[0].rgb[32, 32]
+    middle = RASTERIZERS.load(name).create(scene).render([camera])[0].rgb[32, 32]
     if np.abs(middle - [1, 0, 0]).max() > 0.05:
         raise ArithmeticError(f"a red Gaussian came out as {middle}")
-    return f"numba {metadata.version('numba')} compiles, a picture is right"
+    return "a picture is right"
 
 
 def _try_matcher() -> str:

@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from service.errors import EstimatorFault, InvalidOptions
+from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
@@ -44,7 +44,8 @@ from service.types import (
 )
 
 DEFAULT_ESTIMATOR = "view_index"
-DEFAULT_RASTERIZER = "cpu"
+RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
+"""Where no rasterizer is named, the first one that can run here is used."""
 DEFAULT_MATCHER = "xfeat"
 
 
@@ -63,6 +64,10 @@ class LoadedScene:
     image_matcher: ImageMatcher | None = None
     cache_dir: Path | None = None
     """Where prepared things (view indexes) are kept between runs; None: nowhere."""
+    passed_over: str = ""
+    """Why the rasterizer isn't an earlier one of RASTERIZER_ORDER."""
+    warnings: tuple[str, ...] = ()
+    """For every result."""
     _prepared: dict[str, Any] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -72,10 +77,13 @@ class LoadedScene:
         folder: Path,
         *,
         cache_dir: Path | None = None,
-        rasterizer: str = DEFAULT_RASTERIZER,
+        rasterizer: str | None = None,
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
-        """Read a scene folder (or a bare scene file) and bind tools to it. Raises SceneError, UnknownName."""
+        """Read a scene folder (or a bare scene file) and bind tools to it.
+
+        Raises SceneError, UnknownName, and BackendMissing if the rasterizer that was named can't run.
+        """
         scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
         return cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
 
@@ -85,7 +93,7 @@ class LoadedScene:
         scene: GaussianScene,
         *,
         cache_dir: Path | None = None,
-        rasterizer: str = DEFAULT_RASTERIZER,
+        rasterizer: str | None = None,
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
         features = images = MATCHERS.load(matcher).create()
@@ -93,7 +101,8 @@ class LoadedScene:
             features = MATCHERS.load(DEFAULT_MATCHER).create()
         else:
             images = None
-        return cls(scene, RASTERIZERS.load(rasterizer).create(scene), features, images, cache_dir)
+        renderer, passed_over, warnings = _renderer(scene, rasterizer)
+        return cls(scene, renderer, features, images, cache_dir, passed_over, warnings)
 
     @property
     def nbytes(self) -> int:
@@ -110,6 +119,31 @@ class LoadedScene:
                 tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0))
                 self._prepared[estimator] = make(tools, self.cache_dir)
             return self._prepared[estimator]
+
+
+def choose_rasterizer() -> tuple[str, str]:
+    """Return the rasterizer for scenes that name none, and why it isn't an earlier one of RASTERIZER_ORDER."""
+    reasons = []
+    for name in RASTERIZER_ORDER:
+        reason = RASTERIZERS.missing(name)
+        if reason is None:
+            return name, "; ".join(reasons)
+        reasons.append(f"{name}: {reason}")
+    raise BackendMissing("; ".join(reasons), where="render")
+
+
+def _renderer(scene: GaussianScene, name: str | None) -> tuple[Rasterizer, str, tuple[str, ...]]:
+    """Return the rasterizer, why it isn't an earlier one of RASTERIZER_ORDER, and what results should warn of."""
+    if name:
+        return RASTERIZERS.load(name).create(scene), "", ()
+    name, passed_over = choose_rasterizer()
+    try:
+        return RASTERIZERS.load(name).create(scene), passed_over, ()
+    except BackendMissing as error:  # the GPU's memory may be full
+        last = RASTERIZER_ORDER[-1]
+        if name == last:
+            raise
+        return RASTERIZERS.load(last).create(scene), str(error), (f"rendered with {last}: {error}",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +230,7 @@ def estimate_of(
         budget_exhausted=exhausted,
         renders=renders,
         timings=tuple(timings),
-        warnings=query.warnings + info.warnings,
+        warnings=query.warnings + info.warnings + loaded.warnings,
         records=tuple(records),
     )
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import service.localize
-from service.errors import EstimatorFault
+from service.errors import BackendMissing, EstimatorFault
 from service.geometry import moved
 from service.interfaces import Features, Frame, SceneGradients
 from service.localize import Cancelled, LoadedScene, Request, localize
@@ -221,3 +221,48 @@ def test_a_scene_is_prepared_once_for_all_jobs(monkeypatch: pytest.MonkeyPatch, 
     for worker in workers:
         worker.join(20)
     assert script.prepared == [None]
+
+
+class Gpu:
+    """A rasterizer plug-in beside the CPU's; `full`: its memory."""
+
+    def __init__(self, reason: str | None = None, full: bool = False) -> None:
+        self.reason, self.full = reason, full
+
+    def missing(self, name: str) -> str | None:
+        return self.reason if name == "gsplat_cuda" else None
+
+    def load(self, name: str) -> SimpleNamespace:
+        return SimpleNamespace(create=lambda scene: self._create(name))
+
+    def _create(self, name: str) -> Nothing:
+        if name == "gsplat_cuda" and self.full:
+            raise BackendMissing("the GPU has no memory left.")
+        made = Nothing()
+        made.name = name
+        return made
+
+
+@pytest.mark.parametrize(
+    ("gpu", "named", "expected", "passed_over", "warned"),
+    [
+        (Gpu(), None, "gsplat_cuda", "", False),
+        (Gpu(), "cpu", "cpu", "", False),
+        (Gpu("no driver"), None, "cpu", "gsplat_cuda: no driver", False),
+        (Gpu(full=True), None, "cpu", "the GPU has no memory left.", True),
+    ],
+)
+def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expected, passed_over, warned):
+    monkeypatch.setattr(service.localize, "RASTERIZERS", gpu)
+    use(monkeypatch, Script(1))
+    bound = LoadedScene.of(loaded.scene, rasterizer=named)
+    assert (bound.rasterizer.name, bound.passed_over) == (expected, passed_over)
+    found = localize(QUERY, bound, Request("script"))
+    assert found.rasterizer == expected
+    assert any("GPU" in warning for warning in found.warnings) == warned
+
+
+def test_a_gpu_that_was_asked_for_is_no_other(monkeypatch, loaded):
+    monkeypatch.setattr(service.localize, "RASTERIZERS", Gpu(full=True))
+    with pytest.raises(BackendMissing, match="no memory"):
+        LoadedScene.of(loaded.scene, rasterizer="gsplat_cuda")

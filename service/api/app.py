@@ -47,6 +47,7 @@ from service.errors import InvalidRequest, StorageFailed
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
 from service.matchers import MATCHERS
+from service.render import RASTERIZERS
 
 
 def create_app(
@@ -62,6 +63,8 @@ def create_app(
     settings = settings or Settings()
     for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
         kind.load(name)  # an unknown name shall be told now, not in each job
+    if settings.rasterizer:
+        RASTERIZERS.load(settings.rasterizer)
     if scenes is None:
         known = Scenes(
             settings.scenes,
@@ -70,6 +73,7 @@ def create_app(
             matcher=settings.matcher,
             preload=settings.preload,
             memory_bytes=settings.scene_memory_bytes,
+            rasterizer=settings.rasterizer,
         )
     else:
         known = Scenes.of(scenes, settings.estimator)

@@ -63,12 +63,13 @@ class Scenes:
         matcher: str = DEFAULT_MATCHER,
         preload: list[str] | None = None,
         memory_bytes: int | None = None,
+        rasterizer: str | None = None,
     ) -> None:
         """Find the scenes, without reading them. Raises SceneNotFound, BadInput.
 
         `estimator` is the one that they are made ready for. `preload` names those to load at start, None all.
         """
-        self._estimator, self._matcher = estimator, matcher
+        self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
         self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
         self._entries: dict[str, Entry] = {}
         self._lock = threading.RLock()
@@ -216,7 +217,14 @@ class Scenes:
         awaited = [f"scene {e.id}: {e.state}" for e in entries if e.awaited and e.state in _UNDER_WAY]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
-        return Readiness(ready=usable and not awaited, awaited=awaited, failed=failed)
+        loaded = [e.loaded for e in entries if e.loaded]
+        return Readiness(
+            ready=usable and not awaited,
+            awaited=awaited,
+            failed=failed,
+            rasterizers=sorted({scene.rasterizer.name for scene in loaded}),
+            passed_over=sorted({scene.passed_over for scene in loaded if scene.passed_over}),
+        )
 
     # ------------------------------------------------------------------ on the loading thread
 
@@ -240,7 +248,8 @@ class Scenes:
 
     def _load(self, entry: Entry) -> None:
         if entry.loaded is None and entry.path is not None:
-            loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, matcher=self._matcher)
+            tools = {"matcher": self._matcher, "rasterizer": self._rasterizer}
+            loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, **tools)
             self._make_room(entry, loaded.nbytes)
             entry.loaded, entry.state = loaded, "preparing"
             self._settle(entry)

@@ -411,6 +411,10 @@ class Readiness(Model):
     """What is not done yet; empty when ready."""
     failed: list[str]
     """Scenes that could not be loaded, a disk that can't be written to, workers that are stuck; with the reason."""
+    rasterizers: list[str]
+    """What the scenes in memory are rendered with: `cpu`, `gsplat_cuda`."""
+    passed_over: list[str]
+    """Why no GPU is used, where the operator left the choice."""
 
 
 class Token(Model):

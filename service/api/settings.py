@@ -19,8 +19,17 @@ DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "sh
 CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "splatfix"
 
 
+_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+
+
 def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Count the processors that this process may use; a container's limit is a quota of their time."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    try:
+        quota, period = _CPU_QUOTA.read_text().split()
+    except (OSError, ValueError):
+        return cores
+    return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
 class Settings(BaseSettings):
@@ -56,6 +65,8 @@ class Settings(BaseSettings):
     """Of jobs that name none; what it prepares for a scene is made at start."""
     matcher: str = DEFAULT_MATCHER
     """Of local features, for all scenes; some need weights in the folder that SPLATFIX_WEIGHTS_DIR names."""
+    rasterizer: str | None = None
+    """Renderer; None: the GPU's where there is one that it can use, else the CPU's."""
     workers: int = Field(default_factory=_cores, ge=1)
     """Jobs that run at once; each has one thread."""
     queue_size: int = Field(default=32, ge=1)

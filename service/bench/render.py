@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from service.geometry import look_at
 from service.interfaces import Rasterizer
-from service.localize import DEFAULT_RASTERIZER
+from service.localize import choose_rasterizer
 from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
 
@@ -52,7 +52,7 @@ def run(
         cameras = room_cameras(width)
         scene = scenes.setdefault(count, synthetic_room(count))
         info = replace(scene.info, training_focal_px=cameras[0].intrinsics.fx)
-        rasterizer = RASTERIZERS.load(DEFAULT_RASTERIZER).create(replace(scene, info=info))
+        rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(replace(scene, info=info))
         for (stage, threads), times in _times(rasterizer, cameras, repeats).items():
             wall_ms, cpu_ms = 1e3 * times
             rows.append(

@@ -1,0 +1,138 @@
+"""What lies in docker/: the files are well formed, fit together, and ask for metrics that there are."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import promql_parser
+import pytest
+import yaml
+
+from service.api import settings
+
+ROOT = Path(__file__).parents[1]
+DOCKER = ROOT / "docker"
+MONITORING = DOCKER / "monitoring"
+
+
+def ran(*command: object) -> None:
+    done = subprocess.run([str(part) for part in command], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def installed(name: str) -> Path:
+    """A tool of the environment that runs the tests."""
+    return Path(sys.executable).with_name(name)
+
+
+def test_the_dockerfile_is_clean():
+    ran(installed("hadolint"), DOCKER / "Dockerfile")
+
+
+def test_the_compose_file_fits_its_schema():
+    ran(installed("check-jsonschema"), "--builtin-schema", "vendor.compose-spec", DOCKER / "compose.yaml")
+
+
+def test_the_kubernetes_objects_are_valid():
+    ran(installed("kubernetes-validate"), "--strict", DOCKER / "kubernetes.yaml")
+
+
+@pytest.mark.parametrize("script", ["entrypoint", "verify"])
+def test_the_scripts_can_be_run(script):
+    path = DOCKER / script
+    assert path.stat().st_mode & 0o111
+    shell = path.read_text().splitlines()[0].removeprefix("#!").split()
+    ran(*shell, "-n", path)
+
+
+def test_what_the_dockerfile_copies_is_there_and_not_ignored():
+    """.dockerignore leaves everything out and takes some things back in."""
+    kept = [line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")]
+    copied = re.findall(r"^COPY (?!--from)(.+) \S+$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE)
+    sources = [source for line in copied for source in line.split()]
+    assert {"service", "constraints.txt", "docker/entrypoint"} <= set(sources)
+    for source in sources:
+        assert (ROOT / source).exists(), source
+        assert any(source == entry or entry.startswith(f"{source}/") for entry in kept), source
+    for entry in kept:
+        assert (ROOT / entry).exists(), entry
+
+
+def compose() -> dict:
+    return yaml.safe_load((DOCKER / "compose.yaml").read_text())
+
+
+def test_files_that_compose_mounts_are_there():
+    for service in compose()["services"].values():
+        mounted = [str(volume).split(":")[0] for volume in service.get("volumes", [])]
+        for path in mounted:
+            assert not path.startswith("./") or (DOCKER / path).exists(), path
+
+
+def test_the_service_has_no_way_out():
+    """Only the gateway and Grafana publish a port, and only they are in a network that leads out."""
+    found = compose()
+    assert found["networks"]["inside"] == {"internal": True}
+    for name, service in found["services"].items():
+        if name not in ("gateway", "grafana"):
+            assert list(service["networks"]) == ["inside"], name
+            assert "ports" not in service, name
+
+
+def test_nothing_runs_as_root_or_writes_to_its_image():
+    for name, service in compose()["services"].items():
+        assert service["read_only"], name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["mem_limit"], name
+        assert service["cpus"], name
+    user = re.findall(r"^USER (.+)$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE)
+    assert user == ["10001:10001"]
+
+
+def queries() -> list[str]:
+    board = json.loads((MONITORING / "grafana" / "splatfix.json").read_text())
+    shown = [target["expr"] for panel in board["panels"] for target in panel["targets"]]
+    rules = yaml.safe_load((MONITORING / "alerts.yaml").read_text())
+    return shown + [rule["expr"] for group in rules["groups"] for rule in group["rules"]]
+
+
+def test_dashboard_and_alerts_ask_for_metrics_that_the_service_has(shared):
+    """Parsed as Prometheus would; names and labels as /metrics has them."""
+    told = shared.get("/metrics").text
+    families = set(re.findall(r"^# TYPE (\S+) ", told, re.MULTILINE))
+    for query in queries():
+        promql_parser.parse(query.replace("$__rate_interval", "5m"))
+        names = set(re.findall(r"\b((?:splatfix|process)_\w+)", query))
+        assert names or "up{" in query
+        for name in names:
+            assert name in families or re.sub("_(bucket|sum|count)$", "", name) in families, name
+    with pytest.raises(ValueError, match="parenthes"):
+        promql_parser.parse("sum(rate(x[5m])")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("max 100000", 64), ("200000 100000", 2), ("50000 100000", 1), ("nonsense", 64)]
+)
+def test_workers_follow_the_containers_share_of_processors(text, expected, tmp_path, monkeypatch):
+    quota = tmp_path / "cpu.max"
+    quota.write_text(text)
+    monkeypatch.setattr(settings, "_CPU_QUOTA", quota)
+    monkeypatch.setattr(settings.os, "sched_getaffinity", lambda pid: set(range(64)), raising=False)
+    assert settings._cores() == expected
+
+
+def test_nginx_takes_the_gateways_configuration(tmp_path):
+    """With the names of Docker replaced, since nginx looks them up."""
+    nginx = shutil.which("nginx")
+    if not nginx:
+        pytest.skip("there is no nginx on this machine")
+    shutil.copy(DOCKER / "nginx" / "splatfix.conf", tmp_path)
+    gateway = (DOCKER / "nginx" / "gateway.conf").read_text().replace("/etc/nginx", str(tmp_path))
+    main = f"pid {tmp_path}/pid; error_log stderr; events {{}} http {{ access_log off; {gateway} }}"
+    (tmp_path / "nginx.conf").write_text(main)
+    ran(nginx, "-t", "-p", tmp_path, "-c", tmp_path / "nginx.conf")
