@@ -64,7 +64,7 @@ _DECODERS = (
     ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
     ("PNG", PngImageFile, MAX_PIXELS, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
     ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
-    ("HEIC", lambda file: _heic(file.read()), MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
+    ("HEIC", None, MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
 )
 _HEIC_S = 30
 """Wall time; 64 megapixels take two seconds."""
@@ -174,7 +174,7 @@ def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float
 
 def photo_size(data: bytes) -> tuple[int, int]:
     """Return width and height of the upright photo, from its header. Raises InvalidImage."""
-    _, photo = _open(data)
+    _, photo = _open(data, header_only=True)
     transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
 
@@ -307,7 +307,7 @@ class _Decoded:
         )
 
 
-def _open(data: bytes) -> tuple[str, Image.Image]:
+def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
     """Read the header and check the size. Raises InvalidImage."""
     if not data:
         raise InvalidImage("the photo is empty (0 bytes).", where="photo")
@@ -316,7 +316,7 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
         raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
     name, decoder, limit = fitting[0]
     try:
-        photo = decoder(BytesIO(data))
+        photo = _heic(data, 0 if header_only else limit) if decoder is None else decoder(BytesIO(data))
     except Image.DecompressionBombError as error:
         raise InvalidImage(f"too many pixels: {error}", where="photo") from None
     except Exception as error:  # decoders raise almost anything on a broken file
@@ -333,9 +333,9 @@ def _open(data: bytes) -> tuple[str, Image.Image]:
     return name, photo
 
 
-def _heic(data: bytes) -> Image.Image:
-    """Decode in another process, which may crash. Raises ValueError."""
-    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(MAX_PIXELS)]
+def _heic(data: bytes, max_pixels: int) -> Image.Image:
+    """Decode in another process, which may crash; larger ones not. Raises ValueError."""
+    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(max_pixels)]
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
     try:
         told = subprocess.run(command, input=data, capture_output=True, timeout=_HEIC_S, check=True, env=kept).stdout
@@ -352,7 +352,7 @@ def _heic(data: bytes) -> Image.Image:
 
 
 class _Large(Image.Image):
-    """Of a photo that wasn't decoded: nothing but its size, to be refused."""
+    """A photo that wasn't decoded: its size, and what EXIF says."""
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__()
@@ -427,23 +427,20 @@ def _rgb(
     photo: Image.Image, background_rgb: tuple[float, float, float]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, list[str]]:
     """Return colours, opacity unless all is opaque, and warnings."""
-    rgb = np.empty((photo.height, photo.width, 3), np.uint8)
-    opacity = np.full(rgb.shape[:2], 255, np.uint8) if photo.has_transparency_data else None
+    rgb, alpha = np.empty((photo.height, photo.width, 3), np.uint8), None
     rows = max(1, _BAND_PX // photo.width)
     for top in range(0, photo.height, rows):
         band = photo.crop((0, top, photo.width, min(top + rows, photo.height)))
-        rgb[top : top + rows], alpha = _band_rgb(band, background_rgb)
-        if opacity is not None and alpha is not None:
-            opacity[top : top + rows] = alpha
-    if opacity is None or opacity.min(initial=255) == 255:
-        return rgb, None, []
-    return rgb, opacity, ["Transparent parts of the photo are ignored."]
+        rgb[top : top + rows], band_alpha = _band_rgb(band, background_rgb)
+        if band_alpha is not None:
+            alpha = np.full(rgb.shape[:2], 255, np.uint8) if alpha is None else alpha
+            alpha[top : top + rows] = band_alpha
+    return rgb, alpha, [] if alpha is None else ["Transparent parts of the photo are ignored."]
 
 
 def _band_rgb(
     band: Image.Image, background_rgb: tuple[float, float, float]
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
-    """Return colours, and opacity if there is any."""
     if band.mode.startswith(("I", "F")):  # 16-bit gray, which Pillow's own conversion would clip at 255
         gray = (np.asarray(band).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8)
         return np.repeat(gray[:, :, None], 3, axis=2), None
@@ -453,7 +450,7 @@ def _band_rgb(
     alpha = rgba.getchannel("A")
     canvas = Image.new("RGB", band.size, tuple(round(255 * c) for c in background_rgb))
     canvas.paste(rgba, mask=alpha)
-    return np.asarray(canvas), np.asarray(alpha)
+    return np.asarray(canvas), None if alpha.getextrema()[0] == 255 else np.asarray(alpha)
 
 
 def _orientation(photo: Image.Image) -> int:

@@ -242,7 +242,7 @@ class HeicChild:
         from service import heic_child
         from service.images import MAX_PIXELS
 
-        for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS):
+        for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
         while head := asked.read(4):
             signal.alarm(_HANG_S)

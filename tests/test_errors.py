@@ -87,7 +87,7 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
         changes = {
             **{"scenes": [folder / "scenes"], "cache_dir": None, "data_dir": folder / "data", "queue_size": 50},
             **{"preload": ["good", "plain", "torn", "odd", "fat"], "scene_memory_bytes": int(5 * size)},
-            **{"rate_limit": "", "photo_grace_s": 0, "max_wait_s": 1, "workers": 3, "shutdown_s": 0},
+            **{"rate_limit": "", "photo_grace_s": 0, "workers": 3, "shutdown_s": 0},
         }
         app = create_app(settings(**changes))
         with serving(app) as client:
@@ -186,6 +186,12 @@ def failing_geopose(s: SimpleNamespace, **options) -> httpx.Response:
         return geopose(s)
 
 
+def impatient_geopose(s: SimpleNamespace) -> httpx.Response:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(s.app.state.parts.settings, "max_wait_s", 0.3)
+        return failing_geopose(s, steps=10**6, pause_s=0.1)
+
+
 def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
     """The scene is gone when the job starts."""
     from service.errors import Interrupted
@@ -225,7 +231,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("geopose", "invalid_image"): lambda s: geopose(s, image=b"x"),
     ("geopose", "invalid_intrinsics"): lambda s: geopose(s, params={"model": "MAGIC", "modelParams": [1]}),
     ("geopose", "no_pose"): geopose,
-    ("geopose", "deadline_exceeded"): lambda s: failing_geopose(s, hold=True),
+    ("geopose", "deadline_exceeded"): impatient_geopose,
     ("geopose", "estimator_fault"): lambda s: failing_geopose(s, fail="fault"),
     ("geopose", "interrupted"): interrupted_geopose,
     ("geopose", "storage_failed"): lambda s: with_full_disk(s, lambda: geopose(s)),
