@@ -53,7 +53,8 @@ class Session:
         self._exact = ExactView(client, library.service, self._show_exact)
         self._saving = False
         self._opened = 0.0
-        self._asked_step = 0
+        self._asked: dict[str, Any] = {}
+        """What the user last set; a running job sets the same widgets, perhaps before it is looked at."""
         self._todo: list[Action] = []
         self._ready = threading.Condition()
         self._closed = False
@@ -115,10 +116,10 @@ class Session:
 
     def _wire(self) -> None:
         panel = self.panel
-        self._on_user(panel.jobs, self._user_chose_job)
+        self._on_user(panel.jobs, self._user_chose_job, "job")
         self._on_user(panel.newest, self._user_chose_newest)
-        self._on_user(panel.step, self._user_moved_slider, self._remember_slider)
-        self._on_user(panel.scenes, self._user_chose_scene)
+        self._on_user(panel.step, self._user_moved_slider, "step")
+        self._on_user(panel.scenes, self._user_chose_scene, "scene")
         for widget in (panel.matches, panel.weight, panel.colour_by):
             self._on_user(widget, self._draw)
         self._on_user(panel.exact, lambda: self._exact.want(panel.exact.value))
@@ -137,20 +138,16 @@ class Session:
         command("Previous step", hotkey="P").on_trigger(lambda _: self.post(lambda: self._press("◀ previous")))
         command("Play or pause", hotkey="space").on_trigger(lambda _: self.post(lambda: self._press("play / pause")))
 
-    def _on_user(self, widget: Any, action: Action, at_once: Action | None = None) -> None:
-        """Post the action when the user, not this program, has changed the widget; `at_once` runs before that."""
+    def _on_user(self, widget: Any, action: Action, name: str = "") -> None:
+        """Post the action when the user, not this program, has changed the widget; its value is asked for by `name`."""
 
         async def changed(event: Any) -> None:  # async: runs on viser's own loop, not in its pool of threads
             if event.client is not None:
-                if at_once is not None:
-                    at_once()
+                if name:
+                    self._asked[name] = widget.value
                 self.post(action)
 
         widget.on_update(changed)
-
-    def _remember_slider(self) -> None:
-        """Note what the user asked for: a running job moves the slider, too, perhaps before this is looked at."""
-        self._asked_step = self.panel.step.value
 
     def _jobs_changed(self) -> None:
         self.post(self._sync_jobs)
@@ -247,7 +244,7 @@ class Session:
         self.post(lambda: self.stage.show_exact(picture))
 
     def _user_chose_job(self) -> None:
-        label = self.panel.jobs.value
+        label = self._asked["job"]
         chosen = next((job.id for job in self._library.jobs or () if job_label(job) == label), None)
         if label != NO_JOB and chosen is not None:
             self._wanted, self._follows = chosen, False
@@ -256,7 +253,7 @@ class Session:
 
     def _user_chose_scene(self) -> None:
         """Show a scene by itself, without any job."""
-        scene_id = self.panel.scenes.value
+        scene_id = self._asked["scene"]
         if scene_id in (NO_SCENE, self._scene_id):
             return
         self.panel.newest.value = self._follows = False
@@ -273,7 +270,7 @@ class Session:
 
     def _user_moved_slider(self) -> None:
         self._playback.playing = False
-        self._playback.go(self._asked_step)
+        self._playback.go(self._asked["step"])
         self._show()
 
     def _press(self, button: str) -> None:
