@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from service.api.requests import LocalizeFields
     from service.api.schemas import Result
     from service.api.settings import Settings
-    from service.bench.paper.runs import Progress as PaperProgress
+    from service.bench.paper.runs import Standing
     from service.localize import LoadedScene
 
 # Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
@@ -361,37 +361,37 @@ def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
 
 
 @contextmanager
-def _live_table() -> Iterator[Callable[[PaperProgress], None]]:
+def _live_table() -> Iterator[Callable[[Standing], None]]:
     """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
     from rich.live import Live
 
     told = time.monotonic()
     with Live(console=err, auto_refresh=False, transient=True) as live:
 
-        def show(progress: PaperProgress) -> None:
+        def show(standing: Standing) -> None:
             nonlocal told
             if err.is_terminal:
-                live.update(_progress_table(progress), refresh=True)
+                live.update(_standing_table(standing), refresh=True)
             elif time.monotonic() - told > 60:
                 told = time.monotonic()
-                done, total = sum(progress.done.values()), sum(progress.total.values())
-                err.print(f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go", highlight=False)
+                done, total = sum(standing.done.values()), sum(standing.total.values())
+                err.print(f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go", highlight=False)
 
         yield show
 
 
-def _progress_table(progress: PaperProgress) -> Table:
+def _standing_table(standing: Standing) -> Table:
     from rich.table import Table
 
-    scenes = list(dict.fromkeys(scene for scene, _ in progress.total))
+    scenes = list(dict.fromkeys(scene for scene, _ in standing.total))
     table = Table("study / method / start", *scenes, title="within 5 deg / 0.05, of done, of all")
-    for cell in dict.fromkeys(cell for _, cell in progress.total):
+    for cell in dict.fromkeys(cell for _, cell in standing.total):
         places = [(scene, cell) for scene in scenes]
-        if any(progress.done.get(place) for place in places):
-            counts = [(progress.within.get(p, 0), progress.done.get(p, 0), progress.total[p]) for p in places]
+        if any(standing.done.get(place) for place in places):
+            counts = [(standing.within.get(p, 0), standing.done.get(p, 0), standing.total[p]) for p in places]
             table.add_row(cell, *(f"{a} / {b} / {c}" for a, b, c in counts))
-    done, total = sum(progress.done.values()), sum(progress.total.values())
-    table.caption = f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go"
+    done, total = sum(standing.done.values()), sum(standing.total.values())
+    table.caption = f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go"
     return table
 
 

@@ -89,7 +89,7 @@ def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequ
         place.set(xscale="log", ylim=(-0.03, 1.03), xlabel="step (record of the trace)", title=title)
         place.set_ylabel("share within 5 deg and 0.05 units")
         place.grid(alpha=0.3)
-        place.legend(fontsize=7, loc="upper left")
+        place.legend(fontsize=7)
     return _png(figure)
 
 

@@ -56,7 +56,7 @@ class Asked:
 
 
 @dataclass(slots=True)
-class Progress:
+class Standing:
     """How far the run is."""
 
     done: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -81,14 +81,14 @@ class Progress:
         return left
 
 
-def run(asked: Asked, on_progress: Callable[[Progress], None] | None = None) -> list[dict[str, Any]]:
+def run(asked: Asked, on_standing: Callable[[Standing], None] | None = None) -> list[dict[str, Any]]:
     """Run what is not there yet, and return all lines. Raises SceneError, InvalidRequest."""
     asked.out.mkdir(parents=True, exist_ok=True)
     subjects = {name: load(asked, name) for name in asked.scenes}
     _settle_config(asked, subjects)
     file = asked.out / "results.jsonl"
     lines = read_lines(file, mend=True)
-    progress = _begun(asked, subjects, lines)
+    standing = _begun(asked, subjects, lines)
     done, warm = {_key(line) for line in lines}, set[str]()
     with file.open("a", encoding="utf-8") as stream:
         for scene, cell, trial in _todo(asked, subjects):
@@ -104,10 +104,10 @@ def run(asked: Asked, on_progress: Callable[[Progress], None] | None = None) -> 
             os.fsync(stream.fileno())
             lines.append(line)
             done.add(_key(line))
-            _count(progress, line)
-            progress.seconds.setdefault(cell.name, []).append(time.perf_counter() - began)
-            if on_progress:
-                on_progress(progress)
+            _count(standing, line)
+            standing.seconds.setdefault(cell.name, []).append(time.perf_counter() - began)
+            if on_standing:
+                on_standing(standing)
     return lines
 
 
@@ -240,22 +240,22 @@ def _curve(estimate: PoseEstimate, trial: Trial, one: Subject) -> list[tuple[int
     return found
 
 
-def _begun(asked: Asked, subjects: Mapping[str, Subject], lines: Sequence[Mapping[str, Any]]) -> Progress:
-    progress = Progress()
+def _begun(asked: Asked, subjects: Mapping[str, Subject], lines: Sequence[Mapping[str, Any]]) -> Standing:
+    standing = Standing()
     for cell in asked.cells:
         for scene, one in subjects.items():
-            progress.total[scene, cell.name] = asked.count(cell, len(_of_cell(one, cell).photos))
+            standing.total[scene, cell.name] = asked.count(cell, len(_of_cell(one, cell).photos))
     for line in lines:  # of an earlier call there may be more than this one asks for
         place = line["scene"], line["cell"]
-        if progress.done.get(place, 0) < progress.total.get(place, 0):
-            _count(progress, line)
-    return progress
+        if standing.done.get(place, 0) < standing.total.get(place, 0):
+            _count(standing, line)
+    return standing
 
 
-def _count(progress: Progress, line: Mapping[str, Any]) -> None:
+def _count(standing: Standing, line: Mapping[str, Any]) -> None:
     place = line["scene"], line["cell"]
-    progress.done[place] = progress.done.get(place, 0) + 1
-    progress.within[place] = progress.within.get(place, 0) + bool(line["within_5deg_0p05"])
+    standing.done[place] = standing.done.get(place, 0) + 1
+    standing.within[place] = standing.within.get(place, 0) + bool(line["within_5deg_0p05"])
 
 
 def _key(line: Mapping[str, Any]) -> Key:
