@@ -367,6 +367,7 @@ class Reason(StrEnum):
     LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
     FOCAL_UNCERTAIN = "focal_uncertain"
     INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
+    PLACE_UNCERTAIN = "place_uncertain"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -388,6 +389,9 @@ HINTS: dict[Reason, str] = {
     Reason.INTRINSICS_CONTRADICTED: (
         "The photo fits the scene far better with another focal length: check the intrinsics, or send them with "
         'trust "approximate".'
+    ),
+    Reason.PLACE_UNCERTAIN: (
+        "The photo fits the scene, but hardly tells from where it was taken: show more of the scene, or nearer things."
     ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }

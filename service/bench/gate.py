@@ -57,7 +57,12 @@ PENALTY = 0.02
 BELOW_FLOOR = 0.004
 """Share of right poses, for each signal."""
 BINS = 10
-OF_THE_LENS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED, Reason.LITTLE_SCENE_IN_VIEW)
+OTHER_DOUBTS = (
+    Reason.FOCAL_UNCERTAIN,
+    Reason.INTRINSICS_CONTRADICTED,
+    Reason.LITTLE_SCENE_IN_VIEW,
+    Reason.PLACE_UNCERTAIN,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +212,7 @@ def _sample(
     if truth is not None:
         degrees, units = errors(pose, truth, one.units)
         right = degrees <= COARSE[0] and units <= COARSE[1]
-    doubted = verdict.reason in OF_THE_LENS
+    doubted = verdict.reason in OTHER_DOUBTS
     return Sample(one.loaded.scene.info.name, kind, photo, right, verdict.signals, doubted, weighed)
 
 
