@@ -144,9 +144,13 @@ def queries() -> list[str]:
     return shown + [rule["expr"] for group in rules["groups"] for rule in group["rules"]]
 
 
-def test_dashboard_and_alerts_ask_for_metrics_that_the_service_has(shared):
-    """Parsed as Prometheus would; names and labels as /metrics has them."""
-    told = shared.get("/metrics").text
+def test_dashboard_and_alerts_ask_for_metrics_that_the_service_has(plugins):
+    """Parsed as Prometheus would; names as /metrics has them."""
+    from api_server import create_app, make_scene, serving
+    from api_server import settings as few
+
+    with serving(create_app(few(), {"room": make_scene()})) as client:
+        told = client.get("/metrics").text
     families = set(re.findall(r"^# TYPE (\S+) ", told, re.MULTILINE))
     for query in queries():
         promql_parser.parse(query.replace("$__rate_interval", "5m"))
