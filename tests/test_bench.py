@@ -262,7 +262,7 @@ class TestStarts:
 
     @pytest.mark.parametrize(
         ("kind", "degrees", "lengths"),
-        [("near", (0, 5), (0, 0.1)), ("easy", (0, 30), (0, 0.5)), ("hard", (30, 60), (0.5, 1))],
+        [("near", (0, 2), (0, 0.05)), ("easy", (0, 30), (0, 0.5)), ("hard", (30, 60), (0.5, 1))],
     )
     @given(seed=st.integers(0, 1000))
     def test_world_frame(self, kind, degrees, lengths, seed):

@@ -325,7 +325,18 @@ def test_a_loss_rests_at_the_planted_truth(name: str, room: LoadedScene) -> None
     assert at_truth < (0.03 if name == "l1" else 3e-4) * at_degree
 
 
-@pytest.mark.parametrize(("name", "value"), [("hypotheses", -1), ("solver", "newton"), ("loss", "l3")])
+def test_mc_do_may_sample_the_whole_scene_beside_a_prior(room: LoadedScene) -> None:
+    truth = unseen_pose(2)
+    wrong = moved(truth, np.array([0.0, 3.0, 0.0, 0.0, 0.0, 0.0]))
+    options = ESTIMATORS.load("mc_do").Options(around="scene", refinement_steps=10)
+    found = localize(photo_at(room, truth, prior=wrong), room, Request("mc_do", options))
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("hypotheses", -1), ("solver", "newton"), ("around", "nothing"), ("loss", "l3")]
+)
 def test_mc_do_refuses_senseless_options(name: str, value: object) -> None:
     with pytest.raises((InvalidOptions, UnknownName), match=str(value) if name != "hypotheses" else name):
         ESTIMATORS.load("mc_do").Options(**{name: value})

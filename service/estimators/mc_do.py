@@ -55,6 +55,8 @@ RATE, END_RATE = 2e-3, 1e-5
 class Options:
     hypotheses: int = 64
     """Poses of the Monte Carlo stage's first round; 0 leaves the stage out."""
+    around: Literal["prior", "scene"] = "prior"
+    """What the first round is drawn around; without a prior it is the scene's viewpoints anyway."""
     range_deg: float = 60.0
     """Of the hypotheses around the prior: per axis, about the scene's centre."""
     range_share: float = 0.25
@@ -88,12 +90,14 @@ class Options:
             "refinement_steps": (0, 10_000),
         }
         require_within(self, limits)
-        if self.solver not in SOLVERS:
-            raise InvalidOptions(f"there is no solver '{self.solver}'; known: {', '.join(SOLVERS)}.", where="solver")
+        for what, value, known in (("solver", self.solver, SOLVERS), ("around", self.around, AROUND)):
+            if value not in known:
+                raise InvalidOptions(f"there is no {what} '{value}'; known: {', '.join(known)}.", where=what)
         require_loss(self.loss)
 
 
 SOLVERS = ("least_squares", "gradient")
+AROUND = ("prior", "scene")
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,13 +146,14 @@ def _sampled(start: Pose, query: Query, tools: Tools, options: Options) -> Gener
     focus = tools.prepared.focus
     degrees, share, count = options.range_deg, options.range_share, options.hypotheses
     parents = [start]
-    if query.prior is None:
+    from_prior = query.prior is not None and options.around == "prior"
+    if not from_prior:
         parents = list(tools.prepared.viewpoints)
         degrees, share = SCENE_JITTER_DEG, SCENE_JITTER_SHARE
     scored: list[_Hypothesis] = []
     for number in range(1 + options.rounds):
         poses = around(parents, focus, degrees, share, count, tools.rng)
-        if number == 0 and query.prior is not None:
+        if number == 0 and from_prior:
             poses[0] = start  # the prior itself is the first hypothesis
         if number:
             poses = [*parents, *poses]

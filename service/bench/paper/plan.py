@@ -64,7 +64,12 @@ def _mc_do(name: str, **changed: Any) -> Method:
 
 
 _NO_STAGE = {"hypotheses": 0, "iterations": 0, "refinement_steps": 0}
-_STAGES = {"mc": {"hypotheses": 64}, "do": {"iterations": 10}, "loss": {"refinement_steps": 60}}
+_STAGES: dict[str, dict[str, Any]] = {
+    # A start from anywhere says nothing of where to look.
+    "mc": {"hypotheses": 64, "around": "scene"},
+    "do": {"iterations": 10},
+    "loss": {"refinement_steps": 60},
+}
 MAIN = (
     Method("view_index", "view_index"),
     _mc_do("mc_do"),
