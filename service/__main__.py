@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import json
 import logging
 import os
@@ -98,7 +97,9 @@ def _settings(given: dict[str, Any]) -> Settings:
 @app.command()
 def localize(
     photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC.")],
-    scene: SceneOption,
+    scene: Annotated[
+        list[Path], typer.Option("--scene", help="Scene folder, scene file or folder of scenes; may be repeated.")
+    ],
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
@@ -108,25 +109,30 @@ def localize(
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
 ) -> None:
-    """Find where photos were taken in a scene."""
+    """Find where photos were taken in a scene; of several scenes, also in which."""
+    from service.anywhere import Found, localize_anywhere
     from service.api.convert import result_out, timing_out
     from service.api.documents import versions
     from service.api.intake import Body, make_task, read_fields
     from service.localize import DEFAULT_ESTIMATOR
     from service.localize import localize as run
+    from service.scene_formats.discovery import find_scenes
 
     given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s}
     given |= {"intrinsics": _json(intrinsics, "intrinsics"), "prior": _json(prior, "prior")}
     fields = read_fields({name: value for name, value in given.items() if value is not None})
     bodies = [Body(_bytes(photo), str(photo), {}) for photo in photos]
-    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
+    paths = [path for given_path in scene for path in find_scenes(given_path)]
+    loaded = [_loaded(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
-        task, query = make_task(body, fields, loaded)
-        estimate = run(query, loaded, task.request)
-        results.append(
-            (body.name, result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor))
-        )
+        task, query = make_task(body, fields, loaded[0])
+        if len(loaded) > 1:
+            found = localize_anywhere(query, loaded, task.request)
+        else:
+            found = Found(run(query, loaded[0], task.request), loaded[0])
+        anchor = found.loaded.scene.info.geo_anchor
+        results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
         if not as_json:
             out.print(_line(*results[-1]), markup=False, highlight=False, soft_wrap=True)
     if as_json:
@@ -138,7 +144,8 @@ def localize(
 def _line(name: str, result: Result) -> str:
     place = " ".join(f"{value:.4f}" for value in result.pose.position)
     turn = " ".join(f"{value:.4f}" for value in result.pose.world_from_camera.quaternion_wxyz)
-    told = f"{name}: {result.status}, score {result.score:.2f}, position {place}, quaternion_wxyz {turn}"
+    where = f" in {result.scene.id}" if result.considered else ""
+    told = f"{name}: {result.status}{where}, score {result.score:.2f}, position {place}, quaternion_wxyz {turn}"
     return f"{told}. {result.hint}" if result.hint else told
 
 
@@ -149,11 +156,11 @@ def _write_csv(path: Path, results: list[tuple[str, Result]]) -> None:
     """One row a photo; the pose is world_from_camera in OpenCV axes."""
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
-        table.writerow(["photo", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"])
+        table.writerow(["photo", "scene", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"])
         for name, result in results:
             spent = sum(timing.wall_s for timing in result.timings)
             turn = result.pose.world_from_camera.quaternion_wxyz
-            row = [name, result.status, result.reason, result.score, *result.pose.position, *turn]
+            row = [name, result.scene.id, result.status, result.reason, result.score, *result.pose.position, *turn]
             table.writerow([*row, result.inliers, round(1000 * spent, 1)])
 
 
@@ -385,17 +392,20 @@ def list_scenes(
 
 
 @scenes_app.command("inspect")
-def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")]) -> None:
-    """Read a scene and say what is in it."""
-    from service.scene_formats import load_scene
+def inspect_scene(
+    scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+) -> None:
+    """Read a scene and say what is in it, and from where it would be looked at."""
+    from service.inspection import inspected, told
 
-    with err.status(f"reading {scene}"):
-        found = load_scene(scene)
-    lower, upper = found.means.min(0), found.means.max(0)
-    facts = {"gaussians": found.count, "sh_degree": found.sh_degree, "training cameras": len(found.cameras)}
-    facts |= {"memory": f"{found.nbytes / 1e6:.1f} MB", "extent": f"{lower.tolist()} to {upper.tolist()}"}
-    for name, value in (facts | dataclasses.asdict(found.info)).items():
-        out.print(f"{name:22} {value}", markup=False, highlight=False, soft_wrap=True)
+    with err.status(f"looking at {scene}"):
+        facts = inspected(scene)
+    if as_json:
+        _print_json(facts)
+        return
+    for name, value in told(facts).items():
+        out.print(f"{name:18} {value}", markup=False, highlight=False, soft_wrap=True)
 
 
 @keys_app.command("add")

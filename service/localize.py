@@ -31,7 +31,7 @@ from service.pose.gate import verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.scene_formats import load_scene
-from service.scene_formats.cache import mapped_scene
+from service.scene_formats.cache import mapped_scene, release
 from service.types import (
     GaussianScene,
     IterationRecord,
@@ -77,7 +77,9 @@ class LoadedScene:
     ) -> LoadedScene:
         """Read a scene folder (or a bare scene file) and bind tools to it. Raises SceneError, UnknownName."""
         scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
-        return cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        release(scene)  # the rasterizer has its own copy
+        return loaded
 
     @classmethod
     def of(
@@ -139,9 +141,10 @@ def localize(
     _require_matching(request.estimator, loaded)
     options = request.options if request.options is not None else plugin.Options()
     tally = RenderTally()
+    rasterizer, warnings = _for_photo(query, loaded)
     tools = Tools(
         loaded.scene,
-        Counted(loaded.rasterizer, tally),
+        Counted(rasterizer, tally),
         loaded.matcher,
         np.random.default_rng(request.seed),
         loaded.prepare(request.estimator),
@@ -178,7 +181,7 @@ def localize(
         budget_exhausted=exhausted,
         renders=renders,
         timings=_timings(records, clock),
-        warnings=query.warnings + loaded.scene.info.warnings,
+        warnings=query.warnings + loaded.scene.info.warnings + warnings,
         records=tuple(records),
     )
 
@@ -191,6 +194,24 @@ def _require_matching(estimator: str, loaded: LoadedScene) -> None:
             where="matcher",
             hint="Take mc_do or icomma, or another matcher.",
         )
+
+
+ASSUMED_TRAINING_PX = (800, 1600)
+"""Bounds of the training photos' long side, where it is taken from the photo to localize."""
+
+
+def _for_photo(query: Query, loaded: LoadedScene) -> tuple[Rasterizer, tuple[str, ...]]:
+    """Return the scene's rasterizer; where the size of training is unknown, with the photo's, and a warning."""
+    info = loaded.scene.info
+    if info.training_focal_px or info.training_long_side_px:
+        return loaded.rasterizer, ()
+    low, high = ASSUMED_TRAINING_PX
+    assumed = min(max(query.photo_intrinsics.long_side, low), high)
+    warning = (
+        f"the size of the photos that the scene was trained with is unknown: {assumed} px is assumed, which can shift "
+        'the pose a little; say "training_size" in scene.json.'
+    )
+    return loaded.rasterizer.trained_at(assumed), (warning,)
 
 
 def _exhausted(request: Request, clock: _Clock, tally: RenderTally) -> bool:

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from service.anywhere import Found, localize_anywhere
 from service.api.convert import record_out, result_out, timing_out
 from service.api.desk import Desk, ending
 from service.api.documents import versions
 from service.api.intake import Task
 from service.api.live import LiveJob
 from service.api.requests import LocalizeFields
+from service.api.scenes import several
 from service.api.store import Batch, Ending, StoredJob
 from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFailed
-from service.localize import Cancelled, LoadedScene, localize
+from service.localize import Cancelled, LoadedScene, Request, localize
 from service.logs import bound
-from service.types import IterationRecord, PoseEstimate
+from service.types import IterationRecord, Query
 
 _log = logging.getLogger(__name__)
 
@@ -66,17 +69,17 @@ class Attempts:
         """Localize; None if it was stopped because the service ends."""
         desk = self._desk
         try:
-            if live.loaded is None:
-                live.loaded = desk.scenes.acquire(job.scene)
-            loaded = live.loaded
+            if not live.held:
+                asked = LocalizeFields.model_validate_json(job.fields).scene
+                live.held = desk.scenes.acquire(desk.scenes.chosen(asked if several(asked) else job.scene))
             if live.task is None or live.query is None:
-                live.task, live.query = desk.decoded(job, loaded)
+                live.task, live.query = desk.decoded(job, live.held[0])
             request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
-            estimate = localize(live.query, loaded, request, lambda record: self._tell(live, record, sent))
-            for timing in estimate.timings:
+            found = _found(live.query, live.held, request, lambda record: self._tell(live, record, sent))
+            for timing in found.estimate.timings:
                 desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
-            desk.metrics.renders(job.estimator, estimate.renders)
-            return _success(estimate, live.task, loaded)
+            desk.metrics.renders(job.estimator, found.estimate.renders)
+            return replace(_success(found, live.task), scene=desk.scenes.id_of(found.loaded))
         except Cancelled:
             stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled
             return None if stopped else Ending("cancelled")
@@ -115,6 +118,14 @@ class _Sent:
     at: float = 0.0
 
 
-def _success(estimate: PoseEstimate, task: Task, loaded: LoadedScene) -> Ending:
-    result = result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor)
+def _found(
+    query: Query, scenes: Sequence[LoadedScene], request: Request, on_record: Callable[[IterationRecord], None]
+) -> Found:
+    if len(scenes) > 1:
+        return localize_anywhere(query, scenes, request, on_record)
+    return Found(localize(query, scenes[0], request, on_record), scenes[0])
+
+
+def _success(found: Found, task: Task) -> Ending:
+    result = result_out(found.estimate, timing_out(task.decode), versions(), found.loaded.scene.info.geo_anchor)
     return Ending("succeeded", result.status, result.score, result.model_dump_json())

@@ -78,7 +78,8 @@ async def _form_body(request: HttpRequest) -> Body:
             raise InvalidRequest("a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg")
         # Forms send an empty text for what was left empty.
         texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
-        fields = {name: parsed_json(t, name) if name in _ERRORS else t for name, t in texts.items()}
+        listed = {"scene"} if texts.get("scene", "").startswith("[") else set()
+        fields = {name: parsed_json(t, name) if name in {*_ERRORS, *listed} else t for name, t in texts.items()}
         return Body(await photo.read(), photo.filename or "", fields)
 
 
