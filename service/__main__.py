@@ -380,6 +380,38 @@ def bench_render(
         out.print(" ".join(f"{_short(value):>13}" for value in row), highlight=False, soft_wrap=True)
 
 
+@bench_app.command("scale")
+def bench_scale(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    around: Annotated[list[Path] | None, typer.Option(help="Scenes to put around it; else varied copies.")] = None,
+    sizes: Annotated[list[int] | None, typer.Option("--size", min=1000, help="Gaussians; may be repeated.")] = None,
+    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "ignored",
+    compressed: Annotated[bool, typer.Option("--compressed", help="Write compressed scene files.")] = False,
+    work: Annotated[Path | None, typer.Option(help="Where to write the large scenes meanwhile.")] = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="Draw the curves: .svg or .png.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Measure loading, indexing, memory and localization of scenes of growing size."""
+    from service.bench.scale import SIZES, plot, run
+
+    _tell_machine()
+    with _progress() as progress:
+        rows = run(
+            folder,
+            others=around or (),
+            sizes=sizes or SIZES,
+            cameras=cameras,
+            compressed=compressed,
+            work=work,
+            progress=_counter(progress, "sizes"),
+        )
+    _write_json(json_file, rows)
+    if plot_file:
+        plot(rows, plot_file)
+    for name in rows[0]:
+        out.print(f"{name:20}" + " ".join(f"{_short(row[name]):>14}" for row in rows), highlight=False, soft_wrap=True)
+
+
 @scenes_app.command("list")
 def list_scenes(
     folder: Annotated[Path, typer.Argument(help="A scene, or a folder of scenes.")] = Path(),

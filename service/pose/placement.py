@@ -30,12 +30,14 @@ from service.types import Camera, GaussianScene, Intrinsics, Pose
 MIN_OPACITY = 0.3
 MAX_POINTS = 400_000
 CELLS = 400_000
-"""Of the grid, in the middle 98 % of the volume."""
+"""Of the grid, at most, in the middle 98 % of the volume."""
+POINTS_PER_CELL = 4
+"""On the six sides of a cube of cells: fewer cells, if there are not enough points to close a wall."""
 SEARCH_GAUSSIANS = 200_000
 """More are thinned for the search: a view of 64 px doesn't show the difference."""
 SEARCH_PX = 64
 SEARCH_FOV_DEG = 60.0
-SHELLS = (1.2, 2.0, 3.4)
+SHELLS = (1.2, 2.0, 3.4, 5.0)
 """Radii, in units of the radius that holds half of the opaque Gaussians."""
 SHELL_CANDIDATES, VOLUME_CANDIDATES, SIZE_CANDIDATES = 40, 150, 100
 BEST, OFFSPRING = 50, 4
@@ -47,13 +49,13 @@ COARSE_RADII = (2.0, 5.0)
 NEAREST = 0.06
 """What is nearer than this share of the typical distance is in the way."""
 ROUNDS, ROUND_CANDIDATES = 12, 150
-ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
-"""Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
+ENOUGH_GOOD, ENOUGH_SEEN, LEAST_GAIN = 200, 0.95, 0.005
+"""Views, and share of the opaque Gaussians that any of them sees: the search ends there, or when a round adds less."""
 SURROUNDED = 0.7
 AS_SURROUNDED = 0.6
-"""Where one good view in ten has this share of all directions closed, the others need this share of that."""
+"""Where one good view in twenty has this share of all directions closed, the others need this share of that."""
 RAYS = 32
-AT_LEAST, AT_MOST, COVERED = 64, 384, 0.9
+AT_LEAST, AT_MOST, COVERED = 64, 384, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
 SEEN_AGAIN = 0.25
@@ -83,15 +85,17 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
     views.judge(_shells(space) + _in_volume(space, rng) + _by_size(space, rng, SIZE_CANDIDATES))
     best = np.argsort(-np.array(views.scores), kind="stable")[:BEST]
     views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(OFFSPRING)])
-    unseen = ~views.seen(views.good())
-    for _ in range(ROUNDS):
-        if unseen.mean() < 1 - ENOUGH_SEEN:
-            break
-        views.judge(_by_size(space, rng, ROUND_CANDIDATES, unseen))
-        before, unseen = unseen, ~views.seen(views.good())
-        if before.mean() - unseen.mean() < LEAST_GAIN:
-            break
     good = views.good()
+    unseen = ~views.seen(good)
+    for _ in range(ROUNDS):
+        before, few = unseen.mean(), len(good) < ENOUGH_GOOD
+        if before < 1 - ENOUGH_SEEN and not few:
+            break
+        views.judge(_by_size(space, rng, ROUND_CANDIDATES, unseen if unseen.any() else None))
+        good = views.good()
+        unseen = ~views.seen(good)
+        if before - unseen.mean() < LEAST_GAIN and not few:
+            break
     chosen = good[_choice([views.cells(i) for i in good])]
     lens = search_lens(SEARCH_PX)
     cameras = tuple(Camera(lens, views.poses[i]) for i in chosen)
@@ -184,7 +188,9 @@ def _survey(scene: GaussianScene) -> _Space:
     info = scene.info
     focal = info.training_focal_px or info.training_long_side_px or ASSUMED_FOCAL_PX
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / CELLS)), 1e-9)
+    low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
+    cells = min(CELLS, (len(points) / (6 * POINTS_PER_CELL)) ** 1.5)
+    cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / cells)), 1e-9)
     shape = np.floor((high - low) / cell).astype(int) + 1
     index = np.floor((points - low) / cell).astype(int)
     index = index[np.all((index >= 0) & (index < shape), axis=1)]
@@ -207,7 +213,8 @@ def _survey(scene: GaussianScene) -> _Space:
 def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
     """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
 
-    One of area a stays with the probability p = min(1, k a), and its area becomes a / p: surfaces stay closed.
+    One of area a stays with the probability p = min(1, k a), and its area becomes 2 a / p: what is left to chance
+    leaves holes otherwise.
     """
     if scene.count <= SEARCH_GAUSSIANS:
         return rasterizer
@@ -220,7 +227,8 @@ def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Genera
         share[~certain] *= (SEARCH_GAUSSIANS - certain.sum()) / share[~certain].sum()
     chosen = np.flatnonzero(rng.random(scene.count) < share)
     scales = scene.scales[chosen].copy()
-    wider = (flat[chosen] / np.sqrt(np.minimum(share[chosen], 1))[:, None]).astype(np.float32)
+    wider = np.where(share[chosen] < 1, np.sqrt(2.0 / share[chosen]), 1.0)
+    wider = (flat[chosen] * wider[:, None]).astype(np.float32)
     np.put_along_axis(scales, order[chosen], wider, 1)
     arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "opacities")}
     return rasterizer.of(replace(scene, **arrays, scales=scales, sh=scene.sh[chosen, :1]))
@@ -265,7 +273,7 @@ class _Views:
         """Return which candidates are solid and, where that tells, inside; and take note whether it does."""
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
         solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
-        limit = float(np.quantile(enclosures[solid], 0.9)) if len(solid) else 0.0
+        limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
         self.interior = limit >= SURROUNDED
         return solid[enclosures[solid] >= AS_SURROUNDED * limit] if self.interior else solid
 
@@ -298,11 +306,11 @@ def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
 def _choice(cells: Sequence[Int64[np.ndarray, "_"]]) -> Int64[np.ndarray, "k"]:
     """Take the view that adds most, again and again, until the choice shows what all together show.
 
-    What many candidates see counts more, up to eight: it is what photos show, too.
+    What a single candidate sees counts half: it may be an odd place.
     """
     ids, inverse = np.unique(np.concatenate(cells), return_inverse=True)
     rows = np.split(inverse, np.cumsum([len(c) for c in cells])[:-1])
-    worth = np.minimum(np.bincount(inverse, minlength=len(ids) + 1), 8).astype(np.float64)
+    worth = np.minimum(np.bincount(inverse, minlength=len(ids) + 1), 2).astype(np.float64)
     worth[len(ids)] = 0
     table = np.full((len(rows), max(map(len, rows))), len(ids))
     for row, own in zip(table, rows, strict=True):
@@ -346,14 +354,14 @@ def _in_volume(space: _Space, rng: np.random.Generator) -> list[Pose]:
 def _by_size(
     space: _Space, rng: np.random.Generator, count: int, wanted: Bool[np.ndarray, "n"] | None = None
 ) -> list[Pose]:
-    """Look at random Gaussians, of those wanted, from up to the distance that their sizes tell; rather level than not."""
+    """Look at random Gaussians, of those wanted, from about as far as their sizes tell; rather level than not."""
     among = np.arange(len(space.points)) if wanted is None else np.flatnonzero(wanted)
     taken = rng.choice(among, count)
     directions = rng.standard_normal((count, 3))
     directions -= 0.5 * (directions @ space.up)[:, None] * space.up
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     targets = space.points[taken]
-    distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.25), 0.0, count))
+    distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.4), np.log(1.6), count))
     return _looking(targets - distances[:, None] * directions, targets, space.up)
 
 
