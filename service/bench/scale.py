@@ -13,17 +13,15 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-import matplotlib
 import numpy as np
-from matplotlib.figure import Figure
 
 from service.bench.metrics import COARSE, FINE, Outcome, errors, units_of
 from service.bench.queries import find_photos
-from service.bench.tiles import thinned, tiled, write_folder
-from service.errors import InvalidRequest
+from service.errors import BackendMissing, InvalidRequest
 from service.images import read_query
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
 from service.pose.focus import centre_depth
@@ -49,8 +47,12 @@ def run(
     `others` are the scenes around the one whose photos are localized; without any, varied copies of it. `cameras` as in
     `bench localize`. `work` is where the large scenes are written; by default a temporary folder.
     """
+    if find_spec("gsply") is None:
+        raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
     if not _STATUS.exists():
         raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
+    from service.bench.tiles import write_folder  # loads gsply
+
     held_back = [name for photo in find_photos(folder) for name in photo.names]
     scene = load_scene(folder, without_photos=held_back)
     if not scene.cameras:
@@ -79,6 +81,8 @@ def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:
 
 
 def _sized(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
+    from service.bench.tiles import thinned, tiled
+
     if count < scene.count:
         return thinned(scene, count, LoadedScene.of(scene).rasterizer)
     return tiled(scene, count, others)
@@ -153,6 +157,9 @@ def _memory() -> dict[str, int]:
 
 def plot(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Draw time and memory against the number of Gaussians, as SVG or PNG."""
+    import matplotlib  # not needed to measure
+    from matplotlib.figure import Figure
+
     matplotlib.rcParams["svg.hashsalt"] = "splatfix"  # the same file for the same figures
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     times, latency, memory = figure.subplots(1, 3)

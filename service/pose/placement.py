@@ -49,8 +49,11 @@ COARSE_RADII = (2.0, 5.0)
 NEAREST = 0.06
 """What is nearer than this share of the typical distance is in the way."""
 ROUNDS, ROUND_CANDIDATES = 12, 150
-ENOUGH_GOOD, ENOUGH_SEEN, LEAST_GAIN = 200, 0.95, 0.005
-"""Views, and share of the opaque Gaussians that any of them sees: the search ends there, or when a round adds less."""
+ENOUGH_GOOD, GOOD_PER_AREA = (200, 800), 40
+"""Good views to look for: so many for each square of the typical distance that the surfaces have."""
+WIDE_TURN = 0.8
+ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
+"""Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
 SURROUNDED = 0.7
 AS_SURROUNDED = 0.6
 """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
@@ -88,10 +91,12 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
     good = views.good()
     unseen = ~views.seen(good)
     for _ in range(ROUNDS):
-        before, few = unseen.mean(), len(good) < ENOUGH_GOOD
+        before, few = unseen.mean(), len(good) < space.enough
         if before < 1 - ENOUGH_SEEN and not few:
             break
-        views.judge(_by_size(space, rng, ROUND_CANDIDATES, unseen if unseen.any() else None))
+        aimed = _by_size(space, rng, ROUND_CANDIDATES // 2, unseen if unseen.any() else None)
+        near = rng.choice(good, ROUND_CANDIDATES // 2) if len(good) else []
+        views.judge(aimed + [_jittered(views.poses[i], space, rng, WIDE_TURN) for i in near])
         good = views.good()
         unseen = ~views.seen(good)
         if before - unseen.mean() < LEAST_GAIN and not few:
@@ -163,6 +168,12 @@ class _Space:
     def distance(self) -> float:
         """The typical one."""
         return float(min(np.median(self.distances), COARSE_RADII[0] * self.radius))
+
+    @property
+    def enough(self) -> float:
+        """How many good views are looked for."""
+        area = self.filled.sum() * self.cell**2
+        return float(np.clip(GOOD_PER_AREA * area / self.distance**2, *ENOUGH_GOOD))
 
     def occupied(self, positions: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether Gaussians are there; outside the grid there are none."""
@@ -371,9 +382,9 @@ def _looking(
     return [look_at(p, t, up) for p, t in zip(positions, targets, strict=True) if np.any(p != t)]
 
 
-def _jittered(pose: Pose, space: _Space, rng: np.random.Generator) -> Pose:
-    """Move a pose a little and turn it by some 15 degrees, upright again."""
+def _jittered(pose: Pose, space: _Space, rng: np.random.Generator, turn: float = 0.25) -> Pose:
+    """Move a pose a little and turn it, by some 15 degrees if not said otherwise; upright again."""
     reach = 0.3 * min(space.radius, space.distance)
     position = pose.position_in_world + reach * rng.uniform(-1, 1, 3)
-    axis = pose.axis_in_world + 0.25 * rng.standard_normal(3)
+    axis = pose.axis_in_world + turn * rng.standard_normal(3)
     return look_at(position, position + axis, space.up)
