@@ -61,7 +61,9 @@ def folder(tmp_path) -> Path:
 
 def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
     with service_on(folder) as client:
-        until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]))
+        for name in ("attic", "cellar", "hall"):
+            client.post(f"/scenes/{name}/load")
+        until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]), 60)
         for asked, expected in (("auto", {"attic", "cellar", "hall"}), (["hall", "attic", "hall"], {"hall", "attic"})):
             job = post(client, scene=asked).json()
             assert (job["state"], job["scene_asked"]) == ("succeeded", asked)
