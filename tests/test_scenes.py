@@ -74,7 +74,7 @@ def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
         one = post(client, scene=["cellar"]).json()
         assert (one["scene"], one["result"]["considered"]) == ("cellar", [])
         assert_problem(post(client, scene=["hall", "pantry"]), 404, "scene_not_found", "scene")
-        assert_problem(post(client, scene=[]), 400, "invalid_request", "scene")
+        assert_problem(post(client, scene=[]), 400, "invalid_request")
         client.post("/scenes/cellar/unload")
         until(lambda: client.get("/scenes/cellar").json()["state"] == "unloaded")
         job = post(client, scene="auto").json()
