@@ -126,10 +126,12 @@ def localize(
     given |= {name: _json(text, name) for name, text in nested.items()}
     fields = read_fields({name: value for name, value in given.items() if value is not None})
     files = [(str(photo), _bytes(photo)) for photo in photos]
-    if tum_file and not (sequence or is_sequence(files[0][1])):
-        raise InvalidRequest("a trajectory is a sequence's: add --sequence.", where="--tum")
+    follow = sequence or any(is_sequence(data) for _, data in files)
+    for option, given_for_one in (("--tum", tum_file), ("--every", every > 1), ("--times", times)):
+        if given_for_one and not follow:
+            raise InvalidRequest("this is of a sequence: add --sequence.", where=option)
     loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
-    if sequence or any(is_sequence(data) for _, data in files):
+    if follow:
         _localize_sequence(body_of(files, {}), fields, loaded, csv_file, tum_file, as_json)
     else:
         _localize_each([Body(data, name, {}) for name, data in files], fields, loaded, csv_file, as_json)
