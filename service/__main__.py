@@ -129,8 +129,9 @@ def localize(
     fields = read_fields({name: value for name, value in given.items() if value is not None})
     files = [(str(photo), _bytes(photo)) for photo in photos]
     follow = sequence or any(is_sequence(data) for _, data in files)
-    if tum_file and not follow:
-        raise InvalidRequest("a trajectory is a sequence's: add --sequence.", where="--tum")
+    for option, given_for_one in (("--tum", tum_file), ("--every", every > 1), ("--times", times)):
+        if given_for_one and not follow:
+            raise InvalidRequest("this is of a sequence: add --sequence.", where=option)
     paths = [path for given_path in scene for path in find_scenes(given_path)]
     if follow and len(paths) > 1:
         raise InvalidRequest(

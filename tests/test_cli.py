@@ -238,7 +238,7 @@ def test_doctor_finds_the_parts_at_work(splatfix):
     code, told, _ = splatfix("doctor", "--warm")
     lines = {line[5:29].strip(): line[:4].strip() for line in told.splitlines()}
     assert code == 0, told
-    assert (lines["renderer"], lines["matcher"], lines["estimator view_index"]) == ("ok", "ok", "ok")
+    assert (lines["renderer cpu"], lines["matcher"], lines["estimator view_index"]) == ("ok", "ok", "ok")
     assert "SPLATFIX_WORKERS" in told
 
 

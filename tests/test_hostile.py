@@ -65,13 +65,14 @@ def test_what_follows_a_jpeg_is_not_counted():
     assert read_query(photo() + 1000 * b"\xff\xda\x00\x02").rgb.shape == (64, 96, 3)
 
 
-@pytest.mark.parametrize("kind", ["png", "webp"])
-def test_formats_that_are_decoded_whole_have_a_lower_limit(kind):
-    """64 megapixels in 3 kB of WebP took 1.8 GB and 3.7 s; 26 take 0.43 GB."""
-    file = io.BytesIO()
-    Image.new("L", (6000, 5000)).save(file, kind, **({"lossless": True} if kind == "webp" else {}))
+def test_webp_which_is_decoded_whole_has_a_lower_limit():
+    """64 megapixels in 3 kB of WebP took 1.8 GB and 3.7 s; 26 take 0.43 GB. As a PNG they take 0.3 GB and 0.3 s."""
+    webp, png = io.BytesIO(), io.BytesIO()
+    Image.new("L", (6000, 5000)).save(webp, "webp", lossless=True)
     with pytest.raises(InvalidImage, match="the limit is 26"):
-        read_query(file.getvalue())
+        read_query(webp.getvalue())
+    Image.new("L", (8000, 8000)).save(png, "png")
+    assert read_query(png.getvalue()).rgb.shape == (1600, 1600, 3)
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "LA", "P", "1", "I;16", "CMYK"])

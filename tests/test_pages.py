@@ -285,7 +285,7 @@ def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
     page.get_by_role("link", name="History").click()
     rows = page.locator("tbody tr")
     rows.nth(1).wait_for()
-    page.get_by_label("Outcome").select_option("cancelled")
+    page.get_by_label("Outcome").select_option("interrupted")
     page.get_by_text("No job fits").wait_for()
     page.get_by_label("Outcome").select_option("localized")
     for i in range(2):

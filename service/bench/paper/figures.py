@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-DPI = 110
+DPI, PICTURES_DPI = 110, 80
 GREEN, RED = "#2a9d4a", "#d1372c"
 COLOURS = {"view_index": "#1b1b1b", "mc_do": "#2f6fde", "icomma": "#d1372c", "inerf_dagger": "#e0952b"}
 
@@ -76,7 +76,7 @@ def pictures(
                 place.set_title(columns[c], fontsize=8)
             if c == 0:
                 place.set_ylabel(names[r], fontsize=8)
-    return _png(figure)
+    return _png(figure, PICTURES_DPI)
 
 
 def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float], int]]]) -> bytes:
@@ -162,7 +162,7 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> bytes:
     return _png(figure)
 
 
-def _png(figure: Figure) -> bytes:
+def _png(figure: Figure, dpi: int = DPI) -> bytes:
     stream = io.BytesIO()
-    FigureCanvasAgg(figure).print_figure(stream, dpi=DPI, format="png")
+    FigureCanvasAgg(figure).print_figure(stream, dpi=dpi, format="png")
     return stream.getvalue()
