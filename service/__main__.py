@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
 import os
@@ -100,7 +99,9 @@ def _settings(given: dict[str, Any]) -> Settings:
 @app.command()
 def localize(
     photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC; or one video.")],
-    scene: SceneOption,
+    scene: Annotated[
+        list[Path], typer.Option("--scene", help="Scene folder, scene file or folder of scenes; may be repeated.")
+    ],
     sequence: Annotated[
         bool, typer.Option("--sequence", help="One camera's photos in their order: follow it. A video always is.")
     ] = False,
@@ -116,10 +117,11 @@ def localize(
     tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
 ) -> None:
-    """Find where photos, or a video's frames, were taken in a scene."""
+    """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which."""
     from service.api.intake import Body, body_of, read_fields
     from service.api.sequence import is_sequence
     from service.localize import DEFAULT_ESTIMATOR
+    from service.scene_formats.discovery import find_scenes
 
     given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every}
     nested = {"intrinsics": intrinsics, "prior": prior, "times_s": times}
@@ -130,17 +132,25 @@ def localize(
     for option, given_for_one in (("--tum", tum_file), ("--every", every > 1), ("--times", times)):
         if given_for_one and not follow:
             raise InvalidRequest("this is of a sequence: add --sequence.", where=option)
-    loaded = _loaded(scene, fields.estimator or DEFAULT_ESTIMATOR, matcher)
+    paths = [path for given_path in scene for path in find_scenes(given_path)]
+    if follow and len(paths) > 1:
+        raise InvalidRequest(
+            "only single photos are looked for in several scenes; this is a sequence.",
+            where="--scene",
+            hint="Name one scene; one photo of the sequence, by itself, can tell which.",
+        )
+    loaded = [_loaded(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
     if follow:
-        _localize_sequence(body_of(files, {}), fields, loaded, csv_file, tum_file, as_json)
+        _localize_sequence(body_of(files, {}), fields, loaded[0], csv_file, tum_file, as_json)
     else:
         _localize_each([Body(data, name, {}) for name, data in files], fields, loaded, csv_file, as_json)
 
 
 def _localize_each(
-    bodies: list[Body], fields: LocalizeFields, loaded: LoadedScene, csv_file: Path | None, as_json: bool
+    bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], csv_file: Path | None, as_json: bool
 ) -> None:
     from service import answers
+    from service.anywhere import Found, localize_anywhere
     from service.api.convert import result_out, timing_out
     from service.api.documents import versions
     from service.api.intake import make_task
@@ -148,10 +158,13 @@ def _localize_each(
 
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
-        task, query = make_task(body, fields, loaded)
-        estimate = run(query, loaded, task.request)
-        result = result_out(estimate, timing_out(task.decode), versions(), loaded.scene.info.geo_anchor)
-        results.append((body.name, result))
+        task, query = make_task(body, fields, loaded[0])
+        if len(loaded) > 1:
+            found = localize_anywhere(query, loaded, task.request)
+        else:
+            found = Found(run(query, loaded[0], task.request), loaded[0])
+        anchor = found.loaded.scene.info.geo_anchor
+        results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
         if not as_json:
             _say(answers.photo_line(*results[-1]))
     if as_json:
@@ -439,6 +452,40 @@ def bench_render(
         out.print(" ".join(f"{_short(value):>13}" for value in row), highlight=False, soft_wrap=True)
 
 
+@bench_app.command("scale")
+def bench_scale(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    around: Annotated[list[Path] | None, typer.Option(help="Scenes to put around it; else varied copies.")] = None,
+    sizes: Annotated[list[int] | None, typer.Option("--size", min=1000, help="Gaussians; may be repeated.")] = None,
+    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "ignored",
+    compressed: Annotated[bool, typer.Option("--compressed", help="Write compressed scene files.")] = False,
+    work: Annotated[Path | None, typer.Option(help="Where to write the large scenes meanwhile.")] = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="Draw the curves, a .png.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Measure loading, indexing, memory and localization of scenes of growing size."""
+    from service.bench.scale import SIZES, run
+
+    _tell_machine()
+    with _progress() as progress:
+        rows = run(
+            folder,
+            others=around or (),
+            sizes=sizes or SIZES,
+            cameras=cameras,
+            compressed=compressed,
+            work=work,
+            progress=_counter(progress, "sizes"),
+        )
+    _write_json(json_file, rows)
+    if plot_file:
+        from service.bench.paper.figures import growth  # loads matplotlib
+
+        plot_file.write_bytes(growth(rows))
+    for name in rows[0]:
+        out.print(f"{name:20}" + " ".join(f"{_short(row[name]):>14}" for row in rows), highlight=False, soft_wrap=True)
+
+
 @scenes_app.command("list")
 def list_scenes(
     folder: Annotated[Path, typer.Argument(help="A scene, or a folder of scenes.")] = Path(),
@@ -451,17 +498,20 @@ def list_scenes(
 
 
 @scenes_app.command("inspect")
-def inspect_scene(scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")]) -> None:
-    """Read a scene and say what is in it."""
-    from service.scene_formats import load_scene
+def inspect_scene(
+    scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+) -> None:
+    """Read a scene and say what is in it, and from where it would be looked at."""
+    from service.inspection import inspected, told
 
-    with err.status(f"reading {scene}"):
-        found = load_scene(scene)
-    lower, upper = found.means.min(0), found.means.max(0)
-    facts = {"gaussians": found.count, "sh_degree": found.sh_degree, "training cameras": len(found.cameras)}
-    facts |= {"memory": f"{found.nbytes / 1e6:.1f} MB", "extent": f"{lower.tolist()} to {upper.tolist()}"}
-    for name, value in (facts | dataclasses.asdict(found.info)).items():
-        _say(f"{name:22} {value}")
+    with err.status(f"looking at {scene}"):
+        facts = inspected(scene)
+    if as_json:
+        _print_json(facts)
+        return
+    for name, value in told(facts).items():
+        _say(f"{name:18} {value}")
 
 
 @keys_app.command("add")

@@ -13,7 +13,8 @@ _POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 def photo_line(name: str, result: Result) -> str:
     """Return a photo's answer as a line."""
-    told = _line(name, result.status, result.score, result.pose.world_from_camera)
+    status = f"{result.status} in {result.scene.id}" if result.considered else result.status
+    told = _line(name, status, result.score, result.pose.world_from_camera)
     return f"{told}. {result.hint}" if result.hint else told
 
 
@@ -34,12 +35,13 @@ def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None
     """One row a photo; the pose is world_from_camera in OpenCV axes."""
     rows = [
         (
-            *(name, result.status, result.reason, result.score, *_pose(result.pose.world_from_camera)),
+            *(name, result.scene.id, result.status, result.reason, result.score),
+            *_pose(result.pose.world_from_camera),
             *(result.inliers, round(1000 * sum(timing.wall_s for timing in result.timings), 1)),
         )
         for name, result in results
     ]
-    _write(path, ("photo", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"), rows)
+    _write(path, ("photo", "scene", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"), rows)
 
 
 def write_frame_table(path: Path, frames: Sequence[FrameOut]) -> None:

@@ -50,6 +50,14 @@ class Rasterizer(Protocol):
         """What it keeps of the scene in memory."""
         ...
 
+    def of(self, scene: GaussianScene) -> Rasterizer:
+        """Return a rasterizer of the same kind for another scene."""
+        ...
+
+    def trained_at(self, long_side_px: int) -> Rasterizer:
+        """Return a rasterizer of the same Gaussians, in the same memory, as if trained on photos of this size."""
+        ...
+
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         """Render several cameras; independent ones may use idle cores."""
         ...

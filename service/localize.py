@@ -31,7 +31,7 @@ from service.pose.gate import verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.scene_formats import load_scene
-from service.scene_formats.cache import mapped_scene
+from service.scene_formats.cache import mapped_scene, release
 from service.types import (
     GaussianScene,
     IterationRecord,
@@ -85,7 +85,9 @@ class LoadedScene:
         Raises SceneError, UnknownName, and BackendMissing if the rasterizer that was named can't run.
         """
         scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
-        return cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        release(scene)  # the rasterizer has its own copy
+        return loaded
 
     @classmethod
     def of(
@@ -175,7 +177,7 @@ def localize(
     tally = RenderTally()
     tools = Tools(
         loaded.scene,
-        Counted(loaded.rasterizer, tally),
+        Counted(rasterizer_for(query, loaded), tally),
         loaded.matcher,
         np.random.default_rng(request.seed),
         loaded.prepare(request.estimator),
@@ -230,7 +232,7 @@ def estimate_of(
         budget_exhausted=exhausted,
         renders=renders,
         timings=tuple(timings),
-        warnings=query.warnings + info.warnings + loaded.warnings,
+        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded),
         records=tuple(records),
     )
 
@@ -243,6 +245,35 @@ def _require_matching(estimator: str, loaded: LoadedScene) -> None:
             where="matcher",
             hint="Take mc_do or icomma, or another matcher.",
         )
+
+
+ASSUMED_TRAINING_PX = (800, 1600)
+"""Bounds of the training photos' long side, where it is taken from the photo to localize."""
+
+
+def rasterizer_for(query: Query, loaded: LoadedScene) -> Rasterizer:
+    """Return the scene's rasterizer; where the size of training is unknown, as if it was the photo's."""
+    assumed = _assumed_training_px(query, loaded)
+    return loaded.rasterizer if assumed is None else loaded.rasterizer.trained_at(assumed)
+
+
+def _assumed_training_px(query: Query, loaded: LoadedScene) -> int | None:
+    """Return the long side that training photos are taken to have; None: it is known."""
+    info = loaded.scene.info
+    if info.training_focal_px or info.training_long_side_px:
+        return None
+    low, high = ASSUMED_TRAINING_PX
+    return min(max(query.photo_intrinsics.long_side, low), high)
+
+
+def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
+    assumed = _assumed_training_px(query, loaded)
+    if assumed is None:
+        return ()
+    return (
+        f"the size of the photos that the scene was trained with is unknown: {assumed} px is assumed, which can shift "
+        'the pose a little; say "training_size" in scene.json.',
+    )
 
 
 def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:

@@ -22,7 +22,7 @@ import numpy as np
 
 from service.geometry import moved, pose_distance, se3_log
 from service.interfaces import Frame, RenderTally, Tools
-from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize
+from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
 from service.pose.alignment import Evidence, align, evidence
 from service.pose.gate import LOCALIZED, in_doubt, judged, pixel_signals, probability, verify
 from service.pose.views import known_at, photo_at, sized
@@ -157,7 +157,7 @@ class Tracker:
         """Align the photo and judge the answer; None where it can't be aligned."""
         clock, tally = Clock(), RenderTally()
         rng = np.random.default_rng(self._request.seed)
-        rasterizer = Counted(self._loaded.rasterizer, tally)
+        rasterizer = Counted(rasterizer_for(query, self._loaded), tally)
         tools = Tools(self._loaded.scene, rasterizer, self._loaded.matcher, rng, tally=tally)
         found = _aligned(query, expected, self._seen, tools)
         if found is None:

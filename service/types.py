@@ -451,3 +451,5 @@ class PoseEstimate:
     timings: tuple[StageTiming, ...]
     warnings: tuple[str, ...]
     records: tuple[IterationRecord, ...]
+    considered: tuple[tuple[str, int], ...] = ()
+    """Where the photo was looked for in several scenes: each one's id, and how many matches agreed, best first."""

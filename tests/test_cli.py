@@ -135,8 +135,17 @@ def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
 def test_scenes_are_listed_and_inspected(splatfix, room):
     assert splatfix("scenes", "list", room.parent)[:2] == (0, f"{room}\n")
     code, told, _ = splatfix("scenes", "inspect", room)
-    facts = dict(line.split(maxsplit=1) for line in told.replace("training cameras", "cameras").splitlines())
-    assert (code, facts["cameras"], facts["format"], facts["name"]) == (0, "24", "ply", "room")
+    facts = {line[:18].strip(): line[18:].strip() for line in told.splitlines()}
+    assert (code, facts["training cameras"], facts["format"]) == (0, "24", "ply")
+    assert facts["name"] == "room (id room)"
+    assert facts["training size"] == "320 px (from the training cameras)"
+    code, told, _ = splatfix("scenes", "inspect", room / "scene.ply", "--json")
+    bare = json.loads(told)
+    assert (code, bare["training_cameras"], bare["training_size"]["px"]) == (0, 0, None)
+    assert bare["index"]["interior"]
+    assert bare["index"]["coverage"] > 0.9
+    assert bare["floaters"] < 0.01
+    assert "training size is unknown" in " ".join(bare["warnings"])
 
 
 def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo, tmp_path):

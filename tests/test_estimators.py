@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
+from service.anywhere import localize_anywhere
 from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
 from service.geometry import moved, pose_distance
@@ -22,6 +23,7 @@ from service.pose.views import to_uint8
 from service.types import Camera, Candidates, Intrinsics, IterationRecord, MatchVectors, Pose, Query, Reason, Status
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+LENS_UPRIGHT = Intrinsics(HEIGHT, WIDTH, FOCAL, FOCAL, HEIGHT / 2, WIDTH / 2)
 DEFAULT = "view_index"
 QUICK: dict[str, dict] = {
     "mc_do": {"hypotheses": 16, "rounds": 1, "iterations": 4, "refinement_steps": 20},
@@ -238,11 +240,31 @@ def test_a_photo_of_another_place_is_not_localized(room: LoadedScene, tmp_path: 
         assert ("sample" in stages) is (effort == "exhaustive")
 
 
+def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, tmp_path: Path) -> None:
+    other = LoadedScene.of(replace(room.scene, sh=room.scene.sh[::-1]))  # the same walls, painted otherwise
+    photo = photo_at(room, unseen_pose())
+    told: list[IterationRecord] = []
+    for scenes in ([other, room], [room, other]):
+        told.clear()
+        found = localize_anywhere(photo, scenes, on_record=told.append)
+        assert found.loaded is room
+        assert found.estimate.verdict.status is Status.LOCALIZED
+        assert_near(found.estimate.pose, unseen_pose())
+        assert len(found.estimate.considered) == 2
+        assert tuple(told) == found.estimate.records
+    noise = np.random.default_rng(0).integers(0, 256, photo.rgb.shape).astype(np.uint8)
+    nowhere = localize_anywhere(replace(photo, rgb=noise), [other, room]).estimate
+    assert nowhere.verdict.status is Status.NOT_LOCALIZED
+    assert nowhere.pose is not None
+    turned = replace(photo, rgb=np.rot90(photo.rgb).copy(), intrinsics=LENS_UPRIGHT)
+    assert localize_anywhere(turned, [other, room]).loaded is room
+
+
 def test_without_training_cameras_the_room_is_found_from_the_inside(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, count in (("SHELL_CANDIDATES", 20), ("VOLUME_CANDIDATES", 80), ("BEST", 20)):
-        monkeypatch.setattr(f"service.pose.viewpoints.{name}", count)
+        monkeypatch.setattr(f"service.pose.placement.{name}", count)
     bare = LoadedScene.of(replace(room.scene, cameras=()))
     half = np.array([2.0, 1.5, 1.25])
     views = bare.prepare(DEFAULT).views

@@ -40,6 +40,10 @@ class Nothing:
 
     name = "nothing"
 
+    def trained_at(self, long_side_px: int) -> Nothing:
+        self.assumed_px = long_side_px
+        return self
+
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         shape = (cameras[0].intrinsics.height, cameras[0].intrinsics.width)
         zero = np.zeros(shape, np.float32)
@@ -91,7 +95,7 @@ class Script:
 def loaded() -> LoadedScene:
     one = np.ones((1, 3), np.float32)
     quats = np.array([[1, 0, 0, 0]], np.float32)
-    info = SceneInfo("s", "scene", "f" * 64, "ply", warnings=("from the scene",))
+    info = SceneInfo("s", "scene", "f" * 64, "ply", training_long_side_px=640, warnings=("from the scene",))
     scene = GaussianScene(one, quats, one, np.ones(1, np.float32), np.zeros((1, 1, 3), np.float32), info)
     return LoadedScene(scene, Nothing(), Nothing())
 
@@ -118,6 +122,19 @@ def test_stamps_the_records_and_answers_with_the_last(monkeypatch: pytest.Monkey
     assert found.intrinsics_source == "guessed"
     assert found.warnings == ("from the photo", "from the scene")
     assert found.scene_sha256 == "f" * 64
+
+
+@pytest.mark.parametrize(("photo_px", "assumed_px"), [(300, 800), (1200, 1200), (4000, 1600)])
+def test_where_the_size_of_training_is_unknown_the_photos_is_assumed_and_told(
+    monkeypatch: pytest.MonkeyPatch, loaded: LoadedScene, photo_px: int, assumed_px: int
+) -> None:
+    use(monkeypatch, Script())
+    info = replace(loaded.scene.info, training_long_side_px=None)
+    nothing = Nothing()
+    bare = LoadedScene(replace(loaded.scene, info=info), nothing, nothing)
+    found = localize(replace(QUERY, photo_intrinsics=LENS.resized(photo_px, photo_px // 2)), bare)
+    assert nothing.assumed_px == assumed_px
+    assert f"{assumed_px} px is assumed" in found.warnings[-1]
 
 
 def test_the_lens_of_the_last_record_is_the_answers(monkeypatch: pytest.MonkeyPatch, loaded: LoadedScene) -> None:

@@ -18,7 +18,7 @@ from service.pose.gate import SCALES, Scale, colour_agreement, gradient_agreemen
 from service.pose.index import built_index, prepared_index
 from service.pose.pnp import reprojection_error_px, resection
 from service.pose.retrieval import top, visual_words, vlad, vote
-from service.pose.viewpoints import farthest_points, found_cameras, solidity, spread
+from service.pose.viewpoints import farthest_points, spread
 from service.pose.views import (
     correspondences,
     lifted,
@@ -45,6 +45,9 @@ class PaintedWalls:
 
     def scene_gradients(self, *args: object) -> SceneGradients:
         raise NotImplementedError
+
+    def trained_at(self, long_side_px: int) -> PaintedWalls:
+        return self
 
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         return [self._render(camera) for camera in cameras]
@@ -465,44 +468,14 @@ def test_farthest_points_take_extremes_first_and_stop_when_the_rest_is_near() ->
 def test_spread_takes_all_of_few_cameras_and_covers_many() -> None:
     directions = np.random.default_rng(0).normal(size=(300, 3))
     poses = [look_at(4 * d / np.linalg.norm(d), np.zeros(3), UP) for d in directions]
-    assert sorted(spread(poses[:20])) == list(range(20))
-    chosen = spread(poses)
+    assert sorted(spread(poses[:20], 4.0)) == list(range(20))
+    chosen = spread(poses, 4.0)
     assert 64 <= len(chosen) <= 256
+    # What is seen half as far away looks different after half the way.
+    assert len(spread(poses, 2.0)) > len(chosen)
     axes = np.stack([pose.axis_in_world for pose in poses])
     nearest = np.degrees(np.arccos(np.clip((axes @ axes[chosen].T).max(1), -1, 1)))
     assert nearest.max() < 16  # 0.35 is 14 degrees on an orbit
-
-
-def test_solidity_counts_single_opaque_surfaces() -> None:
-    ones = np.ones((10, 10), np.float32)
-    rgb = np.zeros((10, 10, 3), np.float32)
-    assert solidity(Frame(rgb, ones, 2 * ones, 2 * ones), 0.5) == 1.0
-    assert solidity(Frame(rgb, ones, 2.5 * ones, 2 * ones), 0.5) == 0.0  # something translucent before it
-    assert solidity(Frame(rgb, ones, 0.3 * ones, 0.3 * ones), 0.5) == 0.0  # nose to a floater
-    assert solidity(Frame(rgb, 0.6 * ones, 2 * ones, 2 * ones), 0.5) == 0.0
-
-
-def test_found_cameras_see_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, count in (("SHELL_CANDIDATES", 20), ("VOLUME_CANDIDATES", 40), ("BEST", 20)):
-        monkeypatch.setattr(f"service.pose.viewpoints.{name}", count)
-    rng = np.random.default_rng(0)
-    points = np.concatenate([rng.uniform(-3, 3, (500, 2)), np.zeros((500, 1))], 1).astype(np.float32)
-    scene = GaussianScene(
-        points,
-        np.tile(np.array([1, 0, 0, 0], np.float32), (500, 1)),
-        np.ones((500, 3), np.float32),
-        np.ones(500, np.float32),
-        np.zeros((500, 1, 3), np.float32),
-        SceneInfo("walls", "walls", "", "ply"),
-    )
-    cameras = found_cameras(scene, PaintedWalls(), np.random.default_rng(0))
-    assert 64 <= len(cameras) <= 128
-    seen = [frame.alpha.mean() for frame in PaintedWalls().render(cameras[::16])]
-    assert min(seen) > 0.2
-    again = found_cameras(scene, PaintedWalls(), np.random.default_rng(0))
-    assert all(
-        np.array_equal(a.pose.world_from_camera, b.pose.world_from_camera) for a, b in zip(cameras, again, strict=True)
-    )
 
 
 @pytest.fixture

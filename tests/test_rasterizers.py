@@ -269,6 +269,16 @@ def test_dilation_follows_the_render_size():
     assert dilation_for(camera, unknown) == pytest.approx(0.3 / 16)
 
 
+def test_trained_at_another_size_is_that_scene_in_the_same_memory(create):
+    scene, camera = make_scene(300), make_camera()
+    bare = replace(scene, info=replace(INFO, training_focal_px=None))
+    known = create(replace(scene, info=replace(INFO, training_focal_px=None, training_long_side_px=300)))
+    ours = create(bare)
+    assert same(ours.trained_at(300).render([camera])[0], known.render([camera])[0])
+    assert not same(ours.render([camera])[0], known.render([camera])[0])
+    assert same(ours.of(known.scene).render([camera])[0], known.render([camera])[0])
+
+
 def test_a_small_render_is_the_downsampled_large_one(create):
     """The reason for the scaled dilation: with 0.3 px^2 at every size a small render is fatter than the scene."""
     scene = make_scene(1500, 0, seed=8)

@@ -14,7 +14,9 @@ import pytest
 from api_server import assert_problem, finished, make_scene, post, serving, settings, until
 
 from service.api.app import create_app
+from service.api.scenes import Scenes
 from service.api.warmup import overview
+from service.errors import BadInput
 from service.localize import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
@@ -55,6 +57,36 @@ def folder(tmp_path) -> Path:
         (tmp_path / "scenes" / name / "scene.ply").write_bytes(ply())
         (tmp_path / "scenes" / name / "transforms.json").write_text(json.dumps(TRANSFORMS))
     return tmp_path / "scenes"
+
+
+def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
+    with service_on(folder) as client:
+        for name in ("attic", "cellar", "hall"):
+            client.post(f"/scenes/{name}/load")
+        until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]), 60)
+        for asked, expected in (("auto", {"attic", "cellar", "hall"}), (["hall", "attic", "hall"], {"hall", "attic"})):
+            job = post(client, scene=asked).json()
+            assert (job["state"], job["scene_asked"]) == ("succeeded", asked)
+            assert {each["id"] for each in job["result"]["considered"]} == expected
+            assert job["scene"] == job["result"]["scene"]["id"] in expected
+            assert job["result"]["status"] == "not_localized"  # the stand-ins see nothing
+            assert [t["stage"] for t in job["result"]["timings"]][:2] == ["decode", "which"]
+        one = post(client, scene=["cellar"]).json()
+        assert (one["scene"], one["result"]["considered"]) == ("cellar", [])
+        assert_problem(post(client, scene=["hall", "pantry"]), 404, "scene_not_found", "scene")
+        assert_problem(post(client, scene=[]), 400, "invalid_request")
+        client.post("/scenes/cellar/unload")
+        until(lambda: client.get("/scenes/cellar").json()["state"] == "unloaded")
+        job = post(client, scene="auto").json()
+        assert {each["id"] for each in job["result"]["considered"]} == {"attic", "hall"}
+        assert all(scene["jobs"] == 0 for scene in client.get("/scenes").json()["scenes"])
+
+
+def test_no_scene_is_called_auto(tmp_path):
+    (tmp_path / "auto").mkdir()
+    (tmp_path / "auto" / "scene.ply").write_bytes(ply())
+    with pytest.raises(BadInput, match="stands for all"):
+        Scenes([tmp_path], "stepping", None)
 
 
 def service_on(folder: Path, **changes):

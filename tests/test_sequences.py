@@ -47,7 +47,7 @@ def test_a_video_is_one_job(client):
 
 def test_a_single_photo_has_no_frames(client):
     job = post(client).json()
-    assert job["result"]["frames"] is None
+    assert (job["result"]["frames"], job["result"]["considered"]) == (None, [])
     _, _, record = events(client.get(job["links"]["events"]).text)[0]
     assert record["frame"] is None
 
@@ -82,6 +82,8 @@ def test_what_is_wrong_is_told_at_once(client):
     assert_problem(send(client, photos(2), every="0"), 400, "invalid_request", "every")
     truth = {"position": [0, 0, 0], "quaternion_wxyz": [1, 0, 0, 0]}
     assert_problem(send(client, photos(2), truth=truth), 422, "invalid_prior", "truth")
+    assert_problem(send(client, photos(2), scene="auto"), 400, "invalid_request", "scene")
+    assert_problem(send(client, [("v.mp4", film)], scene=["room"]), 400, "invalid_request", "scene")
     assert_problem(send(client, [("a.zip", b"PK\x03\x04" + bytes(50))]), 422, "invalid_image", "photo")
     assert_problem(send(client, [("v.mp4", film[: len(film) // 2])]), 422, "invalid_image", "photo")
 

@@ -8,11 +8,13 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 
+from service.anywhere import Found, localize_anywhere
 from service.api.convert import record_out, result_out, timing_out
 from service.api.desk import Desk, ending
 from service.api.documents import versions
 from service.api.live import LiveJob
 from service.api.requests import LocalizeFields
+from service.api.scenes import several
 from service.api.schemas import Record, Result
 from service.api.sequence import Reading, read_sequence
 from service.api.store import Batch, Ending, StoredJob
@@ -21,7 +23,7 @@ from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFai
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.logs import bound
 from service.track import localize_sequence
-from service.types import IterationRecord
+from service.types import IterationRecord, Query
 
 _log = logging.getLogger(__name__)
 
@@ -71,23 +73,24 @@ class Attempts:
         """Localize; None if it was stopped because the service ends."""
         desk = self._desk
         try:
-            if live.loaded is None:
-                live.loaded = desk.scenes.acquire(job.scene)
-            loaded = live.loaded
+            if not live.held:
+                asked = LocalizeFields.model_validate_json(job.fields).scene
+                live.held = desk.scenes.acquire(desk.scenes.chosen(asked if several(asked) else job.scene))
             if live.task is None or live.query is None:
-                live.task, live.query = desk.decoded(job, loaded)
+                live.task, live.query = desk.decoded(job, live.held[0])
             request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
             if live.task.reading is not None:
-                result, renders = self._sequence(live, live.task.reading, request, loaded, sent)
+                result, renders = self._sequence(live, live.task.reading, request, live.held[0], sent)
+                scene = None  # it was named
             else:
-                told = partial(self._tell_step, live, sent)
-                estimate = localize(live.query, loaded, request, told)
-                anchor, renders = loaded.scene.info.geo_anchor, estimate.renders
-                result = result_out(estimate, timing_out(live.task.decode), versions(), anchor)
+                found = self._found(live, live.query, request, sent)
+                anchor, renders = found.loaded.scene.info.geo_anchor, found.estimate.renders
+                result = result_out(found.estimate, timing_out(live.task.decode), versions(), anchor)
+                scene = desk.scenes.id_of(found.loaded)
             for timing in result.timings[1:]:
                 desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
             desk.metrics.renders(job.estimator, renders)
-            return Ending("succeeded", result.status, result.score, result.model_dump_json())
+            return Ending("succeeded", result.status, result.score, result.model_dump_json(), scene=scene)
         except Cancelled:
             stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled
             return None if stopped else Ending("cancelled")
@@ -95,6 +98,14 @@ class Attempts:
             expected = isinstance(error, DeadlineExceeded | SceneError)
             _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
             return ending("interrupted" if isinstance(error, SceneError) else "failed", error)
+
+    def _found(self, live: LiveJob, query: Query, request: Request, sent: _Sent) -> Found:
+        """Localize one photo in the job's scene, or in the one of several that it shows."""
+        told = partial(self._tell_step, live, sent)
+        loaded, *others = live.held
+        if others:
+            return localize_anywhere(query, live.held, request, told)
+        return Found(localize(query, loaded, request, told), loaded)
 
     def _sequence(
         self, live: LiveJob, reading: Reading, request: Request, loaded: LoadedScene, sent: _Sent

@@ -11,6 +11,7 @@ from service.api.schemas import (
     Axes,
     CameraOut,
     CandidatesOut,
+    Considered,
     Covariance,
     GeoPose,
     GeoPosition,
@@ -188,6 +189,7 @@ def result_out(
         matcher=estimate.matcher,
         rasterizer=estimate.rasterizer,
         scene=SceneRef(id=estimate.scene_id, sha256=estimate.scene_sha256),
+        considered=[Considered(id=scene, matches=matches) for scene, matches in estimate.considered],
         versions=versions,
         warnings=list(estimate.warnings),
     )

@@ -82,8 +82,7 @@ class Desk:
         wanted = live.query is not None and (job.keep_photo or self.settings.photo_grace_s > 0)
         self.photos.settle(live.id, encode_image(live.query.rgb) if wanted and live.query else None)
         self.live.pop(live.id, None)
-        if live.loaded is not None:
-            self.scenes.release(live.loaded)
+        self.scenes.release(live.held)
         live.end()
 
 

@@ -75,6 +75,7 @@ def job_document(job: StoredJob, root: str) -> JobOut:
     error = Problem.model_validate_json(job.error) if job.error else None
     return JobOut(
         **summary,
+        scene_asked=fields.scene,
         seed=fields.seed,
         budget_s=fields.budget_s,
         deadline=_time(job.deadline) if job.deadline else None,

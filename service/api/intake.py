@@ -21,6 +21,7 @@ from starlette.requests import Request as HttpRequest
 from service.api.convert import OPENCV_FROM_OPENGL
 from service.api.problems import described
 from service.api.requests import LocalizeFields, LocalizeIn, PriorIn
+from service.api.scenes import several
 from service.api.sequence import Reading, check_sequence, is_packed, is_sequence, packed, read_sequence
 from service.errors import (
     InvalidImage,
@@ -92,7 +93,8 @@ async def _form_body(request: HttpRequest, max_frames: int) -> Body:
             raise InvalidRequest("a file is required here.", where="photo", hint="With curl: -F photo=@photo.jpg")
         # Forms send an empty text for what was left empty.
         texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
-        fields = {name: parsed_json(t, name) if name in _ERRORS else t for name, t in texts.items()}
+        listed = {"scene"} if texts.get("scene", "").startswith("[") else set()
+        fields = {name: parsed_json(t, name) if name in {*_ERRORS, *listed} else t for name, t in texts.items()}
         files = [(p.filename or "", await p.read()) for p in photos if isinstance(p, UploadFile)]
         return await to_thread.run_sync(body_of, files, fields)
 
@@ -177,6 +179,12 @@ def make_task(
         _require_ascending(fields.times_s)
         if fields.truth is not None:
             raise InvalidPrior("a single photo's; this is a sequence.", where="truth")
+        if several(fields.scene):
+            raise InvalidRequest(
+                "only a single photo is looked for in several scenes; this is a sequence.",
+                where="scene",
+                hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
+            )
         reading = Reading(max_frames, fields.every, fields.times_s, intrinsics, prior, background)
         check_sequence(body.photo, reading)
         query = next(read_sequence(body.photo, reading)).query

@@ -95,21 +95,21 @@ class Jobs:
         """
         if known := self._store.repeated(order.client, order.idempotency_key, order.digest):
             return known
-        entry = self._scenes.entry(order.fields.scene)
-        loaded = self._scenes.acquire(entry.id)
+        ids = self._scenes.chosen(order.fields.scene)
+        held = self._scenes.acquire(ids)
         try:
             task, query = make_task(
-                order.body, order.fields, loaded, self._settings.estimator, self._settings.max_frames
+                order.body, order.fields, held[0], self._settings.estimator, self._settings.max_frames
             )
-            new = _new_job(order, entry.id, task, query)
+            new = _new_job(order, ids[0], task, query)
             job = self._stored(new, order.body.photo)
         except BaseException:
-            self._scenes.release(loaded)
+            self._scenes.release(held)
             raise
         if job.id != new.id:  # the same key came twice at once
-            self._scenes.release(loaded)
+            self._scenes.release(held)
             return job
-        live = self._live[job.id] = LiveJob(job.id, job.scene, task, query, loaded)
+        live = self._live[job.id] = LiveJob(job.id, job.scene, task, query, held)
         self._executor.submit(live)
         return job
 

@@ -22,13 +22,13 @@ class LiveJob:
         scene: str,
         task: Task | None = None,
         query: Query | None = None,
-        loaded: LoadedScene | None = None,
+        held: tuple[LoadedScene, ...] = (),
     ) -> None:
         self.id, self.scene = job_id, scene
         self.task, self.query = task, query
         """The decoded request; None after a restart, when it is on disk only."""
-        self.loaded = loaded
-        """Held in memory for this job; None after a restart."""
+        self.held = held
+        """Scenes that stay in memory for this job; none after a restart."""
         self.cancel = threading.Event()
         self.attempt = 0
         """0: not started."""

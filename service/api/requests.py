@@ -41,8 +41,9 @@ class RenderIn(Model):
 class LocalizeFields(Model):
     """What is sent beside the photo."""
 
-    scene: str | None = None
-    """May be left out when the service has exactly one scene."""
+    scene: str | Annotated[list[str], Len(1, 100)] | None = None
+    """May be left out when the service has exactly one scene. A list, or `auto` for all that are ready: the photo is
+    looked for in each, and the result names the one that it shows. In a form, a list is JSON text."""
     estimator: str | None = None
     """See `/capabilities`; left out: the default one."""
     options: dict[str, Any] = Field(default_factory=dict)

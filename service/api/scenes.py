@@ -13,7 +13,7 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -26,6 +26,13 @@ from service.scene_formats.discovery import find_scenes
 _log = logging.getLogger(__name__)
 
 _GRACE_S = 5.0
+AUTO = "auto"
+"""Asks for all scenes that are ready; so no scene is called that."""
+
+
+def several(asked: str | Sequence[str] | None) -> bool:
+    """Whether a request asks for more than a certain scene."""
+    return asked == AUTO or (asked is not None and not isinstance(asked, str))
 
 
 @dataclass(slots=True)
@@ -124,6 +131,8 @@ class Scenes:
     def add(self, scene_id: str, path: Path, *, uploaded: bool = False) -> Entry:
         """Add a scene without loading it. Raises BadInput if there is one of that name."""
         with self._lock:
+            if scene_id == AUTO:
+                raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
             if scene_id in self._entries:
                 raise BadInput(f"two scenes are called '{scene_id}'.", where=str(path))
             entry = self._entries[scene_id] = Entry(scene_id, path, uploaded=uploaded)
@@ -162,17 +171,36 @@ class Scenes:
                 self._request(entry)
         raise SceneNotReady(f"scene '{entry.id}' is {entry.state}.", where="scene", hint="Try again later.")
 
-    def acquire(self, scene_id: str | None) -> LoadedScene:
-        """Return a scene that stays in memory until it is released as often. Raises SceneError."""
+    def chosen(self, asked: str | Sequence[str] | None) -> list[str]:
+        """Return the ids of the scenes that a request names: one, several, or all that are ready (`auto`).
+
+        Raises SceneNotFound, SceneNotReady.
+        """
+        if asked == AUTO:
+            ready = [entry.id for entry in self.entries() if entry.state == "ready"]
+            if not ready:
+                raise SceneNotReady("no scene is ready.", where="scene", hint="Try again later.")
+            return ready
+        if asked is None or isinstance(asked, str):
+            return [self.entry(asked).id]
+        return list(dict.fromkeys(self.entry(scene_id).id for scene_id in asked))
+
+    def acquire(self, ids: Sequence[str]) -> tuple[LoadedScene, ...]:
+        """Return scenes that stay in memory until they are released as often. Raises SceneError."""
         with self._lock:
-            loaded = self.get(scene_id)
-            self.entry(scene_id).jobs += 1
+            loaded = tuple(self.get(scene_id) for scene_id in ids)
+            for scene_id in ids:
+                self.entry(scene_id).jobs += 1
             return loaded
 
-    def release(self, loaded: LoadedScene) -> None:
+    def id_of(self, loaded: LoadedScene) -> str | None:
+        """Return the name under which a scene is served; None if it was removed meanwhile."""
+        return next((entry.id for entry in self.entries() if entry.loaded is loaded), None)
+
+    def release(self, held: Collection[LoadedScene]) -> None:
         with self._lock:
             for entry in self._entries.values():
-                if entry.loaded is loaded:
+                if any(entry.loaded is loaded for loaded in held):
                     entry.jobs -= 1
                     if entry.state == "unloading" and not entry.jobs:
                         _drop(entry)

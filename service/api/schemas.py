@@ -225,6 +225,14 @@ class GeoPose(Model):
     quaternion: GeoQuaternion
 
 
+class Considered(Model):
+    """A scene that a photo was compared with."""
+
+    id: str
+    matches: int
+    """With one of its views, that agree on one camera."""
+
+
 class Result(Model):
     """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
 
@@ -261,6 +269,9 @@ class Result(Model):
     matcher: str
     rasterizer: str
     scene: SceneRef
+    """The one that the pose is in."""
+    considered: list[Considered] = []
+    """Where several scenes were asked for: how well each fits, best first."""
     versions: dict[str, str]
     warnings: list[str]
     frames: list[FrameOut] | None = None
@@ -296,6 +307,7 @@ class JobSummary(Model):
     id: str
     state: JobState
     scene: str
+    """Where several were asked for, one of them until it is known which."""
     estimator: str
     photo: PhotoOut
     attempt: int
@@ -316,6 +328,8 @@ class JobSummary(Model):
 class JobOut(JobSummary):
     """A job with its result (state `succeeded`), or the error for which it has none (`failed`, `interrupted`)."""
 
+    scene_asked: str | list[str] | None
+    """As it was sent."""
     seed: int
     budget_s: float | None
     deadline: datetime | None

@@ -125,6 +125,8 @@ class Ending:
     score: float | None = None
     result: str | None = None
     error: str | None = None
+    scene: str | None = None
+    """The one that the photo shows, where it was looked for in several."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,12 +229,13 @@ class JobStore:
             if not _append(writer, job_id, attempt, batch):
                 return False
             writer.execute(
-                "UPDATE jobs SET state = ?, status = ?, score = ?, result = ?, error = ?, finished = ?, "
+                "UPDATE jobs SET state = ?, status = ?, score = ?, result = ?, error = ?, "
+                "scene = coalesce(?, scene), finished = ?, "
                 "photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END, bytes = ? + photo_bytes + "
                 "(SELECT coalesce(sum(length(record)), 0) FROM events WHERE job = jobs.id) WHERE id = ?",
                 (
-                    *(ending.state, ending.status, ending.score, ending.result, ending.error, time.time()),
-                    *(photo_until, size, job_id),
+                    *(ending.state, ending.status, ending.score, ending.result, ending.error),
+                    *(ending.scene, time.time(), photo_until, size, job_id),
                 ),
             )
         return True

@@ -20,7 +20,7 @@ from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, render_views
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 1
+VERSION = 2
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 BATCH = 8
 log = logging.getLogger(__name__)

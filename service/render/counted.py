@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.interfaces import Frame, Rasterizer, RenderTally, SceneGradients
-from service.types import Camera
+from service.types import Camera, GaussianScene
 
 
 class Counted:
@@ -22,6 +22,12 @@ class Counted:
     @property
     def nbytes(self) -> int:
         return self.inner.nbytes
+
+    def of(self, scene: GaussianScene) -> Counted:
+        return Counted(self.inner.of(scene), self.tally)
+
+    def trained_at(self, long_side_px: int) -> Counted:
+        return Counted(self.inner.trained_at(long_side_px), self.tally)
 
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         self.tally.count += len(cameras)

@@ -8,10 +8,12 @@ takes the bias out of small renders; and whole blocks of 1024 Gaussians outside 
 
 from __future__ import annotations
 
+import copy
 import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -68,6 +70,16 @@ class CpuRasterizer:
     @property
     def nbytes(self) -> int:
         return self.packed.nbytes
+
+    def of(self, scene: GaussianScene) -> CpuRasterizer:
+        return CpuRasterizer(scene)
+
+    def trained_at(self, long_side_px: int) -> CpuRasterizer:
+        other = copy.copy(self)
+        info = replace(self.scene.info, training_focal_px=None, training_long_side_px=long_side_px)
+        other.scene = replace(self.scene, info=info)
+        other._local = threading.local()  # a picture that is kept there for its gradients has another dilation
+        return other
 
     def refresh(self) -> None:
         """Take in the scene's values again, for a scene under training: its arrays are views of changing ones."""

@@ -12,8 +12,10 @@ from near to far, and looks for the one at which the transmittance falls to one 
 
 from __future__ import annotations
 
+import copy
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any, NamedTuple
 
@@ -59,9 +61,13 @@ def create(scene: GaussianScene) -> GsplatRasterizer:
     """Put the scene on the GPU. Raises BackendMissing if its memory is too small."""
     from gsplat import rasterization, rasterize_to_indices_in_range
 
+    kernels = Kernels(rasterization, rasterize_to_indices_in_range)
+    return _put(scene, torch.device("cuda"), kernels)
+
+
+def _put(scene: GaussianScene, device: torch.device, kernels: Kernels) -> GsplatRasterizer:
     try:
-        kernels = Kernels(rasterization, rasterize_to_indices_in_range)
-        return GsplatRasterizer(scene, torch.device("cuda"), kernels)
+        return GsplatRasterizer(scene, device, kernels)
     except torch.OutOfMemoryError as error:
         raise BackendMissing(f"the GPU has no memory left for {scene.nbytes / 1e6:.0f} MB.", where="render") from error
 
@@ -82,6 +88,15 @@ class GsplatRasterizer:
     @property
     def nbytes(self) -> int:
         return sum(tensor.nbytes for tensor in self._parameters)
+
+    def of(self, scene: GaussianScene) -> GsplatRasterizer:
+        return _put(scene, self._on, self._kernels)
+
+    def trained_at(self, long_side_px: int) -> GsplatRasterizer:
+        other = copy.copy(self)
+        info = replace(self.scene.info, training_focal_px=None, training_long_side_px=long_side_px)
+        other.scene = replace(self.scene, info=info)
+        return other
 
     def render(self, cameras: Sequence[Camera]) -> list[Frame]:
         groups: dict[tuple, list[int]] = defaultdict(list)

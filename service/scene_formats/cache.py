@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import mmap
 import os
 import shutil
 from dataclasses import asdict, replace
@@ -42,9 +43,20 @@ def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
     scene = load_scene(path)
     try:
         _write(folder, scene)
+        return _opened(folder)
     except OSError as error:  # a full disk: the scene is there all the same
         _log.warning("the scene is not kept for the next start: %s", error)
     return scene
+
+
+def release(scene: GaussianScene) -> None:
+    """Give the memory of a mapped scene's arrays back; what is touched again is read from disk again."""
+    for name in _ARRAYS:
+        array: Any = getattr(scene, name)
+        while array is not None and not isinstance(array, np.memmap):
+            array = array.base
+        if array is not None and hasattr(mmap, "MADV_DONTNEED"):
+            array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
 
 
 def _key(path: Path) -> str:

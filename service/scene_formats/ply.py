@@ -5,14 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
 
 from service.errors import CorruptScene, UnsupportedFormat
-from service.scene_formats.gaussians import RawGaussians, require_count, sh_from_channel_major
-from service.scene_formats.ply_header import element_records, read_header
+from service.scene_formats.gaussians import RawGaussians, require_count
+from service.scene_formats.ply_header import element_blocks, read_header
 
 _REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3}
 """Number of f_rest properties -> SH degree."""
+_COLUMNS = {
+    "means": ["x", "y", "z"],
+    "quats": [f"rot_{i}" for i in range(4)],
+    "scales": [f"scale_{i}" for i in range(3)],
+    "opacities": ["opacity"],
+}
 
 
 def accepts(head: bytes, suffix: str) -> bool:
@@ -28,17 +33,24 @@ def read(path: Path) -> RawGaussians:
         raise UnsupportedFormat("no element 'vertex' of plain properties: not a 3DGS scene.", where=path.name)
     require_count(vertex.count, path.name)
     degree = _sh_degree(vertex.dtype.names or (), path)
-    records = element_records(path, header, "vertex")
+    values = {name: np.empty((vertex.count, len(columns)), np.float32) for name, columns in _COLUMNS.items()}
+    sh = np.empty((vertex.count, (degree + 1) ** 2, 3), np.float32)
     with np.errstate(over="ignore"):  # what overflows is reported with its index by `checked`
-        sh = _columns(records, ["f_dc_0", "f_dc_1", "f_dc_2"])[:, None]
-        if degree:
-            rest = _columns(records, [f"f_rest_{i}" for i in range(3 * ((degree + 1) ** 2 - 1))])
-            sh = np.concatenate([sh, sh_from_channel_major(rest)], 1)
+        # In blocks, straight to where they belong: a large file is never twice in memory.
+        for place, records in element_blocks(path, header, "vertex"):
+            for name, columns in _COLUMNS.items():
+                for i, column in enumerate(columns):
+                    values[name][place, i] = records[column]
+            for channel in range(3):
+                sh[place, 0, channel] = records[f"f_dc_{channel}"]
+                for k in range(1, sh.shape[1]):
+                    sh[place, k, channel] = records[f"f_rest_{channel * (sh.shape[1] - 1) + k - 1}"]
+        opacities = values["opacities"][:, 0]
         return RawGaussians(
-            means=_columns(records, ["x", "y", "z"]),
-            quats=_columns(records, [f"rot_{i}" for i in range(4)]),
-            scales=np.exp(_columns(records, [f"scale_{i}" for i in range(3)])),
-            opacities=1 / (1 + np.exp(-_columns(records, ["opacity"])[:, 0])),
+            means=values["means"],
+            quats=values["quats"],
+            scales=np.exp(values["scales"], out=values["scales"]),
+            opacities=1 / (1 + np.exp(-opacities)),
             sh=sh,
             render_mode=_render_mode(header.comments),
         )
@@ -49,8 +61,7 @@ def _sh_degree(names: tuple[str, ...], path: Path) -> int:
     if "scale_0" in names and "scale_2" not in names:
         raise UnsupportedFormat("a 2DGS scene (it has no scale_2); only 3DGS scenes can be rendered.", where=path.name)
     rest = [name for name in names if name.startswith("f_rest_")]
-    needed = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    needed += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    needed = [name for columns in _COLUMNS.values() for name in columns] + ["f_dc_0", "f_dc_1", "f_dc_2"]
     needed += [f"f_rest_{i}" for i in range(len(rest))]
     missing = [name for name in needed if name not in names]
     if missing:
@@ -58,13 +69,6 @@ def _sh_degree(names: tuple[str, ...], path: Path) -> int:
     if len(rest) not in _REST_COUNTS:
         raise CorruptScene(f"{len(rest)} f_rest properties; 0, 9, 24 or 45 are SH degree 0 to 3.", where=path.name)
     return _REST_COUNTS[len(rest)]
-
-
-def _columns(records: np.ndarray, names: list[str]) -> Float32[np.ndarray, "n m"]:
-    result = np.empty((len(records), len(names)), np.float32)
-    for column, name in enumerate(names):
-        result[:, column] = records[name]
-    return result
 
 
 def _render_mode(comments: tuple[str, ...]) -> str | None:

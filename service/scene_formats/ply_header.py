@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from service.errors import CorruptScene, UnsupportedFormat
 MAX_HEADER_BYTES = 64 * 1024
 """A 3DGS header has 2 KB."""
 MAX_PROPERTIES = 512
+BLOCK = 16_384
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -98,6 +100,22 @@ def _dtype(element: str, properties: list[list[str]], order: str, path: Path) ->
 
 def element_records(path: Path, header: PlyHeader, name: str) -> np.ndarray:
     """Read an element's records. Raises CorruptScene, before it allocates, if the file has another size."""
+    element, offset = _located(path, header, name)
+    return np.fromfile(path, element.dtype, element.count, offset=offset)
+
+
+def element_blocks(path: Path, header: PlyHeader, name: str) -> Iterator[tuple[slice, np.ndarray]]:
+    """Read an element's records in blocks that fit a cache, each with its place. Raises as `element_records`."""
+    element, offset = _located(path, header, name)
+    with path.open("rb") as file:
+        file.seek(offset)
+        for start in range(0, element.count, BLOCK):
+            block = np.fromfile(file, element.dtype, min(BLOCK, element.count - start))
+            yield slice(start, start + len(block)), block
+
+
+def _located(path: Path, header: PlyHeader, name: str) -> tuple[PlyElement, int]:
+    """Return the element and the byte at which it begins, having measured the file."""
     offset = header.data_offset
     for element in header.elements:
         if element.dtype is None:
@@ -121,4 +139,4 @@ def element_records(path: Path, header: PlyHeader, name: str) -> np.ndarray:
             f"{there - needed} bytes follow the {element.count} of '{name}' that the header promises.",
             where=f"{path.name}, byte {offset + needed}",
         )
-    return np.fromfile(path, element.dtype, element.count, offset=offset)
+    return element, offset

@@ -1,10 +1,11 @@
-"""The supplement's figures, drawn with matplotlib. Data comes in as arrays; nothing is run or rendered here."""
+"""The supplement's figures, and other benches', drawn with matplotlib. Data comes in; nothing is run or rendered."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -136,6 +137,28 @@ def reliability(models: Mapping[str, Sequence[Mapping[str, float]]]) -> bytes:
     )
     above.legend()
     below.set(xlabel="probability that was said", ylabel="poses", yscale="log")
+    return _png(figure)
+
+
+def growth(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Draw time and memory against the number of Gaussians; the rows are those of `bench scale`."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    times, latency, memory = figure.subplots(1, 3)
+    size = [row["gaussians"] for row in rows]
+    for name, label in (("load_s", "load from the file"), ("load_again_s", "load again"), ("index_s", "index")):
+        times.plot(size, [row[name] for row in rows], "o-", label=label)
+    times.set(title="seconds to be ready", yscale="log")
+    latency.plot(size, [row["latency_ms_p50"] for row in rows], "o-", label="wall")
+    latency.plot(size, [row["cpu_ms_p50"] for row in rows], "o-", label="CPU")
+    latency.set(title="ms per photo, median", ylim=(0, None))
+    for name, label in (("peak_bytes", "peak"), ("resident_bytes", "resident"), ("anonymous_bytes", "anonymous")):
+        memory.plot(size, [row[name] / 1e6 for row in rows], "o-", label=label)
+    memory.plot(size, [row["file_bytes"] / 1e6 for row in rows], "--", label="scene file", color="gray")
+    memory.set(title="MB", ylim=(0, None))
+    for place in (times, latency, memory):
+        place.set(xscale="log", xlabel="Gaussians")
+        place.grid(alpha=0.3)
+        place.legend(fontsize=7)
     return _png(figure)
 
 

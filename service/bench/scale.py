@@ -1,0 +1,155 @@
+"""`splatfix bench scale`: what a scene costs as it grows, from the file to its localized photos.
+
+Each size is a scene folder of its own (see `tiles`), measured in a process of its own. Loading is timed twice: from the
+file, which leaves the form that is mapped, and from that. Memory is the process's: `peak` up to the end of loading and
+indexing; `resident` when the photos are done, of which `anonymous` is what no file backs and the kernel can't drop.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from service.bench.metrics import COARSE, FINE, Outcome, errors, units_of
+from service.bench.queries import find_photos
+from service.errors import BackendMissing, InvalidRequest
+from service.images import read_query
+from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
+from service.pose.focus import centre_depth
+from service.scene_formats import load_scene
+from service.types import Camera, GaussianScene
+
+SIZES = (100_000, 300_000, 1_000_000, 3_000_000)
+_STATUS = Path("/proc/self/status")
+
+
+def run(
+    folder: Path,
+    *,
+    others: Sequence[Path] = (),
+    sizes: Sequence[int] = SIZES,
+    cameras: Literal["given", "ignored"] = "ignored",
+    compressed: bool = False,
+    work: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Return the list that `--json` writes, a row per size. Raises SceneError, InvalidRequest.
+
+    `others` are the scenes around the one whose photos are localized; without any, varied copies of it. `cameras` as in
+    `bench localize`. `work` is where the large scenes are written; by default a temporary folder.
+    """
+    if find_spec("gsply") is None:
+        raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
+    if not _STATUS.exists():
+        raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
+    from service.bench.tiles import write_folder  # loads gsply
+
+    held_back = [name for photo in find_photos(folder) for name in photo.names]
+    scene = load_scene(folder, without_photos=held_back)
+    if not scene.cameras:
+        raise InvalidRequest("the scene needs training cameras: its units and its small sizes rest on them.")
+    around = [load_scene(other) for other in others]
+    units = units_of([n.camera for n in scene.cameras], _depth_of(scene))
+    rows = []
+    for done, count in enumerate(sizes, 1):
+        with tempfile.TemporaryDirectory(dir=work) as temporary:
+            at = Path(temporary, f"{count}")
+            large = _sized(scene, count, around)
+            file = write_folder(large, at, folder, cameras=cameras == "given", compressed=compressed)
+            facts = {"gaussians": large.count, "sh_degree": large.sh_degree, "file": file.name}
+            facts |= {"cameras": cameras, "file_bytes": file.stat().st_size}
+            del large
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+                rows.append(facts | process.submit(measured, at, units).result())
+        if progress:
+            progress(done, len(sizes))
+    return rows
+
+
+def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:
+    rasterizer = LoadedScene.of(scene).rasterizer
+    return lambda camera: centre_depth(rasterizer, camera)
+
+
+def _sized(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
+    from service.bench.tiles import thinned, tiled
+
+    if count < scene.count:
+        return thinned(scene, count, LoadedScene.of(scene).rasterizer)
+    return tiled(scene, count, others)
+
+
+def measured(folder: Path, units: Any) -> dict[str, Any]:
+    """Load, index and localize a scene folder; the first localization isn't counted. For a fresh process."""
+    cache = folder / "cache"
+    seconds: dict[str, float] = {}
+
+    def timed(name: str, call: Callable[[], Any]) -> Any:
+        wall, cpu = time.perf_counter(), time.process_time()
+        result = call()
+        seconds[f"{name}_s"], seconds[f"{name}_cpu_s"] = time.perf_counter() - wall, time.process_time() - cpu
+        return result
+
+    timed("warm_up", _warm)
+    before = _memory()
+    loaded = timed("load", lambda: LoadedScene.load(folder, cache_dir=cache))
+    index = timed("index", lambda: loaded.prepare(DEFAULT_ESTIMATOR))
+    peak = _memory()["VmHWM"]
+    outcomes = _outcomes(folder, loaded, units)
+    after = _memory()
+    del loaded
+    again = timed("load_again", lambda: LoadedScene.load(folder, cache_dir=cache))
+    timed("index_again", lambda: again.prepare(DEFAULT_ESTIMATOR))
+    return {
+        **seconds,
+        "views": len(index.views),
+        "bytes_before": before["VmRSS"],
+        "peak_bytes": peak,
+        "resident_bytes": after["VmRSS"],
+        "anonymous_bytes": after["RssAnon"],
+        "photos": len(outcomes),
+        "success_5deg_0p05": sum(o.success(COARSE) for o in outcomes),
+        "success_1deg_0p01": sum(o.success(FINE) for o in outcomes),
+        "false_localized": sum(o.false for o in outcomes),
+        "latency_ms_p50": float(np.median([o.latency_ms for o in outcomes])),
+        "cpu_ms_p50": float(np.median([o.cpu_ms for o in outcomes])),
+    }
+
+
+def _warm() -> None:
+    """Load the libraries and compile the kernels on a scene of nothing much."""
+    from service.bench.render import room_cameras, synthetic_room
+
+    loaded = LoadedScene.of(synthetic_room(2000))
+    loaded.rasterizer.render(room_cameras(64))
+    loaded.matcher.extract(np.zeros((96, 128, 3), np.uint8), 10)
+
+
+def _outcomes(folder: Path, loaded: LoadedScene, units: Any) -> list[Outcome]:
+    outcomes = []
+    photos = find_photos(folder)
+    for photo in [photos[0], *photos]:
+        data = photo.path.read_bytes()
+        wall, cpu = time.perf_counter(), time.process_time()
+        background = loaded.scene.info.background_rgb
+        query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background)
+        estimate = localize(query, loaded)
+        spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
+        error = errors(estimate.pose, photo.camera.pose, units)
+        outcomes.append(Outcome(estimate.verdict.status, *error, *spent))
+    return outcomes[1:]
+
+
+def _memory() -> dict[str, int]:
+    """Return what Linux counts for this process, in bytes."""
+    found = re.findall(r"(\w+):\s+(\d+) kB", _STATUS.read_text())
+    return {name: 1024 * int(value) for name, value in found}

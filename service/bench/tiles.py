@@ -1,0 +1,176 @@
+"""Large scenes out of small ones: the scene with its photos as it is, and varied copies around it, on a grid.
+
+    . . .        o  the scene: its photos and their truth stay valid
+    . o .        .  a copy, or another scene: mirrored, turned, with other colours and exposure
+    . . .
+
+A mirrored room has the same kind of content, as the next room of a building has, and is nowhere the same place: no
+rotation takes one into the other. Each copy brings its training cameras along.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import gsply
+import numpy as np
+from jaxtyping import Float64
+
+from service.geometry import so3_exp
+from service.interfaces import Rasterizer
+from service.pose.level import contributions
+from service.scene_formats.gaussians import SH_C0, RawGaussians
+from service.scene_formats.manifest import MANIFEST
+from service.scene_formats.similarity import moved_gaussians, moved_pose
+from service.types import Camera, GaussianScene, NamedCamera
+
+GAP = 0.1
+"""Between two tiles, as a share of a tile's size."""
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+ODD_IN_X = (3, 4, 7, 10, 13, 15)
+"""SH coefficients whose basis function changes its sign where x does."""
+
+
+def tiled(scene: GaussianScene, count: int, others: Sequence[GaussianScene] = (), seed: int = 0) -> GaussianScene:
+    """Return a scene of `count` Gaussians with `scene` in its middle; the tile farthest out is cut off.
+
+    Raises ValueError if the scene alone has more.
+    """
+    if count < scene.count:
+        raise ValueError(f"the scene has {scene.count} Gaussians, more than {count}.")
+    rng = np.random.default_rng(seed)
+    parts, cameras = [_raw(scene)], list(scene.cameras)
+    total = scene.count
+    for number, cell in enumerate(_spiral()):
+        if total >= count:
+            break
+        source = others[number % len(others)] if others else scene
+        part, seen = _placed(source, scene, cell, rng)
+        if len(part.means) > count - total:
+            part = _cut(part, count - total)
+        parts.append(part)
+        cameras += [replace(named, name=f"tile{number}/{named.name}") for named in seen]
+        total += len(part.means)
+    degree = min(part.sh.shape[1] for part in parts)
+    arrays = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "quats", "scales", "opacities")}
+    sh = np.concatenate([part.sh[:, :degree] for part in parts])
+    return replace(scene, **arrays, sh=sh, cameras=tuple(cameras))
+
+
+def thinned(scene: GaussianScene, count: int, rasterizer: Rasterizer) -> GaussianScene:
+    """Return the scene of the `count` Gaussians that contribute most to its training photos."""
+    views = [Camera(n.camera.intrinsics.with_long_side(200), n.camera.pose) for n in scene.cameras]
+    chosen = np.sort(np.argsort(-contributions(scene, rasterizer, views), kind="stable")[:count])
+    arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "scales", "opacities", "sh")}
+    return replace(scene, **arrays)
+
+
+def write_folder(scene: GaussianScene, folder: Path, source: Path, *, cameras: bool, compressed: bool) -> Path:
+    """Write a scene folder with the photos and the truth of `source`; return its scene file."""
+    folder.mkdir(parents=True)
+    file = folder / ("scene.compressed.ply" if compressed else "scene.ply")
+    opacities = np.clip(scene.opacities, 1e-6, 1 - 1e-6)
+    arrays = (
+        scene.means, np.log(scene.scales), scene.quats, np.log(opacities / (1 - opacities)), scene.sh[:, 0],
+        scene.sh[:, 1:],
+    )  # fmt: skip
+    gsply.plywrite(str(file), *(np.ascontiguousarray(a, np.float32) for a in arrays), compressed=compressed)
+    manifest = {"background": scene.info.background_rgb, "render_mode": scene.info.render_mode}
+    if scene.info.up_in_world:
+        manifest["up"] = scene.info.up_in_world
+    if scene.info.training_long_side_px:
+        manifest["training_size"] = [scene.info.training_long_side_px, scene.info.training_long_side_px * 3 // 4]
+    (folder / MANIFEST).write_text(json.dumps(manifest))
+    if cameras:
+        (folder / "transforms.json").write_text(json.dumps({"frames": [_frame(named) for named in scene.cameras]}))
+    for name in ("truth.json", "photos"):
+        if (source / name).is_dir():
+            shutil.copytree(source / name, folder / name)
+        elif (source / name).is_file():
+            shutil.copy(source / name, folder / name)
+    return file
+
+
+def _frame(named: NamedCamera) -> dict:
+    k = named.camera.intrinsics
+    pose = named.camera.pose.world_from_camera @ np.diag([1.0, -1, -1, 1])
+    lens = {"w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy}
+    return {"file_path": named.name, "transform_matrix": pose.tolist(), **lens}
+
+
+def _raw(scene: GaussianScene) -> RawGaussians:
+    return RawGaussians(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh)
+
+
+def _spiral() -> Iterator[tuple[int, int]]:
+    """The cells around (0, 0), ring by ring."""
+    ring = 1
+    while True:
+        cells = [(x, y) for x in range(-ring, ring + 1) for y in range(-ring, ring + 1)]
+        yield from (cell for cell in cells if max(map(abs, cell)) == ring)
+        ring += 1
+
+
+def _placed(
+    source: GaussianScene, scene: GaussianScene, cell: tuple[int, int], rng: np.random.Generator
+) -> tuple[RawGaussians, list[NamedCamera]]:
+    """Vary a scene and put it into a cell of the grid."""
+    raw = _recoloured(_mirrored(_raw(source)), rng)
+    up = np.array(scene.info.up_in_world or (0.0, 0.0, 1.0))
+    low, high = _extent(scene)
+    size = (high - low) * (1 + GAP)
+    low, high = _extent(replace(source, means=raw.means))
+    matrix = np.eye(4)
+    quarter = int(rng.integers(4)) // 2 * 2  # half turns: a room that is not square still fits its cell
+    matrix[:3, :3] = so3_exp(up * (quarter * np.pi / 2))
+    matrix[:3, :3] *= np.max(size / (1 + GAP)) / np.max(high - low) if source is not scene else 1.0
+    across = _across(up)
+    centre = np.mean(_extent(scene), axis=0) + sum(c * (a @ size) * a for c, a in zip(cell, across, strict=True))
+    matrix[:3, 3] = centre - matrix[:3, :3] @ (0.5 * (low + high))
+    cameras = [replace(n, camera=_mirrored_camera(n.camera)) for n in source.cameras]
+    moved = [replace(n, camera=replace(n.camera, pose=moved_pose(n.camera.pose, matrix))) for n in cameras]
+    return moved_gaussians(raw, matrix), moved
+
+
+def _across(up: Float64[np.ndarray, "3"]) -> list[Float64[np.ndarray, "3"]]:
+    """The two axes of the world that are least along `up`."""
+    return [np.eye(3)[axis] for axis in np.sort(np.argsort(np.abs(up), kind="stable")[:2])]
+
+
+def _extent(scene: GaussianScene) -> Float64[np.ndarray, "2 3"]:
+    return np.quantile(scene.means[scene.opacities > 0.3].astype(np.float64), [0.005, 0.995], axis=0)
+
+
+def _mirrored(raw: RawGaussians) -> RawGaussians:
+    """Reflect at the plane x = 0."""
+    sh = raw.sh.copy()
+    odd = [k for k in ODD_IN_X if k < sh.shape[1]]
+    sh[:, odd] *= -1
+    signs = np.array([1, 1, -1, -1], np.float32)
+    return replace(raw, means=raw.means * np.array([-1, 1, 1], np.float32), quats=raw.quats * signs, sh=sh)
+
+
+def _mirrored_camera(camera: Camera) -> Camera:
+    """The camera whose picture of the mirrored scene is the mirror image."""
+    pose = replace(camera.pose, world_from_camera=MIRROR @ camera.pose.world_from_camera @ MIRROR)
+    k = camera.intrinsics
+    return Camera(replace(k, cx=k.width - k.cx), pose)
+
+
+def _recoloured(raw: RawGaussians, rng: np.random.Generator) -> RawGaussians:
+    """Exchange the colour channels and expose each anew."""
+    gains = rng.uniform(0.7, 1.3, 3).astype(np.float32)
+    sh = raw.sh[:, :, rng.permutation(3)] * gains
+    sh[:, 0] += (gains - 1) * np.float32(0.5 / SH_C0)  # colour is 0.5 + the sum
+    return replace(raw, sh=sh)
+
+
+def _cut(raw: RawGaussians, count: int) -> RawGaussians:
+    """Keep the first along x: half a room, not a thin whole one."""
+    chosen = np.argsort(raw.means[:, 0], kind="stable")[:count]
+    arrays = {n: getattr(raw, n)[chosen] for n in ("means", "quats", "scales", "opacities", "sh")}
+    return replace(raw, **arrays)

@@ -1,0 +1,390 @@
+"""Where to look at a scene from when nothing tells where its photos were taken.
+
+    opaque Gaussians -> places in free space that look at some of them -> small renders of a thinned scene -> good?
+        ^------------ aim at what no good view has seen yet <------------|
+    good views -> the few that together see every surface from every side that any of them sees
+
+Three kinds of places: on shells around the middle (objects), anywhere in the volume (rooms), and at the distance
+that a Gaussian's size tells: trainers split and merge until a Gaussian fills about a pixel of the photos, so distance
+= size x focal length, whatever the scene's unit and however far its background is.
+
+A view is good if it is solid, free and inside. Solid: most of the image shows one opaque surface, not nearer than a
+floater would be; from behind walls, inside floaters and towards parts never photographed, the depths along a ray
+disagree. Near training cameras of a room's corner 0.8 to 0.94 of the image are solid, elsewhere 0.05 to 0.3; objects
+that were photographed all around are solid from everywhere. Free: not among Gaussians. Inside: where most good views
+are surrounded by the scene, one that isn't looks at the outside of its walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from service.geometry import look_at, transformed, unproject
+from service.interfaces import Frame, Rasterizer
+from service.types import Camera, GaussianScene, Intrinsics, Pose
+
+MIN_OPACITY = 0.3
+MAX_POINTS = 400_000
+CELLS = 400_000
+"""Of the grid, at most, in the middle 98 % of the volume."""
+POINTS_PER_CELL = 4
+"""On the six sides of a cube of cells: fewer cells, if there are not enough points to close a wall."""
+SEARCH_GAUSSIANS = 200_000
+"""More are thinned for the search: a view of 64 px doesn't show the difference."""
+SEARCH_PX = 64
+SEARCH_FOV_DEG = 60.0
+SHELLS = (1.2, 2.0, 3.4, 5.0)
+"""Radii, in units of the radius that holds half of the opaque Gaussians."""
+SHELL_CANDIDATES, VOLUME_CANDIDATES, SIZE_CANDIDATES = 40, 150, 100
+BEST, OFFSPRING = 50, 4
+GAUSSIAN_PX = 1.2
+"""Middle one of the median Gaussian's three sizes in its training photos; 0.5 to 2.4 in seven scenes."""
+ASSUMED_FOCAL_PX = 1000.0
+COARSE_RADII = (2.0, 5.0)
+"""Radii of the scene that the typical distance, and any, is at most: scenes of few, large Gaussians look far away."""
+NEAREST = 0.06
+"""What is nearer than this share of the typical distance is in the way."""
+ROUNDS, ROUND_CANDIDATES = 12, 150
+ENOUGH_GOOD, GOOD_PER_AREA = (200, 800), 40
+"""Good views to look for: so many for each square of the typical distance that the surfaces have."""
+WIDE_TURN = 0.8
+ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
+"""Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
+SURROUNDED = 0.7
+AS_SURROUNDED = 0.6
+"""Where one good view in twenty has this share of all directions closed, the others need this share of that."""
+RAYS = 32
+AT_LEAST, AT_MOST, COVERED = 64, 384, 0.93
+FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
+"""A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
+SEEN_AGAIN = 0.25
+"""Worth of what another view of the choice shows already."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """The views that were found, and how much of the scene they show."""
+
+    cameras: tuple[Camera, ...]
+    candidates: int
+    good: int
+    coverage: float
+    """Share of the opaque Gaussians that the chosen views see."""
+    typical_distance: float
+    """From which the Gaussians' sizes say that they were photographed; scene units, median."""
+    interior: bool
+    """The scene surrounds its views."""
+
+
+def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Placement:
+    """Find places from which the scene looks as it did to the cameras that it was trained with."""
+    space = _survey(scene)
+    search = _thinned(scene, rasterizer, rng)
+    views = _Views(space, search)
+    views.judge(_shells(space) + _in_volume(space, rng) + _by_size(space, rng, SIZE_CANDIDATES))
+    best = np.argsort(-np.array(views.scores), kind="stable")[:BEST]
+    views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(OFFSPRING)])
+    good = views.good()
+    unseen = ~views.seen(good)
+    for _ in range(ROUNDS):
+        before, few = unseen.mean(), len(good) < space.enough
+        if before < 1 - ENOUGH_SEEN and not few:
+            break
+        aimed = _by_size(space, rng, ROUND_CANDIDATES // 2, unseen if unseen.any() else None)
+        near = rng.choice(good, ROUND_CANDIDATES // 2) if len(good) else []
+        views.judge(aimed + [_jittered(views.poses[i], space, rng, WIDE_TURN) for i in near])
+        good = views.good()
+        unseen = ~views.seen(good)
+        if before - unseen.mean() < LEAST_GAIN and not few:
+            break
+    chosen = good[_choice([views.cells(i) for i in good])]
+    lens = search_lens(SEARCH_PX)
+    cameras = tuple(Camera(lens, views.poses[i]) for i in chosen)
+    coverage = float(views.seen(chosen).mean())
+    return Placement(cameras, len(views.poses), len(good), coverage, space.distance, views.interior)
+
+
+def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
+    """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
+    views = _Views(_survey(scene), _thinned(scene, rasterizer, np.random.default_rng(0)))
+    views.add([Camera(camera.intrinsics.with_long_side(SEARCH_PX), camera.pose) for camera in cameras])
+    return float(views.seen(np.arange(len(cameras))).mean())
+
+
+def floaters(scene: GaussianScene) -> float:
+    """Return the share of the opaque Gaussians that have hardly any others around: no surface, but haze."""
+    space = _survey(scene)
+    size = FLOATER_REACH * space.distance
+    cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
+    ids = _ids(cells)
+    order = np.argsort(ids)
+    around = np.zeros(len(cells), int)
+    for step in np.ndindex(3, 3, 3):
+        wanted = _ids(cells + np.array(step) - 1)
+        at = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
+        around += np.where(ids[at] == wanted, counts[at], 0)
+    opaque = max(int((scene.opacities > MIN_OPACITY).sum()), len(space.points))
+    alone = around <= max(1.0, FLOATER_NEIGHBOURS * len(space.points) / opaque)
+    return float(counts[alone].sum() / counts.sum())
+
+
+def solidity(frame: Frame, min_distance: float) -> float:
+    """Return the share of the image that shows one opaque surface, not nearer than `min_distance`."""
+    return float(_solid(frame, min_distance).mean())
+
+
+def _solid(frame: Frame, min_distance: float) -> Bool[np.ndarray, "h w"]:
+    apart = np.abs(frame.depth - frame.median_depth)
+    return (frame.alpha > 0.9) & (frame.median_depth > min_distance) & (apart < 0.05 * frame.median_depth)
+
+
+def search_lens(long_side: int) -> Intrinsics:
+    """Return the lens of the found views: 4:3, SEARCH_FOV_DEG wide."""
+    focal = 0.5 * long_side / np.tan(np.radians(0.5 * SEARCH_FOV_DEG))
+    height = long_side * 3 // 4
+    return Intrinsics(long_side, height, focal, focal, 0.5 * long_side, 0.5 * height)
+
+
+@dataclass(frozen=True, slots=True)
+class _Space:
+    """The opaque Gaussians, at most MAX_POINTS, and a grid over the middle 98 % of them."""
+
+    points: Float64[np.ndarray, "n 3"]
+    distances: Float64[np.ndarray, "n"]
+    """From which each was photographed, by its size."""
+    low: Float64[np.ndarray, "3"]
+    cell: float
+    filled: Bool[np.ndarray, "x y z"]
+    middle: Float64[np.ndarray, "3"]
+    radius: float
+    """Holds half of the points."""
+    up: Float64[np.ndarray, "3"]
+
+    @property
+    def distance(self) -> float:
+        """The typical one."""
+        return float(min(np.median(self.distances), COARSE_RADII[0] * self.radius))
+
+    @property
+    def enough(self) -> float:
+        """How many good views are looked for."""
+        area = self.filled.sum() * self.cell**2
+        return float(np.clip(GOOD_PER_AREA * area / self.distance**2, *ENOUGH_GOOD))
+
+    def occupied(self, positions: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Whether Gaussians are there; outside the grid there are none."""
+        index = np.floor((positions - self.low) / self.cell).astype(int)
+        inside = np.all((index >= 0) & (index < self.filled.shape), axis=-1)
+        x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
+        return inside & self.filled[x, y, z]
+
+    def enclosure(self, position: Float64[np.ndarray, "3"]) -> float:
+        """Return the share of all directions in which something is met within the grid."""
+        steps = np.arange(1.5, np.linalg.norm(self.filled.shape)) * self.cell
+        along = position + steps[:, None, None] * _lattice(RAYS)
+        return float(self.occupied(along).any(0).mean())
+
+
+def _survey(scene: GaussianScene) -> _Space:
+    opaque = np.flatnonzero(scene.opacities > MIN_OPACITY)
+    opaque = opaque if len(opaque) else np.arange(scene.count)
+    opaque = opaque[:: -(-len(opaque) // MAX_POINTS)]
+    points = scene.means[opaque].astype(np.float64)
+    sizes = np.sort(scene.scales[opaque].astype(np.float64), axis=1)[:, 1]  # long and thin ones: how fine they are
+    sizes = np.clip(sizes, *np.quantile(sizes, [0.1, 0.9]))
+    info = scene.info
+    focal = info.training_focal_px or info.training_long_side_px or ASSUMED_FOCAL_PX
+    low, high = np.quantile(points, [0.01, 0.99], axis=0)
+    low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
+    cells = min(CELLS, (len(points) / (6 * POINTS_PER_CELL)) ** 1.5)
+    cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / cells)), 1e-9)
+    shape = np.floor((high - low) / cell).astype(int) + 1
+    index = np.floor((points - low) / cell).astype(int)
+    index = index[np.all((index >= 0) & (index < shape), axis=1)]
+    counts = np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape)))
+    middle = np.median(points, axis=0)
+    radius = float(np.median(np.linalg.norm(points - middle, axis=1)))
+    up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
+    return _Space(
+        points,
+        np.clip(sizes * focal / GAUSSIAN_PX, 1e-9, max(COARSE_RADII[1] * radius, 1e-9)),
+        low,
+        cell,
+        (counts >= 2).reshape(shape),
+        middle,
+        radius,
+        up,
+    )
+
+
+def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
+    """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
+
+    One of area a stays with the probability p = min(1, k a), and its area becomes 2 a / p: what is left to chance
+    leaves holes otherwise.
+    """
+    if scene.count <= SEARCH_GAUSSIANS:
+        return rasterizer
+    order = np.argsort(scene.scales, axis=1)[:, 1:]
+    flat = np.take_along_axis(scene.scales, order, 1)
+    areas = (flat[:, 0] * flat[:, 1] * scene.opacities).astype(np.float64) + 1e-30
+    share = SEARCH_GAUSSIANS * areas / areas.sum()
+    for _ in range(10):  # those that are certain leave room for others
+        certain = share >= 1
+        share[~certain] *= (SEARCH_GAUSSIANS - certain.sum()) / share[~certain].sum()
+    chosen = np.flatnonzero(rng.random(scene.count) < share)
+    scales = scene.scales[chosen].copy()
+    wider = np.where(share[chosen] < 1, np.sqrt(2.0 / share[chosen]), 1.0)
+    wider = (flat[chosen] * wider[:, None]).astype(np.float32)
+    np.put_along_axis(scales, order[chosen], wider, 1)
+    arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "opacities")}
+    return rasterizer.of(replace(scene, **arrays, scales=scales, sh=scene.sh[chosen, :1]))
+
+
+class _Views:
+    """Candidates, how solid each is, and what it sees of the scene."""
+
+    def __init__(self, space: _Space, rasterizer: Rasterizer) -> None:
+        self.poses: list[Pose] = []
+        self.scores: list[float] = []
+        self.interior = False
+        """The scene surrounds its good views, as far as is known."""
+        self._enclosures: list[float] = []
+        self._surfaces: list[Float64[np.ndarray, "n 3"]] = []
+        self._space, self._rasterizer = space, rasterizer
+        self._voxel = 0.25 * space.distance
+        self._points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
+
+    def judge(self, poses: Sequence[Pose]) -> None:
+        """Render the candidates small. Those among Gaussians are not worth it."""
+        blocked = self._space.occupied(np.stack([pose.position_in_world for pose in poses]))
+        lens = search_lens(SEARCH_PX)
+        free = [pose for pose, bad in zip(poses, blocked, strict=True) if not bad]
+        self.add([Camera(lens, pose) for pose in free])
+        self._enclosures += [self._space.enclosure(pose.position_in_world) for pose in free]
+
+    def add(self, cameras: Sequence[Camera]) -> None:
+        nearest = NEAREST * self._space.distance
+        for camera, frame in zip(cameras, self._rasterizer.render(cameras), strict=True):
+            height, width = frame.alpha.shape
+            row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
+            solid = _solid(frame, nearest)
+            kept = solid[row, column]
+            px = np.stack([column[kept], row[kept]], 1) + 0.5
+            points = unproject(px, frame.median_depth[row, column][kept], camera.intrinsics)
+            self.poses.append(camera.pose)
+            self.scores.append(float(solid.mean()))
+            self._surfaces.append(transformed(camera.pose.world_from_camera, points))
+
+    def good(self) -> Int64[np.ndarray, "k"]:
+        """Return which candidates are solid and, where that tells, inside; and take note whether it does."""
+        scores, enclosures = np.array(self.scores), np.array(self._enclosures)
+        solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
+        limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
+        self.interior = limit >= SURROUNDED
+        return solid[enclosures[solid] >= AS_SURROUNDED * limit] if self.interior else solid
+
+    def seen(self, chosen: Int64[np.ndarray, "k"]) -> Bool[np.ndarray, "n"]:
+        """Tell of each point of the space whether one of the views sees its voxel."""
+        surfaces = [self._surfaces[i] for i in chosen]
+        voxels = np.floor(np.concatenate([*surfaces, np.empty((0, 3))]) / self._voxel).astype(np.int64)
+        return np.isin(self._points, np.unique(_ids(voxels)))
+
+    def cells(self, i: int) -> Int64[np.ndarray, "k"]:
+        """Return what a view sees as (voxel, direction of view, octave of distance): what makes pictures alike."""
+        points = self._surfaces[i]
+        rays = points - self.poses[i].position_in_world
+        distances = np.linalg.norm(rays, axis=1, keepdims=True)
+        directions = np.rint(1.4 * rays / np.maximum(distances, 1e-12))
+        octaves = np.floor(np.log2(np.maximum(distances, 1e-12)))
+        voxels = np.floor(points / self._voxel)
+        return np.unique(_ids(np.concatenate([voxels, directions, octaves], 1).astype(np.int64)))
+
+
+def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
+    """Return one number for each row of small numbers; chance collisions do no harm."""
+    result = np.zeros(len(rows), np.uint64)
+    for column in rows.T:
+        result = (result ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
+        result ^= result >> np.uint64(29)
+    return result.astype(np.int64)
+
+
+def _choice(cells: Sequence[Int64[np.ndarray, "_"]]) -> Int64[np.ndarray, "k"]:
+    """Take the view that adds most, again and again, until the choice shows what all together show.
+
+    What a single candidate sees counts half: it may be an odd place.
+    """
+    ids, inverse = np.unique(np.concatenate(cells), return_inverse=True)
+    rows = np.split(inverse, np.cumsum([len(c) for c in cells])[:-1])
+    worth = np.minimum(np.bincount(inverse, minlength=len(ids) + 1), 2).astype(np.float64)
+    worth[len(ids)] = 0
+    table = np.full((len(rows), max(map(len, rows))), len(ids))
+    for row, own in zip(table, rows, strict=True):
+        row[: len(own)] = own
+    left, total, seen = worth.copy(), worth.sum(), 0.0
+    chosen: list[int] = []
+    while len(chosen) < min(AT_MOST, len(rows)) and (len(chosen) < AT_LEAST or seen < COVERED * total):
+        gains = left[table].sum(1)
+        gains[chosen] = -1
+        taken = int(np.argmax(gains))
+        new = np.unique(table[taken])
+        seen += float(left[new][left[new] == worth[new]].sum())
+        left[new] *= SEEN_AGAIN
+        chosen.append(taken)
+    return np.array(chosen, int)
+
+
+def _shells(space: _Space) -> list[Pose]:
+    """Look at the middle from all around."""
+    middle, radius = space.middle, space.radius
+    directions = _lattice(SHELL_CANDIDATES)
+    return [look_at(middle + factor * radius * d, middle, space.up) for factor in SHELLS for d in directions]
+
+
+def _lattice(count: int) -> Float64[np.ndarray, "n 3"]:
+    """Return evenly spread directions (a Fibonacci lattice)."""
+    i = np.arange(count) + 0.5
+    z, angle = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5.0)) * i
+    ring = np.sqrt(1 - z * z)
+    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
+
+
+def _in_volume(space: _Space, rng: np.random.Generator) -> list[Pose]:
+    """Look from random places in the volume towards random Gaussians."""
+    low, high = np.quantile(space.points, [0.05, 0.95], axis=0)
+    positions = rng.uniform(low, high, (VOLUME_CANDIDATES, 3))
+    targets = space.points[rng.integers(len(space.points), size=VOLUME_CANDIDATES)]
+    return _looking(positions, targets, space.up)
+
+
+def _by_size(
+    space: _Space, rng: np.random.Generator, count: int, wanted: Bool[np.ndarray, "n"] | None = None
+) -> list[Pose]:
+    """Look at random Gaussians, of those wanted, from about as far as their sizes tell; rather level than not."""
+    among = np.arange(len(space.points)) if wanted is None else np.flatnonzero(wanted)
+    taken = rng.choice(among, count)
+    directions = rng.standard_normal((count, 3))
+    directions -= 0.5 * (directions @ space.up)[:, None] * space.up
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    targets = space.points[taken]
+    distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.4), np.log(1.6), count))
+    return _looking(targets - distances[:, None] * directions, targets, space.up)
+
+
+def _looking(
+    positions: Float64[np.ndarray, "n 3"], targets: Float64[np.ndarray, "n 3"], up: Float64[np.ndarray, "3"]
+) -> list[Pose]:
+    return [look_at(p, t, up) for p, t in zip(positions, targets, strict=True) if np.any(p != t)]
+
+
+def _jittered(pose: Pose, space: _Space, rng: np.random.Generator, turn: float = 0.25) -> Pose:
+    """Move a pose a little and turn it, by some 15 degrees if not said otherwise; upright again."""
+    reach = 0.3 * min(space.radius, space.distance)
+    position = pose.position_in_world + reach * rng.uniform(-1, 1, 3)
+    axis = pose.axis_in_world + turn * rng.standard_normal(3)
+    return look_at(position, position + axis, space.up)

@@ -1,0 +1,149 @@
+"""Views placed by the scene itself, in scenes whose inside, walls and haze are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.bench.render import ROOM, synthetic_room
+from service.geometry import look_at
+from service.interfaces import Frame
+from service.pose.placement import _thinned, coverage, find_views, floaters, search_lens, solidity
+from service.render.cpu import CpuRasterizer
+from service.types import Camera, GaussianScene
+
+COUNT = 6000
+
+
+@pytest.fixture(autouse=True)
+def few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many candidates as these small scenes need."""
+    for name, count in (
+        ("SHELL_CANDIDATES", 12),
+        ("VOLUME_CANDIDATES", 60),
+        ("SIZE_CANDIDATES", 60),
+        ("BEST", 20),
+        ("AT_LEAST", 16),
+    ):
+        monkeypatch.setattr(f"service.pose.placement.{name}", count)
+
+
+def closed_room(count: int = COUNT) -> GaussianScene:
+    """Walls and furniture without the bench's loose Gaussians in the air."""
+    room = synthetic_room(count)
+    names = ("means", "quats", "scales", "sh")
+    walls = {n: getattr(room, n)[: count - count // 10] for n in names}
+    return replace(room, **walls, opacities=np.full(count - count // 10, 0.95, np.float32))
+
+
+def joined(*scenes: GaussianScene) -> GaussianScene:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return replace(scenes[0], **{n: np.concatenate([getattr(s, n) for s in scenes]) for n in names})
+
+
+def changed(scene: GaussianScene, scale: float, shift: tuple[float, float, float]) -> GaussianScene:
+    means = scene.means * scale + np.array(shift)
+    return replace(scene, means=means.astype(np.float32), scales=scene.scales * np.float32(scale))
+
+
+def blobs(positions: np.ndarray, size: float) -> GaussianScene:
+    """Opaque balls."""
+    few = synthetic_room(len(positions))
+    ones = np.ones(len(positions), np.float32)
+    scales = np.full((len(positions), 3), size, np.float32)
+    return replace(few, means=positions.astype(np.float32), scales=scales, opacities=0.95 * ones)
+
+
+def places(scene: GaussianScene, seed: int = 0) -> tuple[np.ndarray, float, bool]:
+    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(seed))
+    positions = np.stack([camera.pose.position_in_world for camera in found.cameras])
+    return positions, found.coverage, found.interior
+
+
+def test_solidity_counts_single_opaque_surfaces() -> None:
+    ones = np.ones((10, 10), np.float32)
+    rgb = np.zeros((10, 10, 3), np.float32)
+    assert solidity(Frame(rgb, ones, 2 * ones, 2 * ones), 0.5) == 1.0
+    assert solidity(Frame(rgb, ones, 2.5 * ones, 2 * ones), 0.5) == 0.0  # something translucent before it
+    assert solidity(Frame(rgb, ones, 0.3 * ones, 0.3 * ones), 0.5) == 0.0  # nose to a floater
+    assert solidity(Frame(rgb, 0.6 * ones, 2 * ones, 2 * ones), 0.5) == 0.0
+
+
+@pytest.mark.parametrize(("scale", "shift"), [(1.0, (0, 0, 0)), (0.01, (5, -3, 2)), (300.0, (1e4, 0, 0))])
+def test_a_closed_room_is_seen_from_inside_whatever_its_unit(scale, shift) -> None:
+    room = closed_room()
+    positions, seen, interior = places(changed(room, scale, shift))
+    inside = np.abs((positions - shift) / scale) < ROOM / 2
+    assert interior
+    assert inside.all(1).mean() > 0.9
+    assert seen > 0.9
+
+
+def test_two_rooms_get_views_each() -> None:
+    room = closed_room()
+    positions, seen, _ = places(joined(room, changed(room, 1.0, (9.0, 0, 0))))
+    first = (positions[:, 0] < 4.5).mean()
+    assert 0.3 < first < 0.7
+    assert seen > 0.85
+
+
+def test_an_object_before_a_far_background_is_looked_at() -> None:
+    """A third of the Gaussians are a shell 40 radii away, as trainers make of a sky; the photos had 64 px."""
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(4000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    scene = joined(blobs(directions[:2700], 0.04), blobs(40 * directions[2700:], 1.6))
+    scene = replace(scene, info=replace(scene.info, training_long_side_px=64))
+    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(0))
+    views = [c.pose for c in found.cameras]
+    near = [v for v in views if np.linalg.norm(v.position_in_world) < 8]
+    at_it = [v for v in near if -v.position_in_world @ v.axis_in_world > 0.8 * np.linalg.norm(v.position_in_world)]
+    assert len(at_it) >= 10
+    assert min(np.linalg.norm(v.position_in_world) for v in views) > 1.0  # none in the object
+
+
+def test_no_view_is_inside_a_cloud_of_floaters() -> None:
+    room = closed_room()
+    rng = np.random.default_rng(2)
+    cloud = blobs(np.array([0.0, -0.5, 0.0]) + rng.uniform(-0.5, 0.5, (1500, 3)), 0.08)
+    positions, _, _ = places(joined(room, cloud))
+    within = np.all(np.abs(positions - [0.0, -0.5, 0.0]) < 0.5, axis=1)
+    assert not within.any()
+
+
+def test_the_same_seed_finds_the_same() -> None:
+    room = synthetic_room(2000)
+    assert np.array_equal(places(room, 3)[0], places(room, 3)[0])
+
+
+def test_floaters_are_counted() -> None:
+    rng = np.random.default_rng(0)
+    walls = blobs(np.concatenate([rng.uniform(-3, 3, (3800, 2)), np.zeros((3800, 1))], 1), 0.02)
+    assert floaters(walls) < 0.01
+    haze = blobs(rng.uniform((-3, -3, 3), (3, 3, 9), (200, 3)), 0.02)
+    assert floaters(joined(walls, haze)) == pytest.approx(0.05, abs=0.01)
+
+
+def test_coverage_is_the_share_that_is_seen() -> None:
+    """A camera before one of two walls, back to back and far apart."""
+    rng = np.random.default_rng(0)
+    wall = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.full((4000, 1), 3.0)], 1)
+    scene = joined(blobs(wall, 0.06), blobs(wall - [0, 0, 6], 0.06))
+    pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    assert coverage(scene, CpuRasterizer(scene), [Camera(search_lens(64), pose)]) == pytest.approx(0.5, abs=0.03)
+
+
+def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("service.pose.placement.SEARCH_GAUSSIANS", 8000)
+    scene = closed_room(40_000)
+    whole = CpuRasterizer(scene)
+    thin = _thinned(scene, whole, np.random.default_rng(0))
+    assert isinstance(thin, CpuRasterizer)
+    assert thin.scene.count == pytest.approx(8000, rel=0.05)
+    up = np.array([0.0, 0.0, 1.0])
+    camera = Camera(search_lens(64), look_at(np.array([0.0, -1.0, 0.0]), np.array([3.0, 1.0, -0.5]), up))
+    a, b = whole.render([camera])[0], thin.render([camera])[0]
+    assert b.alpha.mean() > 0.95 * a.alpha.mean()
+    assert np.median(np.abs(a.median_depth - b.median_depth) / a.median_depth) < 0.08

@@ -1,0 +1,85 @@
+"""Large scenes made of small ones: the copies are what they claim to be, the scene in the middle is untouched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from service.bench import tiles
+from service.bench.render import room_cameras, synthetic_room
+from service.render.cpu import CpuRasterizer
+from service.scene_formats import load_scene
+from service.types import GaussianScene, NamedCamera
+
+COUNT = 4000
+
+
+@pytest.fixture(scope="module")
+def room() -> GaussianScene:
+    cameras = tuple(NamedCamera(f"{i}.png", camera) for i, camera in enumerate(room_cameras(96)))
+    return replace(synthetic_room(COUNT), cameras=cameras)
+
+
+def test_the_mirrored_camera_sees_the_mirror_image(room: GaussianScene) -> None:
+    raw = tiles._mirrored(tiles._raw(room))
+    mirrored = replace(room, means=raw.means, quats=raw.quats, sh=raw.sh)
+    for named in room.cameras[:3]:
+        (seen,) = CpuRasterizer(room).render([named.camera])
+        (other,) = CpuRasterizer(mirrored).render([tiles._mirrored_camera(named.camera)])
+        # float32 and the order of blending: seen 1e-5
+        assert np.abs(seen.rgb - other.rgb[:, ::-1]).max() < 1e-3
+        assert np.abs(seen.median_depth - other.median_depth[:, ::-1]).mean() < 1e-3
+
+
+def test_copies_stand_apart_and_their_cameras_with_them(room: GaussianScene) -> None:
+    large = tiles.tiled(room, 5 * COUNT // 2)
+    assert large.count == 5 * COUNT // 2
+    assert np.array_equal(large.means[:COUNT], room.means)
+    assert np.array_equal(large.sh[:COUNT], room.sh)
+    assert [n.name for n in large.cameras[:6]] == [n.name for n in room.cameras]
+    assert len(large.cameras) == 18
+    middle = [large.means[i * COUNT : (i + 1) * COUNT].mean(0) for i in range(2)]
+    assert np.linalg.norm(middle[0] - middle[1]) > 6
+    # The copy's camera sees the copy as the original's sees the original: mirrored, with other colours.
+    (seen,) = CpuRasterizer(room).render([room.cameras[0].camera])
+    (other,) = CpuRasterizer(large).render([large.cameras[6].camera])
+    assert np.abs(seen.median_depth - other.median_depth[:, ::-1]).mean() < 0.02
+    assert np.abs(seen.rgb - other.rgb[:, ::-1]).mean() > 0.02
+
+
+def test_other_scenes_are_put_around(room: GaussianScene) -> None:
+    small = replace(synthetic_room(1000, sh_degree=1), cameras=())
+    large = tiles.tiled(room, COUNT + 1500, [replace(small, means=small.means * np.float32(0.1))])
+    assert large.count == COUNT + 1500
+    assert large.sh_degree == 1
+    spans = np.ptp(large.means[COUNT : COUNT + 1000], axis=0)
+    assert spans == pytest.approx(np.ptp(room.means, axis=0), rel=0.05)  # as large as the scene in the middle
+    with pytest.raises(ValueError, match="more than"):
+        tiles.tiled(room, 10)
+
+
+def test_thinned_keeps_what_is_seen(room: GaussianScene) -> None:
+    rasterizer = CpuRasterizer(room)
+    half = tiles.thinned(room, COUNT // 2, rasterizer)
+    assert half.count == COUNT // 2
+    (whole,), (part,) = (r.render([room.cameras[0].camera]) for r in (rasterizer, CpuRasterizer(half)))
+    assert np.abs(whole.rgb - part.rgb).mean() < 0.03
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_a_written_folder_is_the_scene(room: GaussianScene, tmp_path: Path, compressed: bool) -> None:
+    file = tiles.write_folder(room, tmp_path / "out", tmp_path, cameras=not compressed, compressed=compressed)
+    scene = load_scene(tmp_path / "out")
+    assert scene.count == COUNT
+    assert len(scene.cameras) == (0 if compressed else 6)
+    if compressed:
+        assert file.stat().st_size < 0.4 * 4 * 59 * COUNT
+    else:
+        assert np.allclose(scene.means, room.means)
+        assert np.allclose(scene.sh, room.sh, atol=1e-6)
+        for a, b in zip(scene.cameras, room.cameras, strict=True):
+            assert np.allclose(a.camera.pose.world_from_camera, b.camera.pose.world_from_camera)
+            assert a.camera.intrinsics == b.camera.intrinsics
