@@ -161,7 +161,8 @@ class _Sight:
 def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iterator[Iterator[IterationRecord]]:
     """The ways to look for the photo, cheapest first."""
     index: ViewIndex = tools.prepared
-    sight = _Sight(_same_scale_px(query, index))
+    # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
+    sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
     words = vlad(sight.features(query, tools).descriptors, index.words)
     yield _search("retrieve", sight, index.vectors @ words, query, tools, options)
     sight, scores = _turned_sight(sight, query, tools)
