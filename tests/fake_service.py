@@ -164,6 +164,7 @@ class FakeJob:
             id=self.id,
             state="succeeded" if result else "running",
             scene="ball",
+            scene_asked="ball",
             estimator="view_index",
             attempt=1,
             created=self.created,
