@@ -587,7 +587,8 @@ class TestColmap:
         folder = colmap_folder(tmp_path, kind)
         images = folder / "sparse" / "0" / f"images.{kind}"
         whole = images.read_bytes()
-        broken = [whole[: len(whole) // 2], b"\xff" * 80]
+        # Within the first photo's line: how long the lines are depends on the last digits of this machine's cosine.
+        broken = [whole[:60], b"\xff" * 80]
         if kind == "bin":
             broken += [whole[:3], struct.pack("<Q", 2**60) + whole[8:], whole[:-1]]
             broken += [whole[:80].replace(b"b.jpg\0", b"b.jpgx") + b"x" * 50]
