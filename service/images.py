@@ -18,22 +18,21 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
-from service.errors import InvalidImage, InvalidIntrinsics
+from service.errors import InvalidImage
+from service.intrinsics import require_size, undistorted
 from service.types import Intrinsics, Pose, Query
 
 MAX_PIXELS = 64 * 1024 * 1024
@@ -50,13 +49,6 @@ MIN_SIDE = 32
 """Of `Query.rgb`; the features need more anyway."""
 GUESSED_FOCAL = 0.78
 """In long sides; see the module's docstring."""
-
-DISTORTION_COUNTS = {
-    "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8,
-    "SIMPLE_RADIAL_FISHEYE": 1, "RADIAL_FISHEYE": 2, "OPENCV_FISHEYE": 4,
-}  # fmt: skip
-"""COLMAP's camera models -> number of parameters after focal lengths and principal point."""
-ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before we
 # check.
@@ -127,7 +119,7 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
     """Find out about the camera, and take its distortion out."""
     warnings = list(decoded.warnings)
     if intrinsics is not None:
-        _require_size(intrinsics, decoded.width, decoded.height)
+        require_size(intrinsics, decoded.width, decoded.height)
         source = "given"
     else:
         source = "exif" if focal_mm else "guessed"
@@ -177,106 +169,6 @@ def photo_size(data: bytes) -> tuple[int, int]:
     _, photo = _open(data, header_only=True)
     transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
-
-
-def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
-    """Parse `{width, height, fx, fy, cx, cy, model?, distortion?, trust?}`. Raises InvalidIntrinsics with the field.
-
-    `distortion` has COLMAP's parameters of `model` after the focal lengths and the principal point.
-    """
-    required, optional = ("width", "height", "fx", "fy", "cx", "cy"), ("model", "distortion", "trust")
-    unknown = [key for key in mapping if key not in (*required, *optional)]
-    if unknown:
-        known = ", ".join((*required, *optional))
-        raise InvalidIntrinsics(f"unknown; known: {known}.", where=str(unknown[0])[:40])
-    for key in required:
-        if key not in mapping:
-            raise InvalidIntrinsics("is missing.", where=key)
-    values = {key: _number(mapping[key], key) for key in required}
-    for key in ("width", "height"):
-        if values[key] != int(values[key]):
-            raise InvalidIntrinsics(f"must be a whole number of pixels, is {values[key]}.", where=key)
-    model = mapping.get("model", "PINHOLE")
-    if not isinstance(model, str) or model not in DISTORTION_COUNTS:
-        raise InvalidIntrinsics(
-            f"there is no camera model {str(model)[:40]!r}; known: {', '.join(DISTORTION_COUNTS)}.",
-            where="model",
-        )
-    distortion = mapping.get("distortion", ())
-    if not isinstance(distortion, list | tuple) or len(distortion) != DISTORTION_COUNTS[model]:
-        count = len(distortion) if isinstance(distortion, list | tuple) else "no list"
-        raise InvalidIntrinsics(
-            f"{model} has {DISTORTION_COUNTS[model]} parameters after the principal point, here are {count}.",
-            where="distortion",
-        )
-    if model in ONE_FOCAL and values["fx"] != values["fy"]:
-        raise InvalidIntrinsics(f"{model} has one focal length: fy must equal fx.", where="fy")
-    return Intrinsics(
-        width=int(values["width"]),
-        height=int(values["height"]),
-        **{key: values[key] for key in required[2:]},
-        model=model,
-        distortion=tuple(_number(v, "distortion") for v in distortion),
-        trust=mapping.get("trust", "exact"),
-    )
-
-
-def undistorted(
-    image: UInt8[np.ndarray, "h w *channels"], intrinsics: Intrinsics
-) -> tuple[UInt8[np.ndarray, "h w *channels"], Intrinsics, Bool[np.ndarray, "h w"] | None]:
-    """Return the image as a pinhole of the same focal length and size sees it, black where it sees more.
-
-    The last value says where it does not; None if nothing had to be done.
-    """
-    pinhole = replace(intrinsics, model="PINHOLE", distortion=())
-    if "FISHEYE" not in intrinsics.model and not any(intrinsics.distortion):
-        return image, pinhole, None
-    x, y, seen = _undistortion(intrinsics)
-    straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    straight[~seen] = 0
-    return straight, pinhole, seen
-
-
-@lru_cache(maxsize=4)
-def _undistortion(
-    intrinsics: Intrinsics,
-) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return where each pixel of the pinhole lies in the photo, and whether it does; made once for a camera."""
-    pinhole, fisheye = replace(intrinsics, model="PINHOLE", distortion=()), "FISHEYE" in intrinsics.model
-    coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
-    coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
-    # cv2 counts pixels from the centre of the first one.
-    matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
-    make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
-    size = (pinhole.width, pinhole.height)
-    x, y = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
-    inside = (x > -0.5) & (y > -0.5) & (x < pinhole.width - 0.5) & (y < pinhole.height - 0.5)
-    return x, y, inside & ~_folded(pinhole, coefficients, fisheye)
-
-
-def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels beyond the radius at which the distortion's polynomial turns back.
-
-    There it would show the inside of the image once more.
-    """
-    x = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
-    y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
-    radius = np.linspace(0.0, np.hypot(np.abs(x).max(), np.abs(y).max()), 1025)
-    turns = np.flatnonzero(np.diff((_fisheye if fisheye else _radial)(radius, coefficients)) <= 0)
-    reach = radius[turns[0]] if len(turns) else np.inf
-    return x[None] ** 2 + y[:, None] ** 2 > reach**2
-
-
-def _radial(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
-    """The distorted radius, tangential terms apart."""
-    r2 = r * r
-    return r * (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-
-
-def _fisheye(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "n"]:
-    theta = np.arctan(r)
-    t2 = theta * theta
-    return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -480,32 +372,6 @@ def _exif(photo: Image.Image) -> Image.Exif:
     except Exception as error:
         log.info("EXIF ignored: %s", _short(error))
         return Image.Exif()
-
-
-def _require_size(given: Intrinsics, width: int, height: int) -> None:
-    if (given.width, given.height) == (width, height):
-        return
-    expected = f"they are for {given.width} x {given.height}, the upright photo has {width} x {height}"
-    if (given.width, given.height) == (height, width):
-        raise InvalidIntrinsics(
-            f"width and height are swapped: {expected}.",
-            where="intrinsics",
-            hint="They refer to the photo after its EXIF orientation was applied: swap fx, fy, cx, cy too.",
-        )
-    same_shape = abs(given.width * height - given.height * width) <= 0.01 * given.width * height
-    raise InvalidIntrinsics(
-        f"{expected}.",
-        where="intrinsics",
-        hint="Scale all of them by the ratio of the widths." if same_shape else "The photo may have been cropped.",
-    )
-
-
-def _number(value: Any, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InvalidIntrinsics(f"must be a number, is {str(value)[:40]!r}.", where=where)
-    if not abs(value) < 1e12:  # also nan
-        raise InvalidIntrinsics(f"must be a finite number, is {str(value)[:40]}.", where=where)
-    return float(value)
 
 
 def _short(error: Exception) -> str:

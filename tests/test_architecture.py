@@ -19,7 +19,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Bottom to top: a part imports from the lines below its own, and from itself.
 LAYERS = [
     {"types", "errors", "plugins", "logs", "heic_child"},
-    {"interfaces", "images", "video", "geometry", "jit"},
+    {"interfaces", "images", "intrinsics", "video", "geometry", "jit"},
     {"scene_formats", "render", "matchers", "pose"},
     {"estimators"},
     {"localize"},
@@ -29,14 +29,21 @@ LAYERS = [
     {"serve"},
     {"__main__"},
 ]
-FOUNDATIONS = {("types", "errors"), ("plugins", "errors"), ("images", "geometry")}
+FOUNDATIONS = {("types", "errors"), ("plugins", "errors"), ("images", "geometry"), ("images", "intrinsics")}
 """Within a line: only these."""
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
 WRAPPED = {
     "PIL": {"service/images.py"},
     "pi_heif": {"service/heic_child.py"},
-    "cv2": {"service/images.py", "service/video.py", "service/matchers", "service/pose", "viewer/draw.py"},
+    "cv2": {
+        "service/images.py",
+        "service/intrinsics.py",
+        "service/video.py",
+        "service/matchers",
+        "service/pose",
+        "viewer/draw.py",
+    },
     "numba": {"service/jit.py", "service/render/simd.py"},
     "llvmlite": {"service/render/simd.py"},
     "torch": {"service/matchers/xfeat.py", "service/matchers/networks.py", "service/render/gsplat_cuda.py"},

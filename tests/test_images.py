@@ -15,7 +15,8 @@ from PIL import ExifTags, Image, ImageOps
 
 from service import images
 from service.errors import InvalidImage, InvalidIntrinsics
-from service.images import intrinsics_from, photo_size, read_query, undistorted
+from service.images import photo_size, read_query
+from service.intrinsics import intrinsics_from, undistorted
 from service.types import Intrinsics, Pose
 
 DATA = Path(__file__).parent / "data"

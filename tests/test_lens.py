@@ -9,7 +9,7 @@ import pytest
 
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
-from service.images import intrinsics_from
+from service.intrinsics import intrinsics_from
 from service.pose import alignment
 from service.pose.alignment import align, evidence
 from service.pose.focal import focal_resection, linearized

@@ -14,7 +14,7 @@ import numpy as np
 from service.api.convert import pose_out
 from service.api.schemas import FrameOut, IntrinsicsOut, PoseOut, Result
 from service.errors import NoGeoAnchor
-from service.images import ONE_FOCAL
+from service.intrinsics import ONE_FOCAL
 from service.types import Pose, Status
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "geopose"]

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from service.api.scenes import Entry
 from service.api.schemas import GeoPose, Model, Result
 from service.errors import InvalidIntrinsics, InvalidRequest, NoGeoAnchor
-from service.images import DISTORTION_COUNTS, ONE_FOCAL
+from service.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
 from service.types import GeoAnchor
 
 _EARTH_M = 6_371_000.0

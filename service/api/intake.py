@@ -32,7 +32,8 @@ from service.errors import (
 )
 from service.estimators import ESTIMATORS
 from service.geometry import rotation_from_quat
-from service.images import intrinsics_from, read_query
+from service.images import read_query
+from service.intrinsics import intrinsics_from
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 from service.types import Intrinsics, Pose, Query, StageTiming
 
