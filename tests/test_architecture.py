@@ -18,7 +18,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 
 # Bottom to top: a part imports from the lines below its own, and from itself.
 LAYERS = [
-    {"types", "errors", "plugins", "logs", "heic_child"},
+    {"types", "errors", "plugins", "logs", "heic_child", "video_child"},
     {"interfaces", "images", "intrinsics", "video", "geometry", "jit"},
     {"scene_formats", "render", "matchers", "pose"},
     {"estimators"},
@@ -39,7 +39,7 @@ WRAPPED = {
     "cv2": {
         "service/images.py",
         "service/intrinsics.py",
-        "service/video.py",
+        "service/video_child.py",
         "service/matchers",
         "service/pose",
         "viewer/draw.py",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import tempfile
+import threading
 from pathlib import Path
 
 import cv2
@@ -42,8 +42,8 @@ def written(ext: str, codec: str, count: int, size: tuple[int, int] = (128, 64),
 @pytest.mark.parametrize(("ext", "codec"), KINDS)
 def test_frames_come_in_order_with_their_times_and_colours(ext, codec):
     data = written(ext, codec, 8)
-    assert is_video(data[:12])
-    frames = list(read_video(io.BytesIO(data)))
+    assert is_video(data)
+    frames = list(read_video(data))
     assert [frame.number for frame in frames] == list(range(8))
     assert [frame.time_s for frame in frames] == pytest.approx([i / 25 for i in range(8)], abs=2e-3)
     for frame in frames:
@@ -53,7 +53,7 @@ def test_frames_come_in_order_with_their_times_and_colours(ext, codec):
 
 
 def test_every_nth_frame_keeps_number_and_time():
-    frames = list(read_video(io.BytesIO(written("mp4", "mp4v", 8, rate=10.0)), every=3))
+    frames = list(read_video(written("mp4", "mp4v", 8, rate=10.0), every=3))
     assert [frame.number for frame in frames] == [0, 3, 6]
     assert [frame.time_s for frame in frames] == pytest.approx([0.0, 0.3, 0.6])
     assert np.median(np.abs(frames[2].rgb.astype(int) - picture(6, (128, 64)))) < 8
@@ -65,12 +65,12 @@ def test_a_video_that_was_taken_upright_comes_upright():
     matrix = data.index(b"tkhd") + 4 + 4 + 36
     turned = (0, 0x10000, 0, -0x10000, 0, 0, 64 << 16, 0, 0x40000000)  # by 90 degrees clockwise
     data[matrix : matrix + 36] = struct.pack(">9i", *turned)
-    (first, _) = read_video(io.BytesIO(bytes(data)))
+    (first, _) = read_video(bytes(data))
     assert np.median(np.abs(first.rgb.astype(int) - np.rot90(picture(0, (128, 64)), -1))) < 8
 
 
 def test_the_number_of_frames_is_told_beforehand():
-    assert frame_count(io.BytesIO(written("mp4", "mp4v", 5))) == 5
+    assert frame_count(written("mp4", "mp4v", 5)) == 5
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_the_number_of_frames_is_told_beforehand():
 )
 def test_what_is_no_video_is_refused(data):
     with pytest.raises(InvalidImage):
-        list(read_video(io.BytesIO(data)))
+        list(read_video(data))
 
 
 @pytest.mark.parametrize(("ext", "codec"), KINDS)
@@ -99,7 +99,7 @@ def test_a_damaged_video_gives_the_frames_before_the_damage_or_an_error(ext, cod
         broken = bytearray(data[: int(len(data) * cut)])
         for spoilt in (broken, broken[: len(broken) // 2] + rng.bytes(len(broken) // 2)):
             try:
-                frames = list(read_video(io.BytesIO(bytes(spoilt))))
+                frames = list(read_video(bytes(spoilt)))
             except InvalidImage:
                 continue
             assert 1 <= len(frames) <= 8
@@ -108,4 +108,37 @@ def test_a_damaged_video_gives_the_frames_before_the_damage_or_an_error(ext, cod
 def test_large_frames_are_refused_before_they_are_decoded(monkeypatch):
     monkeypatch.setattr(video, "MAX_FRAME_PIXELS", 128 * 64 - 1)
     with pytest.raises(InvalidImage, match="128 x 64"):
-        next(read_video(io.BytesIO(written("mp4", "mp4v", 2))))
+        next(read_video(written("mp4", "mp4v", 2)))
+
+
+def child_that(folder: Path, does: str, before: str) -> Path:
+    """The decoder's program with a line more."""
+    whole = video._CHILD.read_text()
+    assert whole.count(before) == 1
+    indent = before[: len(before) - len(before.lstrip())]
+    child = folder / "child.py"
+    child.write_text(whole.replace(before, f"{indent}import os, time\n{indent}{does}\n{before}"))
+    return child
+
+
+@pytest.mark.parametrize("does", ["os.kill(os.getpid(), 11)", "time.sleep(60)"], ids=["crash", "hang"])
+def test_a_decoder_that_crashes_or_hangs_is_a_broken_video(monkeypatch, tmp_path, does):
+    monkeypatch.setattr(video, "_FRAME_S", 1.0)
+    monkeypatch.setattr(video, "_CHILD", child_that(tmp_path, does, "    video = _opened"))
+    with pytest.raises(InvalidImage, match="crashed or took too long"):
+        list(read_video(written("mp4", "mp4v", 8)))
+
+
+def test_a_crash_on_the_way_leaves_the_frames_before_it(monkeypatch, tmp_path):
+    crash = "if number == 3: os.kill(os.getpid(), 11)"
+    monkeypatch.setattr(video, "_CHILD", child_that(tmp_path, crash, "        if number % every == 0:"))
+    assert [frame.number for frame in read_video(written("mp4", "mp4v", 8))] == [0, 1, 2]
+
+
+def test_a_reader_that_stops_early_leaves_no_process():
+    frames = read_video(written("mp4", "mp4v", 8))
+    next(frames)
+    children = Path(f"/proc/self/task/{threading.get_native_id()}/children")
+    assert len(children.read_text().split()) == 1
+    frames.close()
+    assert not children.read_text().split()

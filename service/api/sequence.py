@@ -42,7 +42,7 @@ def is_packed(data: bytes) -> bool:
 
 def is_sequence(data: bytes) -> bool:
     """Return whether it is what `packed` makes, or a video."""
-    return is_packed(data) or is_video(data[:12])
+    return is_packed(data) or is_video(data)
 
 
 def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
@@ -56,10 +56,10 @@ def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
 
 def check_sequence(data: bytes, reading: Reading) -> None:
     """Refuse what the heads of the files show to be wrong. Raises InvalidImage, InvalidRequest."""
-    if is_video(data[:12]):
+    if is_video(data):
         if reading.times_s is not None:
             raise InvalidRequest("a video tells its times itself.", where="times_s")
-        _check_count(-(-frame_count(io.BytesIO(data)) // reading.every), reading)
+        _check_count(-(-frame_count(data) // reading.every), reading)
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
@@ -93,8 +93,8 @@ def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, Non
 
 def _sources(data: bytes, reading: Reading) -> Iterator[tuple[int, str, float, bytes | UInt8[np.ndarray, "h w 3"]]]:
     """Yield number, name, time, and the file or the decoded frame."""
-    if is_video(data[:12]):
-        for frame in read_video(io.BytesIO(data), reading.every):
+    if is_video(data):
+        for frame in read_video(data, reading.every):
             yield frame.number, f"frame {frame.number}", frame.time_s, frame.rgb
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
