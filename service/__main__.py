@@ -249,10 +249,12 @@ def bench_localize(
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
+    misses: Annotated[Path | None, typer.Option(help="A folder for a picture of each miss at 1 deg, 0.01.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
 ) -> None:
     """Localize a scene's test photos and compare with the truth."""
     from service.api.intake import options_from
+    from service.bench import misses as pictures
     from service.bench.localize import Budget, run
     from service.localize import DEFAULT_MATCHER
 
@@ -276,6 +278,7 @@ def bench_localize(
             budget=Budget(budget_s, budget_renders),
             progress=_counter(progress, "photos"),
             cache_dir=_settings({}).cache_dir,
+            on_miss=pictures.kept_in(misses) if misses else None,
         )
     _write_json(json_file, outcome)
     for name, value in outcome.items():

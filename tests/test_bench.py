@@ -14,6 +14,7 @@ from PIL import Image
 from service.bench import localize as bench
 from service.bench import render as render_bench
 from service.bench.metrics import Units, units_of
+from service.bench.misses import kept_in
 from service.bench.modifications import MODIFICATIONS, Shot, modified
 from service.bench.queries import find_photos, sent
 from service.bench.starts import KINDS, start_pose
@@ -204,6 +205,27 @@ class TestRun:
         assert [line["photo"] for line in outcome["per_query"]] == ["images/0.png", "images/5.png"]
         assert steps == [(1, 2), (2, 2)]
         assert all(query.prior is None for query, _ in runs["queries"])
+
+    def test_a_miss_is_drawn_and_blamed(self, tmp_path, runs, monkeypatch):
+        """The fake scene looks like stripes which tell where they were seen from; the photo has the answer's."""
+        far = moved(poses()[5], np.array([0, 0, 0, 1.0, 0, 0]))
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+
+        def stripes(_, cameras):
+            row = [np.arange(c.intrinsics.width) * (0.3 + abs(c.pose.world_from_camera[0, 3])) for c in cameras]
+            size = [(c.intrinsics.height, c.intrinsics.width, 3) for c in cameras]
+            rgb = [np.broadcast_to(0.5 + 0.4 * np.sin(r)[None, :, None], s) for r, s in zip(row, size, strict=True)]
+            return [Frame(r.astype(np.float32), *3 * (np.ones(r.shape[:2], np.float32),)) for r in rgb]
+
+        monkeypatch.setattr(FakeRasterizer, "render", stripes)
+        (seen,) = stripes(None, [Camera(LENS, far)])
+        (folder / "images" / "5.png").write_bytes(encode_image(0.5 * seen.rgb + 0.2, "png"))
+        runs["answer"] = lambda query, index: [poses()[0], poses()[0], far][index - 1]
+        outcome = bench.run(folder, on_miss=kept_in(tmp_path / "misses"))
+        right, wrong = outcome["per_query"]
+        assert "picture" not in right
+        assert [p.name for p in (tmp_path / "misses").iterdir()] == [wrong["picture"]] == ["s-images_5.png-0.jpg"]
+        assert wrong["residual_at_answer"] < 0.003 < 0.05 < wrong["residual_at_truth"]  # 8 bits; seen: 0.001, 0.13
 
     def test_trials_have_starts_of_their_own_the_same_every_time(self, tmp_path, runs):
         folder = folder_of(tmp_path / "s", "nerfstudio")
