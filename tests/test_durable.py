@@ -137,6 +137,11 @@ def test_a_repeated_request_is_the_same_job(client, stepping):
     assert len(client.get("/jobs").json()["jobs"]) == 2
 
 
+def test_an_empty_key_is_no_key(client, stepping):
+    for _ in range(2):  # the second one would have met the first one's
+        assert_problem(keyed(client, "", seed="1"), 400, "invalid_request", "header.idempotency-key")
+
+
 def test_a_repeated_request_is_answered_by_a_full_service_too(client, stepping):
     held = post(client, prefer="", options={"hold": True}).headers["location"]
     until(lambda: client.get(held).json()["state"] == "running")

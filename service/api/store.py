@@ -374,7 +374,7 @@ def _select(connection: sqlite3.Connection, where: str, *values: object) -> list
 
 
 def _repeated(connection: sqlite3.Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
-    rows = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key else []
+    rows = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key is not None else []
     known = _job(rows[0]) if rows else None
     if known and known.digest != digest:
         raise IdempotencyConflict(

@@ -83,7 +83,11 @@ async def localize_photo(
     prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
     idempotency_key: Annotated[
         str | None,
-        Header(max_length=200, description="Send a request again with the same key: it is the same job, not a second"),
+        Header(
+            min_length=1,
+            max_length=200,
+            description="Send a request again with the same key: it is the same job, not a second",
+        ),
     ] = None,
 ) -> JobOut:
     """Find where a photo was taken. What is wrong with the request is told at once; the search is a job.
