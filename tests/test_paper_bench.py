@@ -65,9 +65,9 @@ def test_every_query_is_one_line(scene, monkeypatch):
     lines = runs.run(asked_for(scene), lambda progress: shown.append((sum(progress.done.values()), progress.eta_s)))
     stored = [json.loads(line) for line in (scene.parent / "out" / "results.jsonl").read_text().splitlines()]
     assert stored == json.loads(json.dumps(lines))
-    # 2 starts x (6 + 6 + 2) and, without a start, each of the two photos once
-    assert len(lines) == len(asked) == len(set(keys(lines))) == 2 * 14 + 2
-    assert [done for done, _ in shown] == list(range(1, 31))
+    # 2 starts x (6 + 6 + 2) and, without a start, each of the two photos once by two methods
+    assert len(lines) == len(asked) == len(set(keys(lines))) == 2 * 14 + 4
+    assert [done for done, _ in shown] == list(range(1, 33))
     assert shown[-1][1] == 0
     first = lines[0]
     assert (first["method"], first["protocol"], first["profile"]) == ("view_index", "hard", "")
@@ -104,7 +104,7 @@ def test_it_goes_on_where_it_was_and_takes_more(scene, monkeypatch):
     assert len(asked) == len(few)
     more = runs.run(asked_for(scene))
     assert set(keys(few)) < set(keys(more))
-    assert len(asked) == len(more) == len(set(keys(more))) == 30
+    assert len(asked) == len(more) == len(set(keys(more))) == 32
     shown = []
     runs.run(
         asked_for(scene, trials=3, cells=plan.chosen(protocols=("random",), methods=("view_index",))), shown.append
@@ -113,7 +113,7 @@ def test_it_goes_on_where_it_was_and_takes_more(scene, monkeypatch):
         asked_for(scene, trials=2, cells=plan.cells()[:1], scenes={"t": (scene, None), "s": (scene, None)}),
         shown.append,
     )
-    assert [sum(shown[i].total.values()) for i in (0, -1)] == [3, 4]
+    assert [sum(shown[i].total.values()) for i in (0, -1)] == [4, 4]
     assert sum(shown[-1].done.values()) == 4
     assert shown[-1].eta_s == 0
 
@@ -135,14 +135,14 @@ def test_killed_it_loses_and_repeats_nothing(scene, monkeypatch):
     process.send_signal(signal.SIGKILL)
     process.wait()
     before = file.read_bytes()
-    assert 4 <= before.count(b"\n") < 30
+    assert 4 <= before.count(b"\n") < 32
     with file.open("ab") as stream:
         stream.write(b'{"scene": "s", "cell": "table2/mc_')  # what a kill within a write leaves
     asked = fake_answers(monkeypatch.setattr)
     lines = runs.run(asked_for(scene))
     assert file.read_bytes().startswith(before[: before.rfind(b"\n") + 1])
-    assert len(keys(lines)) == len(set(keys(lines))) == 30
-    assert len(asked) == 30 - before.count(b"\n")
+    assert len(keys(lines)) == len(set(keys(lines))) == 32
+    assert len(asked) == 32 - before.count(b"\n")
     fresh = runs.run(asked_for(scene, out=scene.parent / "other"))
     assert set(keys(lines)) == set(keys(fresh))
     starts = [{k: line["start_world_from_camera"] for k, line in zip(keys(x), x, strict=True)} for x in (lines, fresh)]

@@ -83,7 +83,7 @@ def _losses(lines: Sequence[Line]) -> Iterator[Claim | None]:
 
 def _default(lines: Sequence[Line]) -> Iterator[Claim | None]:
     """The default against the paper's method, on the queries that both answered."""
-    for protocol in ("hard", "easy"):
+    for protocol in ("hard", "easy", "none"):
         chosen = [line for line in lines if line["study"] == "table2" and line["protocol"] == protocol]
         for scene in dict.fromkeys(line["scene"] for line in chosen):
             both = _common([line for line in chosen if line["scene"] == scene], "view_index", "mc_do")
