@@ -239,10 +239,10 @@ class TestTables:
     def test_success_beside_what_was_published(self):
         table = self.named("table2_hard")
         assert table.header == ("scene", "bound", "", "view_index", "mc_do", "icomma*")
-        assert table.rows[0] == ("chair", "5 deg, 0.05", "here", "1/1 1", "2/3 .67", "0/1 .00")
+        assert table.rows[0] == ("chair", "5 deg, 0.05", "here", "1/1 = 1.00", "2/3 = .67", "0/1 = .00")
         assert table.rows[1] == ("chair", "5 deg, 0.05", "published", "", ".98", ".72")
-        assert table.rows[2][4] == "1/3 .33"
-        assert table.rows[4] == ("mine", "5 deg, 0.05", "here", "", "0/1 .00", "")
+        assert table.rows[2][4] == "1/3 = .33"
+        assert table.rows[4] == ("mine", "5 deg, 0.05", "here", "", "0/1 = .00", "")
         assert len(table.rows) == 6  # nothing was published of 'mine'
 
     def test_mean_start_errors_stand_above_every_table(self):
@@ -264,13 +264,13 @@ class TestTables:
 
     def test_stages_and_times(self):
         assert self.named("section_c").rows[0][4:7] == ("2.00", "0.00", "0.50")
-        assert self.named("section_h").rows[0][:4] == ("+-60 deg", "1/1 1", "3.00", "3.00")
+        assert self.named("section_h").rows[0][:4] == ("+-60 deg", "1/1 = 1.00", "3.00", "3.00")
         assert ("view_index", "hard", "chair", "1", "0.20", "0.20", "4.00", "4.00", "200") in self.named("times").rows
 
     def test_ablations(self):
         rows = {row[0]: row[1:] for row in self.named("table5").rows}
-        assert rows["mc"] == ("1/1 1", "1/1 1", "1/1 1", "1/1 1", ".72", ".68", ".64", ".60")
-        assert rows["do"][0] == "0/1 .00"
+        assert rows["mc"] == ("1/1 = 1.00", "1/1 = 1.00", "1/1 = 1.00", "1/1 = 1.00", ".72", ".68", ".64", ".60")
+        assert rows["do"][0] == "0/1 = .00"
         losses = [row for row in self.named("table1").rows if row[0] == "< 0.05 units"]
         assert [row[1] for row in losses] == list(plan.LOSSES)
         assert losses[0][-4:] == (".89", ".97", ".93", ".93")

@@ -105,15 +105,15 @@ def _of(lines: Sequence[Line], **wanted: str) -> list[Line]:
 
 
 def _share(lines: Sequence[Line], holds: Callable[[Line], bool]) -> str:
-    """'38/40 .95'."""
+    """'38/40 = .95'."""
     if not lines:
         return ""
     count = sum(map(holds, lines))
-    return f"{count}/{len(lines)} {_fraction(count / len(lines))}"
+    return f"{count}/{len(lines)} = {_fraction(count / len(lines))}"
 
 
 def _fraction(value: float) -> str:
-    return f"{value:.2f}".removeprefix("0") if value < 1 else "1"
+    return f"{value:.2f}".removeprefix("0")
 
 
 def _named(methods: Sequence[str], lines: Sequence[Line]) -> tuple[str, ...]:
