@@ -10,6 +10,7 @@ import numpy as np
 
 from service.bench.paper.tables import Line
 
+STARTS_APART = ("easy", "hard")
 REFINING = ("l1", "blur", "relative", "l2", "feature", "corner")
 
 
@@ -58,6 +59,8 @@ def _methods(lines: Sequence[Line]) -> Iterator[Claim | None]:
         yield _ahead(f"Table 2: {better} is ahead of {worse}", *pair)
     pair = [(n, _within(_common(shared, "mc_do", "mc_do_gradient"), method=n)) for n in ("mc_do", "mc_do_gradient")]
     yield _ahead("Ours: DO by least squares is ahead of DO by gradient", *pair)
+    starts = [(start, _within(lines, study="table2", method="inerf_dagger", protocol=start)) for start in STARTS_APART]
+    yield _ahead("Section G: inerf_dagger does better from small errors than from large ones", *starts)
 
 
 def _common(lines: Sequence[Line], *methods: str) -> list[Line]:
