@@ -20,7 +20,7 @@ from service.pose.losses import LOSSES
 SLOW = ("inerf", "inerf_dagger", "pnerf", "icomma")
 """Methods that get few trials."""
 STEPS_OF_TABLE_1 = 120
-"""Of the descent. Its rates fall: 60 steps go no further than 1.4 degrees about an axis, and a near start is up to 2."""
+"""Of the descent. Its rates fall: in 60 steps they go 1.4 degrees about an axis; near starts are up to 2 off."""
 IMAGES_OF_TABLE_5 = 5
 """Of each scene; with 40 trials a cell they have ten starts each, as published, and five where stages are left out."""
 STEP_CURVES = ("icomma", "inerf_dagger", "mc_do", "view_index")
