@@ -75,13 +75,18 @@ def _common(lines: Sequence[Line], *methods: str) -> list[Line]:
 
 def _losses(lines: Sequence[Line]) -> Iterator[Claim | None]:
     near = [line for line in lines if line["study"] == "table1"]
-    counts = {loss: _within(near, method=f"mc_do:{loss}") for loss in REFINING}
-    if all(n for _, n in counts.values()):
-        ranked = sorted(counts, key=lambda loss: -counts[loss][0] / counts[loss][1])
-        told = ", ".join(f"{loss} {counts[loss][0]}/{counts[loss][1]}" for loss in ranked)
-        best = counts[ranked[0]][0] / counts[ranked[0]][1]
-        holds = counts["l1"][0] / counts["l1"][1] >= best
-        yield Claim("Table 1: L1 is the best loss near the optimum (or as good as any)", told, holds)
+    of_loss = {loss: [line for line in near if line["method"] == f"mc_do:{loss}"] for loss in REFINING}
+    if not all(of_loss.values()):
+        return
+    shares = {loss: _within(each) for loss, each in of_loss.items()}
+    ranked = sorted(shares, key=lambda loss: -shares[loss][0] / shares[loss][1])
+    told = ", ".join(f"{loss} {shares[loss][0]}/{shares[loss][1]}" for loss in ranked)
+    best, ours = (shares[loss][0] / shares[loss][1] for loss in (ranked[0], "l1"))
+    yield Claim("Table 1: L1 succeeds as often as any loss near the optimum", told, ours >= best)
+    errors = {loss: float(np.median([line["translation_units"] for line in each])) for loss, each in of_loss.items()}
+    ranked = sorted(errors, key=lambda loss: errors[loss])
+    told = ", ".join(f"{loss} {errors[loss]:.2g}" for loss in ranked) + " units"
+    yield Claim("Ours: L1 ends nearest of all losses, by the median error", told, ranked[0] == "l1")
 
 
 def _default(lines: Sequence[Line]) -> Iterator[Claim | None]:
