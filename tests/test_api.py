@@ -33,6 +33,7 @@ from api_server import (
 from PIL import Image
 
 import service.estimators
+from service.api import documents
 from service.api.app import create_app
 from service.api.settings import Settings
 from service.localize import LoadedScene
@@ -615,6 +616,12 @@ def test_capabilities_tell_what_can_be_chosen(shared):
     assert {"xfeat", "sift"} <= {m["name"] for m in told["matchers"]}
     assert {"ply", "splat", "compressed_ply"} <= {f["name"] for f in told["scene_formats"]}
     assert all(e["available"] == (e["reason"] is None) for e in told["estimators"])
+
+
+@pytest.mark.parametrize("name", ["xfeat", "sift"])
+def test_the_matcher_that_is_set_is_the_default(name):
+    told = documents.capabilities(settings(estimator="view_index", matcher=name))
+    assert [matcher.name for matcher in told.matchers if matcher.default] == [name]
 
 
 def test_the_start_page_and_the_docs_are_there(shared):

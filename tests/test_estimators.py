@@ -12,6 +12,7 @@ import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service.anywhere import localize_anywhere
+from service.api.warmup import warm_up
 from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
 from service.geometry import moved, pose_distance
@@ -415,3 +416,11 @@ def _to_nearest(candidates: Candidates) -> list[float]:
     """Degrees from each pose to the one of the others that is turned most like it."""
     poses = [Pose(matrix) for matrix in candidates.world_from_camera]
     return [min(pose_distance(a, b)[0] for b in poses if b is not a) for a in poses]
+
+
+@pytest.mark.parametrize("name", ["inerf", "icomma"])
+def test_a_method_that_needs_a_prior_warms_up(room, name, caplog):
+    """As a service does whose SPLATFIX_ESTIMATOR is such a method."""
+    with caplog.at_level("INFO"):
+        warm_up(room, name)
+    assert "warmed up" in caplog.text

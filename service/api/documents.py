@@ -34,7 +34,7 @@ from service.api.settings import Settings
 from service.api.store import StoredJob
 from service.errors import JobNotReady, NoPose
 from service.estimators import ESTIMATORS
-from service.localize import DEFAULT_MATCHER, choose_rasterizer
+from service.localize import choose_rasterizer
 from service.matchers import MATCHERS
 from service.plugins import PluginFolder
 from service.render import RASTERIZERS
@@ -191,7 +191,7 @@ def capabilities(settings: Settings) -> Capabilities:
             )
             for plugin in plugins(ESTIMATORS, settings.estimator)
         ],
-        matchers=plugins(MATCHERS, DEFAULT_MATCHER),
+        matchers=plugins(MATCHERS, settings.matcher),
         rasterizers=plugins(RASTERIZERS, settings.rasterizer or choose_rasterizer()[0]),
         scene_formats=plugins(SCENE_FORMATS),
         max_upload_bytes=settings.max_upload_bytes,

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import numpy as np
 
+from service.errors import InvalidPrior
 from service.geometry import look_at
 from service.localize import LoadedScene, Request, localize
 from service.types import Camera, Intrinsics, Query
 
+ENOUGH_RENDERS = 10
+"""Of a method that needs a prior: it begins at the answer, and more of the same would warm nothing."""
 _log = logging.getLogger(__name__)
 
 
@@ -18,7 +22,12 @@ def warm_up(loaded: LoadedScene, estimator: str) -> None:
     camera = overview(loaded, 512)
     frame = loaded.rasterizer.render([camera])[0]
     rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
-    estimate = localize(Query(rgb, camera.intrinsics, "given", camera.intrinsics), loaded, Request(estimator))
+    query = Query(rgb, camera.intrinsics, "given", camera.intrinsics)
+    try:
+        estimate = localize(query, loaded, Request(estimator))
+    except InvalidPrior:
+        begun = replace(query, prior=camera.pose)
+        estimate = localize(begun, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
     _log.info("scene %s: warmed up, %s", loaded.scene.info.id, estimate.verdict.status)
 
 

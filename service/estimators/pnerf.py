@@ -34,8 +34,6 @@ DECAY, DECAY_STEPS = 0.33, 256
 START_DEG, START_UNITS = 15.0, 0.3
 CHILD_DEG, CHILD_UNITS = 3.0, 0.1
 LEAST_PARENTS = 4
-REPRESENTATION = "3DGS; the supplement's pNeRF has Instant-NGP"
-"""What the bench says beside this method's figures."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 DPI, PICTURES_DPI = 110, 80
+MARGIN = 0.05
+"""About the match vectors of Figure 1, of the photo's long side."""
 GREEN, RED = "#2a9d4a", "#d1372c"
 COLOURS = {"view_index": "#1b1b1b", "mc_do": "#2f6fde", "icomma": "#d1372c", "inerf_dagger": "#e0952b"}
 
@@ -43,16 +46,22 @@ def vectors_and_paths(
 ) -> bytes:
     """Figure 1: rows of match vectors, and below them the paths of the cameras and their rotation errors."""
     columns = max(len(row) for row in rows)
-    figure = Figure(figsize=(3.1 * columns, 2.7 * (len(rows) + 1.1)), layout="constrained")
-    grid = figure.add_gridspec(len(rows) + 1, 2 * columns)
-    for r, row in enumerate(rows):
-        for c, vectors in enumerate(row):
-            _draw_vectors(figure.add_subplot(grid[r, 2 * c : 2 * c + 2]), vectors)
-    _draw_paths(figure.add_subplot(grid[-1, :columns]), paths, truth)
-    errors = figure.add_subplot(grid[-1, columns:])
+    figure = Figure(figsize=(3.1 * columns, 2.9 * (len(rows) + 1)), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(len(rows), 1))
+    grid = above.subplots(len(rows), columns, squeeze=False)
+    box = _box_of([vectors for row in rows for vectors in row])
+    for places, row in zip(grid, rows, strict=True):
+        for place, vectors in zip_longest(places, row):
+            if vectors is None:
+                place.remove()
+            else:
+                _draw_vectors(place, vectors, box)
+    track, errors = below.subplots(1, 2)
+    _draw_paths(track, paths, truth)
     for path in paths:
         errors.plot(np.arange(len(path.rotation_deg)) + 1, path.rotation_deg, label=path.name)
-    errors.set(xscale="log", yscale="log", xlabel="step", ylabel="rotation error, deg", title="(c) rotation error")
+    errors.set(xscale="log", yscale="log", xlabel="step", ylabel="rotation error, deg")
+    errors.set_title("(c) rotation error", fontsize=9)
     errors.legend(fontsize=7)
     return _png(figure)
 
@@ -94,7 +103,21 @@ def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequ
     return _png(figure)
 
 
-def _draw_vectors(place: Axes, vectors: Vectors) -> None:
+def _box_of(shown: Sequence[Vectors]) -> tuple[float, float, float, float]:
+    """Return left, right, bottom, top of what the photo shows of all matches, with a margin."""
+    ends = np.concatenate([np.concatenate([vectors.rendered_px, vectors.photo_px]) for vectors in shown])
+    height, width = shown[0].photo.shape[:2]
+    (left, top), (right, bottom) = np.percentile(ends, [0.5, 99.5], axis=0)
+    margin = MARGIN * max(width, height)
+    return (
+        max(0.0, left - margin),
+        min(float(width), right + margin),
+        min(float(height), bottom + margin),
+        max(0.0, top - margin),
+    )
+
+
+def _draw_vectors(place: Axes, vectors: Vectors, box: tuple[float, float, float, float]) -> None:
     faded = 255 - (255 - vectors.photo.astype(float)) * 0.45
     place.imshow(faded.astype(np.uint8))
     a, b = vectors.rendered_px - 0.5, vectors.photo_px - 0.5  # matplotlib has the first pixel's centre at 0
@@ -102,8 +125,7 @@ def _draw_vectors(place: Axes, vectors: Vectors) -> None:
     place.quiver(*a.T, *shift.T, angles="xy", scale_units="xy", scale=1, width=0.003, color="#3a3a3a")
     place.scatter(*a.T, s=7, facecolors="none", edgecolors=RED, linewidths=0.8)
     place.scatter(*b.T, s=7, facecolors="none", edgecolors=GREEN, linewidths=0.8)
-    height, width = vectors.photo.shape[:2]
-    place.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+    place.set(xlim=box[:2], ylim=box[2:], xticks=[], yticks=[])
     place.set_title(vectors.title, fontsize=8)
 
 
@@ -115,7 +137,7 @@ def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "
         place.plot(*(axes @ (path.positions - truth).T), marker=".", markersize=3, linewidth=1, label=path.name)
     place.plot(0, 0, marker="*", markersize=11, color=GREEN, linestyle="none", label="truth")
     place.set_aspect("equal", adjustable="datalim")
-    place.set_title("(c) the camera's path, units")
+    place.set_title("(c) the camera's path, units", fontsize=9)
     place.legend(fontsize=7)
 
 

@@ -27,12 +27,12 @@ tr.published td{color:#6a6a6a}p.note{font-size:13px;color:#444;max-width:75ch;ma
 img{max-width:100%}td.yes{color:#1d7a3a}td.no{color:#b3261e}
 """
 FIGURES = {
-    "figure1": "Figure 1: match vectors (red: rendered, green: in the photo) when the camera is only turned about the "
+    "figure1": "Figure 1: Match vectors (red: rendered, green: in the photo) when the camera is only turned about the "
     "scene's centre, or only shifted; along the steps without and with decoupling; the path of the camera. Not "
     "decoupled: icomma, which descends the distances of all matches by all six numbers at once.",
-    "figure2": "Figure 2: answers blended with the photo, start 'hard'.",
-    "figure3": "Figure 3: the same, not blended.",
-    "figure4": "Figure 4: share of the queries within 5 deg and 0.05 units after each step. A step of view_index or "
+    "figure2": "Figure 2: Answers blended with the photo, start 'hard'.",
+    "figure3": "Figure 3: The same, not blended.",
+    "figure4": "Figure 4: Share of the queries within 5 deg and 0.05 units after each step. A step of view_index or "
     "mc_do is a record of its trace (a hypothesis, a render and its matches, or a gradient), of the others a gradient.",
 }
 

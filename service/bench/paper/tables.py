@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from service.bench.paper.plan import ABLATION, MAIN, RANGES_DEG, RESOLUTIONS_PX
+from service.bench.paper.plan import ABLATION, MAIN, RANGES_DEG, RESOLUTIONS_PX, STEPS_OF_TABLE_1
 from service.pose.losses import LOSSES
 
 Line = Mapping[str, Any]
@@ -105,15 +105,15 @@ def _of(lines: Sequence[Line], **wanted: str) -> list[Line]:
 
 
 def _share(lines: Sequence[Line], holds: Callable[[Line], bool]) -> str:
-    """'38/40 .95'."""
+    """'38/40 = .95'."""
     if not lines:
         return ""
     count = sum(map(holds, lines))
-    return f"{count}/{len(lines)} {_fraction(count / len(lines))}"
+    return f"{count}/{len(lines)} = {_fraction(count / len(lines))}"
 
 
 def _fraction(value: float) -> str:
-    return f"{value:.2f}".removeprefix("0") if value < 1 else "1"
+    return f"{value:.2f}".removeprefix("0")
 
 
 def _named(methods: Sequence[str], lines: Sequence[Line]) -> tuple[str, ...]:
@@ -202,13 +202,25 @@ def _table_1(lines: Sequence[Line], scenes: Sequence[str]) -> Iterator[Table]:
                 of_all = _share([line for each in here for line in each], holds)
                 paper = tuple(_fraction(known[loss][key][g]) for g in groups) if key else ("",) * len(groups)
                 rows.append((bound, loss, *(_share(each, holds) for each in here), of_all, *paper))
+    for what, key in (("median deg", "rotation_deg"), ("median units", "translation_units")):
+        for loss in LOSSES:
+            here = [_of(chosen, method=f"mc_do:{loss}", scene=scene) for scene in scenes]
+            if any(here):
+                each = [_median(lines, key) for lines in (*here, [line for lines in here for line in lines])]
+                rows.append((what, loss, *each, *("",) * len(groups)))
     yield Table(
         "table1",
         "Table 1: losses near the optimum",
-        _notes(chosen, "The descent alone, 60 steps, from the start; the published starts are not known."),
+        _notes(
+            chosen, f"The descent alone, {STEPS_OF_TABLE_1} steps, from the start; the published starts are not known."
+        ),
         ("bound", "loss", *scenes, "all here", *(f"published, {g}" for g in groups)),
         tuple(rows),
     )
+
+
+def _median(lines: Sequence[Line], key: str) -> str:
+    return f"{np.median([line[key] for line in lines]):.2g}" if lines else ""
 
 
 def _table_5(lines: Sequence[Line]) -> Iterator[Table]:
