@@ -8,6 +8,7 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,12 +18,11 @@ from jaxtyping import Float32, Float64
 from service.interfaces import Features, Tools
 from service.pose.retrieval import vote
 from service.pose.viewpoints import INDEX_PX, index_cameras
-from service.pose.views import VIEW_FEATURES, View, render_views
+from service.pose.views import VIEW_FEATURES, View, view_from
 from service.types import Camera, Intrinsics, Pose
 
 VERSION = 3
 """Raise it with any change that makes stored indexes differ from fresh ones."""
-BATCH = 8
 log = logging.getLogger(__name__)
 
 
@@ -50,11 +50,12 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
-    """Render the views, in batches that may use idle cores."""
-    views: list[View] = []
-    for start in range(0, len(cameras), BATCH):
-        rendered = render_views(cameras[start : start + BATCH], tools.rasterizer, tools.matcher)
-        views += [view for view, _ in rendered]
+    """Render the views and find their features, one camera a core.
+
+    The threads end with the building, and with them their working memory, which grows with the scene.
+    """
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
+        views = list(pool.map(lambda camera: view_from(camera, tools.rasterizer, tools.matcher), cameras))
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
     return ViewIndex(tuple(views))
 
