@@ -10,13 +10,15 @@ are the research's; numbers that were measured stand beside the constants.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
@@ -168,13 +170,13 @@ def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iter
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
     votes = index.votes(sight.features(query, tools).descriptors)
-    likely = top(votes, options.candidates)
-    yield _search("retrieve", sight, votes, likely, query, tools)
+    ranked = deque(top(votes, options.candidates))
+    yield _search("retrieve", sight, votes, ranked, query, tools)
     sight, votes = _turned_sight(sight, votes, query, tools)
-    likely = likely[:0] if sight.eighths else likely
-    further = top(votes, len(likely) + max(options.candidates, len(index.views) // FURTHER))[len(likely) :]
-    if len(further):
-        yield _search("turn" if sight.eighths else "further", sight, votes, further, query, tools)
+    further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
+    ranked.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
+    while ranked:
+        yield _search("turn" if sight.eighths else "further", sight, votes, ranked, query, tools)
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
@@ -215,18 +217,21 @@ def _search(
     stage: str,
     sight: _Sight,
     votes: Float64[np.ndarray, "views"],
-    chosen: Int64[np.ndarray, "k"],
+    ranked: deque[int],
     query: Query,
     tools: Tools,
 ) -> Iterator[IterationRecord]:
-    """Go from chosen views, the likeliest first, to an aligned pose; end early where too few matches agree."""
+    """Go from views, the likeliest first, to an aligned pose; end early where too few matches agree.
+
+    The views that were looked at are taken from `ranked`.
+    """
     index: ViewIndex = tools.prepared
-    views = [index.views[i] for i in chosen]
-    poses = np.stack([view.camera.pose.world_from_camera for view in views])
-    candidates = Candidates(poses, votes[chosen])
-    yield IterationRecord(stage, query.prior or views[0].camera.pose, candidates=candidates)
+    poses = [index.views[i].camera.pose for i in ranked]
+    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), votes[list(ranked)])
+    yield IterationRecord(stage, query.prior or poses[0], candidates=candidates)
+    views = (index.views[ranked.popleft()] for _ in range(len(ranked)))
     if query.prior and stage == "retrieve":
-        views.insert(0, rendered_view(query.prior, query, tools)[0])
+        views = chain([rendered_view(query.prior, query, tools)[0]], views)
     found = yield from _matched(sight, views, query, tools)
     if found and found.num_inliers < STRONG:
         found = yield from _rematched(found, query, tools)
@@ -253,7 +258,7 @@ def _sampled(
 
 
 def _matched(
-    sight: _Sight, views: Sequence[View], query: Query, tools: Tools
+    sight: _Sight, views: Iterable[View], query: Query, tools: Tools
 ) -> Generator[IterationRecord, None, Resection | None]:
     """Match the photo with one view after the other until one explains it; else with all of them together."""
     photo = sight.features(query, tools)
@@ -264,7 +269,7 @@ def _matched(
         found = _resected(seen[-1], query, sight.max_error_px, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        yield _match_record("match", best or views[0].camera.pose, seen[-1], found, view.camera)
+        yield _match_record("match", best or view.camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
     pooled = Correspondences.pooled(seen)
