@@ -20,7 +20,7 @@ from service.interfaces import Tools
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request, localize
 from service.pose.index import ViewIndex
 from service.pose.pnp import resection
-from service.pose.retrieval import top, vlad
+from service.pose.retrieval import top
 from service.pose.views import PHOTO_PX, correspondences, photo_features
 from service.types import IterationRecord, PoseEstimate, Query, StageTiming, Status
 
@@ -96,10 +96,10 @@ def _supports(query: Query, scenes: Sequence[LoadedScene]) -> np.ndarray:
 def _support(query: Query, loaded: LoadedScene, quarter_turns: int, memo: dict[Any, Any]) -> int:
     index: ViewIndex = loaded.prepare(DEFAULT_ESTIMATOR)
     tools = Tools(loaded.scene, loaded.rasterizer, loaded.matcher, np.random.default_rng(0), index, memo)
-    photo = photo_features(query, tools, quarter_turns)
+    photo = photo_features(query, tools, eighths=2 * quarter_turns)
     pixels = (APPROXIMATE_ERROR_PX if query.focal_sigma else MAX_ERROR_PX) * query.intrinsics.long_side / PHOTO_PX
     most = 0
-    for i in top(index.vectors @ vlad(photo.descriptors, index.words), VIEWS):
+    for i in top(index.votes(photo.descriptors), VIEWS):
         matches = correspondences(photo, index.views[i], loaded.matcher)
         agreed = resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, TRIALS)
         most = max(most, agreed.num_inliers if agreed else 0)

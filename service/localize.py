@@ -120,6 +120,7 @@ class LoadedScene:
             if estimator not in self._prepared:
                 tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0))
                 self._prepared[estimator] = make(tools, self.cache_dir)
+                release(self.scene)
             return self._prepared[estimator]
 
 

@@ -234,7 +234,7 @@ def test_a_photo_of_another_place_is_not_localized(room: LoadedScene, tmp_path: 
     found = localize(photo_at(foreign, unseen_pose()), room)
     assert found.verdict.status is Status.NOT_LOCALIZED
     assert found.verdict.score < 0.25
-    assert not {record.stage for record in found.records}.isdisjoint({"turn", "vote"})
+    assert not {record.stage for record in found.records}.isdisjoint({"turn", "further"})
     for effort in ("fast", "exhaustive"):
         request = Request(options=ESTIMATORS.load(DEFAULT).Options(effort=effort), budget_renders=25)
         stages = {record.stage for record in localize(photo_at(foreign, unseen_pose()), room, request).records}

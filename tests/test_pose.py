@@ -17,7 +17,7 @@ from service.pose.alignment import align
 from service.pose.gate import SCALES, Scale, colour_agreement, gradient_agreement, probability, verify
 from service.pose.index import built_index, prepared_index
 from service.pose.pnp import reprojection_error_px, resection
-from service.pose.retrieval import top, visual_words, vlad, vote
+from service.pose.retrieval import top, vote
 from service.pose.viewpoints import farthest_points, spread
 from service.pose.views import (
     correspondences,
@@ -243,50 +243,30 @@ def clustered(rng: np.random.Generator, count: int, spread_: float = 0.3) -> np.
     return (x / np.linalg.norm(x, axis=1, keepdims=True)).astype(np.float32)
 
 
-def test_vlad_is_the_plain_sum_over_words() -> None:
-    """Against the definition, written as a loop."""
-    rng = np.random.default_rng(0)
-    descriptors, words = clustered(rng, 200), clustered(rng, 6)
-    expected = np.zeros((6, 32))
-    for d in descriptors:
-        word = int(np.argmax([d @ w for w in words]))
-        expected[word] += d - words[word]
-    expected = np.sign(expected) * np.sqrt(np.abs(expected))
-    norms = np.linalg.norm(expected, axis=1, keepdims=True)
-    expected = (expected / np.where(norms > 0, norms, 1)).ravel()
-    assert np.allclose(vlad(descriptors, words), expected / np.linalg.norm(expected), atol=1e-5)
-    assert np.all(vlad(descriptors[:0], words) == 0)
-
-
-def test_both_rankings_find_the_view_that_shares_features() -> None:
-    rng = np.random.default_rng(1)
-    views = [clustered(rng, 300) for _ in range(12)]
-    shared = views[7][:150] + 0.02 * rng.normal(size=(150, 32))
-    photo = np.concatenate([shared / np.linalg.norm(shared, axis=1, keepdims=True), clustered(rng, 150)]).astype(
-        np.float32
-    )
-    words = visual_words(np.concatenate(views), np.random.default_rng(0))
-    vectors = np.stack([vlad(view, words) for view in views])
-    assert top(vectors @ vlad(photo, words), 3)[0] == 7
-    assert top(vote(photo, views), 3)[0] == 7
-
-
-def test_a_vote_stands_more_clutter_than_vlad() -> None:
-    """The reason why there are two: features of an occluder outnumber those of the scene."""
+def test_a_vote_finds_the_view_that_shares_features_among_clutter() -> None:
     rng = np.random.default_rng(2)
     views = [clustered(rng, 300, 1.0) for _ in range(12)]
     shared, clutter = views[7][:40], clustered(rng, 260, 1.0)
-    photo = np.concatenate([shared, clutter])
-    scores = vote(photo, views)
+    scores = vote(np.concatenate([shared, clutter]), views)
     assert top(scores, 1)[0] == 7
     assert scores[7] > 2 * np.sort(scores)[-2]
 
 
-def test_visual_words_depend_on_the_seed_only() -> None:
-    descriptors = clustered(np.random.default_rng(3), 500)
-    a, b, c = (visual_words(descriptors, np.random.default_rng(seed)) for seed in (0, 0, 1))
-    assert np.array_equal(a, b)
-    assert not np.array_equal(a, c)
+def test_what_many_views_show_doesnt_outvote_what_few_do() -> None:
+    """Rooms with the same chairs: a fifth of the views answers most of the photo very well, one all that is left."""
+    rng = np.random.default_rng(3)
+    chairs, picture = clustered(rng, 100, 1.0), clustered(rng, 30, 1.0)
+    views = [clustered(rng, 150, 1.0) for _ in range(60)]
+    for i in range(12):
+        views[i] = np.concatenate([chairs, views[i][:50]])
+    views[40] = np.concatenate([picture, views[40][:120]])
+    assert top(vote(np.concatenate([chairs, picture]), views), 1)[0] == 40
+
+
+def test_a_vote_needs_no_features_and_only_one_view() -> None:
+    rng = np.random.default_rng(4)
+    assert vote(clustered(rng, 5), [clustered(rng, 9)]).tolist() == [0.0]
+    assert vote(clustered(rng, 0), [clustered(rng, 9), clustered(rng, 0)]).tolist() == [0.0, 0.0]
 
 
 # --- alignment
@@ -497,7 +477,6 @@ def test_the_index_is_the_same_from_the_cache(walls_with_cameras: GaussianScene,
         assert np.array_equal(a.camera.pose.world_from_camera, b.camera.pose.world_from_camera)
         assert np.array_equal(a.points_in_world, b.points_in_world)
         assert np.array_equal(a.features.descriptors, b.features.descriptors)
-    assert np.array_equal(fresh.vectors, cached.vectors)
     assert len(list(tmp_path.iterdir())) == 1
 
 
@@ -526,7 +505,7 @@ def test_an_index_of_a_scene_without_features_is_empty_but_there() -> None:
     index = built_index([Camera(LENS, true_pose())], tools_for(Fog()))
     assert len(index.views) == 1
     assert len(index.views[0].points_in_world) == 0
-    assert (index.vectors @ vlad(np.zeros((0, 27), np.float32), index.words)).shape == (1,)
+    assert index.votes(np.zeros((0, 27), np.float32)).shape == (1,)
 
 
 def test_correspondences_join_photo_pixels_and_scene_points() -> None:

@@ -1,21 +1,24 @@
 """The default estimator: recognise the photo among rendered views, resect, align. Needs no prior.
 
-    features of the photo -> views that look like it (VLAD) -> matches, lifted to 3D -> PnP
+    features of the photo -> views that they vote for -> matches, lifted to 3D -> PnP
     -> while few agree: render there, match again -> align photometrically on two renders -> verification gate
 
-Only if the gate doesn't accept the answer the dearer searches are tried: a vote of features instead of VLAD, with the
-photo turned by eighths; then poses sampled near the views. A prior pose is one more candidate view. Sizes and rounds
+Only if the gate doesn't accept the answer the dearer searches are tried: further views, or with the photo turned by
+eighths; then poses sampled near the views. A prior pose is one more candidate view. Sizes and rounds
 are the research's; numbers that were measured stand beside the constants.
 """
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
@@ -27,7 +30,7 @@ from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
-from service.pose.retrieval import top, vlad, vote
+from service.pose.retrieval import top
 from service.pose.views import (
     PHOTO_PX,
     Correspondences,
@@ -51,6 +54,8 @@ CHANCE = 15
 """Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
 STRONG = 150
 """Inliers with which alignment needs no further match."""
+FURTHER = 16
+"""One view in so many is tried before the search is given up: in a building the likeliest five may all be wrong."""
 SAME_SCALE = 1.4
 """Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
 SCALES_PX = (160, 640)
@@ -78,10 +83,11 @@ REMATCHES, ALIGNMENTS = 3, 4
 @dataclass(frozen=True, slots=True)
 class Options:
     candidates: int = 5
-    """Index views that the photo is matched with in one search, 1 to 64."""
+    """Index views that the photo is matched with in the first search, 1 to 64; in the second as many others, or a
+    sixteenth of all."""
     effort: Literal["fast", "normal", "exhaustive"] = "normal"
-    """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, by a vote of
-    features, with the photo turned. `normal`: then among sampled poses, if something in the photo was recognised.
+    """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, and
+    with the photo turned. `normal`: then among sampled poses, if something in the photo was recognised.
     `exhaustive`: among sampled poses until the budget ends."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
@@ -163,29 +169,34 @@ def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iter
     index: ViewIndex = tools.prepared
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
-    words = vlad(sight.features(query, tools).descriptors, index.words)
-    yield _search("retrieve", sight, index.vectors @ words, query, tools, options)
-    sight, scores = _turned_sight(sight, query, tools)
-    yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options)
+    votes = index.votes(sight.features(query, tools).descriptors)
+    ranked = deque(top(votes, options.candidates))
+    yield _search("retrieve", sight, votes, ranked, query, tools)
+    sight, votes = _turned_sight(sight, votes, query, tools)
+    further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
+    ranked.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
+    while ranked:
+        yield _search("turn" if sight.eighths else "further", sight, votes, ranked, query, tools)
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
-        yield _sampled(sight, scores, query, tools)
+        yield _sampled(sight, votes, query, tools)
 
 
-def _turned_sight(sight: _Sight, query: Query, tools: Tools) -> tuple[_Sight, np.ndarray]:
-    """Return the photo upright, or turned as the views' votes say, and the votes.
+def _turned_sight(
+    sight: _Sight, upright: Float64[np.ndarray, "views"], query: Query, tools: Tools
+) -> tuple[_Sight, Float64[np.ndarray, "views"]]:
+    """Return the photo upright, with the votes given, or turned as the views' votes say, with those.
 
     Votes on a smaller photo choose the turns that are worth a closer look.
     """
-    described = [view.features.descriptors for view in tools.prepared.views]
 
-    def votes(turned: _Sight, share: float) -> np.ndarray:
-        return vote(turned.features(query, tools, share).descriptors, described)
+    def votes(turned: _Sight, share: float) -> Float64[np.ndarray, "views"]:
+        return tools.prepared.votes(turned.features(query, tools, share).descriptors)
 
     turns = [replace(sight, eighths=eighths) for eighths in range(1, 8)]
     turns.sort(key=lambda turned: -votes(turned, VOTE_SHARE).max())
-    best, best_votes = sight, votes(sight, 1.0)
+    best, best_votes = sight, upright
     for turned in turns[:CLOSER_LOOKS]:
         if (found := votes(turned, 1.0)).max() * TURN_BIAS > best_votes.max() * (TURN_BIAS if best.eighths else 1.0):
             best, best_votes = turned, found
@@ -203,17 +214,24 @@ def _same_scale_px(query: Query, index: ViewIndex) -> int:
 
 
 def _search(
-    stage: str, sight: _Sight, scores: np.ndarray, query: Query, tools: Tools, options: Options
+    stage: str,
+    sight: _Sight,
+    votes: Float64[np.ndarray, "views"],
+    ranked: deque[int],
+    query: Query,
+    tools: Tools,
 ) -> Iterator[IterationRecord]:
-    """Go from scored views to an aligned pose; end early where too few matches agree."""
+    """Go from views, the likeliest first, to an aligned pose; end early where too few matches agree.
+
+    The views that were looked at are taken from `ranked`.
+    """
     index: ViewIndex = tools.prepared
-    chosen = top(scores, options.candidates)
-    views = [index.views[i] for i in chosen]
-    poses = np.stack([view.camera.pose.world_from_camera for view in views])
-    candidates = Candidates(poses, scores[chosen].astype(np.float64))
-    yield IterationRecord(stage, query.prior or views[0].camera.pose, candidates=candidates)
+    poses = [index.views[i].camera.pose for i in ranked]
+    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), votes[list(ranked)])
+    yield IterationRecord(stage, query.prior or poses[0], candidates=candidates)
+    views = (index.views[ranked.popleft()] for _ in range(len(ranked)))
     if query.prior and stage == "retrieve":
-        views.insert(0, rendered_view(query.prior, query, tools)[0])
+        views = chain([rendered_view(query.prior, query, tools)[0]], views)
     found = yield from _matched(sight, views, query, tools)
     if found and found.num_inliers < STRONG:
         found = yield from _rematched(found, query, tools)
@@ -221,10 +239,12 @@ def _search(
         yield from _aligned(found, query, tools)
 
 
-def _sampled(sight: _Sight, scores: np.ndarray, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+def _sampled(
+    sight: _Sight, votes: Float64[np.ndarray, "views"], query: Query, tools: Tools
+) -> Iterator[IterationRecord]:
     """Render at sampled poses and match; go on from the one that most matches agree with."""
     index: ViewIndex = tools.prepared
-    poses = poses_near_views(index.views, scores, -0.25 * np.pi * sight.eighths, SAMPLES, tools.rng)
+    poses = poses_near_views(index.views, votes, -0.25 * np.pi * sight.eighths, SAMPLES, tools.rng)
     lens = sized(query.intrinsics, SAMPLE_PX)
     best: Resection | None = None
     for pose in poses:
@@ -238,7 +258,7 @@ def _sampled(sight: _Sight, scores: np.ndarray, query: Query, tools: Tools) -> I
 
 
 def _matched(
-    sight: _Sight, views: Sequence[View], query: Query, tools: Tools
+    sight: _Sight, views: Iterable[View], query: Query, tools: Tools
 ) -> Generator[IterationRecord, None, Resection | None]:
     """Match the photo with one view after the other until one explains it; else with all of them together."""
     photo = sight.features(query, tools)
@@ -249,7 +269,7 @@ def _matched(
         found = _resected(seen[-1], query, sight.max_error_px, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        yield _match_record("match", best or views[0].camera.pose, seen[-1], found, view.camera)
+        yield _match_record("match", best or view.camera.pose, seen[-1], found, view.camera)
         if best and best.num_inliers >= GOOD_MATCH:
             return best
     pooled = Correspondences.pooled(seen)

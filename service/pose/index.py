@@ -8,30 +8,31 @@ import os
 import tempfile
 import zipfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64
 
 from service.interfaces import Features, Tools
-from service.pose.retrieval import visual_words, vlad
+from service.pose.retrieval import vote
 from service.pose.viewpoints import INDEX_PX, index_cameras
-from service.pose.views import VIEW_FEATURES, View, render_views
+from service.pose.views import VIEW_FEATURES, View, view_from
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 2
+VERSION = 3
 """Raise it with any change that makes stored indexes differ from fresh ones."""
-BATCH = 8
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class ViewIndex:
     views: tuple[View, ...]
-    words: Float32[np.ndarray, "words d"]
-    vectors: Float32[np.ndarray, "views size"]
-    """VLAD of each view."""
+
+    def votes(self, descriptors: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "views"]:
+        """Return how much each view is like a photo with these features."""
+        return vote(descriptors, [view.features.descriptors for view in self.views])
 
 
 def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
@@ -49,15 +50,14 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
-    """Render the views, in batches that may use idle cores, and learn the visual words from their features."""
-    views: list[View] = []
-    for start in range(0, len(cameras), BATCH):
-        rendered = render_views(cameras[start : start + BATCH], tools.rasterizer, tools.matcher)
-        views += [view for view, _ in rendered]
-    descriptors = [view.features.descriptors for view in views]
-    words = visual_words(np.concatenate(descriptors), tools.rng)
+    """Render the views and find their features, one camera a core.
+
+    The threads end with the building, and with them their working memory, which grows with the scene.
+    """
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
+        views = list(pool.map(lambda camera: view_from(camera, tools.rasterizer, tools.matcher), cameras))
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
-    return ViewIndex(tuple(views), words, np.stack([vlad(d, words) for d in descriptors]))
+    return ViewIndex(tuple(views))
 
 
 def _key(tools: Tools) -> str:
@@ -78,8 +78,6 @@ def _write(index: ViewIndex, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     cameras = [view.camera for view in index.views]
     arrays = {
-        "words": index.words,
-        "vectors": index.vectors,
         "counts": np.array([len(view.points_in_world) for view in index.views]),
         "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
         "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
@@ -109,4 +107,4 @@ def _read(path: Path) -> ViewIndex:
         features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
         camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
         views.append(View(camera, features, stored["points_in_world"][start:stop]))
-    return ViewIndex(tuple(views), stored["words"], stored["vectors"])
+    return ViewIndex(tuple(views))

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float32
 
 from service.interfaces import Features, Frame, ImageMatcher, Rasterizer, Tools
 from service.pose.views import (
-    VIEW_FEATURES,
     Correspondences,
     View,
     correspondences,
@@ -20,6 +19,7 @@ from service.pose.views import (
     photo_at,
     photo_features,
     to_uint8,
+    view_from,
 )
 from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query
 
@@ -28,10 +28,10 @@ def render_and_match(
     camera: Camera, rasterizer: Rasterizer, query: Query, tools: Tools
 ) -> tuple[Correspondences, View]:
     """Render, match and lift the matches; `camera` has the photo's lens at any size."""
-    (frame,) = rasterizer.render([camera])
     if tools.image_matcher:
+        (frame,) = rasterizer.render([camera])
         return _matched_images(frame, camera, tools.image_matcher, query, tools)
-    view = lifted(tools.matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
+    view = view_from(camera, rasterizer, tools.matcher)
     return correspondences(photo_features(query, tools, camera.intrinsics.long_side), view, tools.matcher), view
 
 

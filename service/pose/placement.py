@@ -48,8 +48,8 @@ COARSE_RADII = (2.0, 5.0)
 """Radii of the scene that the typical distance, and any, is at most: scenes of few, large Gaussians look far away."""
 NEAREST = 0.06
 """What is nearer than this share of the typical distance is in the way."""
-ROUNDS, ROUND_CANDIDATES = 12, 150
-ENOUGH_GOOD, GOOD_PER_AREA = (200, 800), 40
+ROUNDS, ROUND_CANDIDATES = 24, 150
+ENOUGH_GOOD, GOOD_PER_AREA = (200, 1200), 40
 """Good views to look for: so many for each square of the typical distance that the surfaces have."""
 WIDE_TURN = 0.8
 ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
@@ -58,7 +58,7 @@ SURROUNDED = 0.7
 AS_SURROUNDED = 0.6
 """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
 RAYS = 32
-AT_LEAST, AT_MOST, COVERED = 64, 384, 0.93
+AT_LEAST, AT_MOST, COVERED = 64, 640, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
 SEEN_AGAIN = 0.25
@@ -163,11 +163,8 @@ class _Space:
     radius: float
     """Holds half of the points."""
     up: Float64[np.ndarray, "3"]
-
-    @property
-    def distance(self) -> float:
-        """The typical one."""
-        return float(min(np.median(self.distances), COARSE_RADII[0] * self.radius))
+    distance: float
+    """The typical one."""
 
     @property
     def enough(self) -> float:
@@ -209,15 +206,17 @@ def _survey(scene: GaussianScene) -> _Space:
     middle = np.median(points, axis=0)
     radius = float(np.median(np.linalg.norm(points - middle, axis=1)))
     up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
+    distances = np.clip(sizes * focal / GAUSSIAN_PX, 1e-9, max(COARSE_RADII[1] * radius, 1e-9))
     return _Space(
         points,
-        np.clip(sizes * focal / GAUSSIAN_PX, 1e-9, max(COARSE_RADII[1] * radius, 1e-9)),
+        distances,
         low,
         cell,
         (counts >= 2).reshape(shape),
         middle,
         radius,
         up,
+        float(min(np.median(distances), COARSE_RADII[0] * radius)),
     )
 
 

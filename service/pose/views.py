@@ -147,13 +147,10 @@ def _well_inside(
     return keep
 
 
-def render_views(cameras: Sequence[Camera], rasterizer: Rasterizer, matcher: Matcher) -> list[tuple[View, Frame]]:
+def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
     """Render, find features, lift them."""
-    frames = rasterizer.render(cameras)
-    return [
-        (lifted(matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera), frame)
-        for camera, frame in zip(cameras, frames, strict=True)
-    ]
+    (frame,) = rasterizer.render([camera])
+    return lifted(matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
 
 
 def rendered_frame(pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0) -> tuple[Frame, Camera]:

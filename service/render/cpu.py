@@ -78,7 +78,6 @@ class CpuRasterizer:
         other = copy.copy(self)
         info = replace(self.scene.info, training_focal_px=None, training_long_side_px=long_side_px)
         other.scene = replace(self.scene, info=info)
-        other._local = threading.local()  # a picture that is kept there for its gradients has another dilation
         return other
 
     def refresh(self) -> None:
@@ -139,13 +138,14 @@ class CpuRasterizer:
         )  # fmt: skip
         for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
             image.flags.writeable = False
-        s.camera, s.frame = camera, frame
+        s.camera, s.info, s.frame = camera, self.scene.info, frame
         return frame
 
     def _backward(self, camera: Camera, d_rgb: Any, d_depth: Any, d_alpha: Any) -> _Scratch:
         """Fill `sums` for the picture of this camera; it is rendered first unless it was this thread's last."""
         s = self._scratch()
-        frame = s.frame if s.camera is camera and s.frame is not None else self._render(camera)
+        is_last = s.camera is camera and s.info is self.scene.info  # trained_at another size is another picture
+        frame = s.frame if is_last and s.frame is not None else self._render(camera)
         width, height = camera.intrinsics.width, camera.intrinsics.height
         zero = np.zeros(width * height, np.float32)
         s.sums[: s.visible * RECORD] = 0
@@ -218,7 +218,9 @@ class _Scratch:
         self.state = aligned(16 * STATE)
         self.visible = 0
         self.camera: Camera | None = None
-        """Whose picture the lists belong to."""
+        """Whose picture the lists belong to..."""
+        self.info: SceneInfo | None = None
+        """...and of the scene as trained at which size."""
         self.frame: Frame | None = None
         self.inputs = aligned(16 * INPUT)
         self.work = aligned(WORK)
