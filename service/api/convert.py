@@ -23,6 +23,7 @@ from service.api.schemas import (
     NamedCameraOut,
     PoseOut,
     Record,
+    RegionOut,
     Result,
     SceneRef,
     Timing,
@@ -31,6 +32,7 @@ from service.api.schemas import (
 from service.geometry import quat_from_rotation
 from service.types import (
     HINTS,
+    Box,
     Camera,
     GeoAnchor,
     Intrinsics,
@@ -39,6 +41,7 @@ from service.types import (
     NamedCamera,
     Pose,
     PoseEstimate,
+    Region,
     StageTiming,
 )
 
@@ -155,6 +158,13 @@ def covariance_out(matrix: np.ndarray) -> Covariance:
         sigma_deg=float(np.degrees(np.sqrt(np.trace(matrix[:3, :3])))),
         sigma_units=float(np.sqrt(np.trace(matrix[3:, 3:]))),
     )
+
+
+def region_out(region: Region) -> RegionOut:
+    """Spell out what a prior admits."""
+    if isinstance(region, Box):
+        return RegionOut(box=[region.lower_in_world.tolist(), region.upper_in_world.tolist()])
+    return RegionOut(covariance=covariance_out(region.covariance))
 
 
 def timing_out(timing: StageTiming) -> Timing:

@@ -325,6 +325,14 @@ class JobSummary(Model):
     links: JobLinks
 
 
+class RegionOut(Model):
+    """A box that holds the camera's centre, or the covariance of a Gaussian about the prior."""
+
+    box: Matrix | None = None
+    """Lower and upper corner in the world."""
+    covariance: Covariance | None = None
+
+
 class JobOut(JobSummary):
     """A job with its result (state `succeeded`), or the error for which it has none (`failed`, `interrupted`)."""
 
@@ -336,6 +344,9 @@ class JobOut(JobSummary):
     """When the answer was of no use any more, if that was said."""
     options: dict[str, Any]
     prior: PoseOut | None
+    """The guess, or a Gaussian's mean."""
+    region: RegionOut | None
+    """Where the prior says that the camera is for certain."""
     truth: PoseOut | None
     """As it was sent; no part of the search."""
     result: Result | None

@@ -27,6 +27,7 @@ from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
+from service.pose.region import admits, excess, loosened
 from service.pose.retrieval import top, vlad, vote
 from service.pose.views import (
     PHOTO_PX,
@@ -71,6 +72,8 @@ LENS_SETTLED_PX = 0.05
 """The same while the focal length is free: it hides behind the distance, and hardly moves what is seen."""
 SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
+NEAREST = 16
+"""Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
 
@@ -164,13 +167,23 @@ def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iter
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
     words = vlad(sight.features(query, tools).descriptors, index.words)
-    yield _search("retrieve", sight, index.vectors @ words, query, tools, options)
+    yield _search("retrieve", sight, _within_reach(index.vectors @ words, query, index), query, tools, options)
     sight, scores = _turned_sight(sight, query, tools)
+    scores = _within_reach(scores, query, index)
     yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options)
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
         yield _sampled(sight, scores, query, tools)
+
+
+def _within_reach(scores: np.ndarray, query: Query, index: ViewIndex) -> np.ndarray:
+    """Return the views' scores, those of views that are far from the photo's region put below all others."""
+    if query.region is None:
+        return scores
+    away = np.array([excess(query.region, view.camera.pose) for view in index.views])
+    reach = np.sort(away)[min(NEAREST, len(away)) - 1]
+    return np.where(away <= reach, scores, min(0.0, float(scores.min())))
 
 
 def _turned_sight(sight: _Sight, query: Query, tools: Tools) -> tuple[_Sight, np.ndarray]:
@@ -319,13 +332,22 @@ def _resected(
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     given = (matches.photo_px, matches.points_in_world)
     if not query.focal_sigma:
-        return resection(*given, query.intrinsics, pixels, max_trials)
-    if near is None:
-        return focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
-    found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
-    if found is None:
-        return None
-    return refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
+        found = resection(*given, query.intrinsics, pixels, max_trials)
+    elif near is None:
+        found = focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
+    else:
+        found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
+        if found:
+            found = refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
+    return found if found and _possible(found.pose, matches, query) else None
+
+
+def _possible(pose: Pose, matches: Correspondences, query: Query) -> bool:
+    """Tell whether the photo's region may hold what the pose leads to."""
+    if query.region is None:
+        return True
+    distance = np.median(np.linalg.norm(matches.points_in_world - pose.position_in_world, axis=1))
+    return admits(loosened(query.region, float(distance)), pose)
 
 
 def _match_record(
