@@ -392,6 +392,8 @@ class IterationRecord:
     step_units: float | None = None
     matches: MatchVectors | None = None
     candidates: Candidates | None = None
+    rivals: Candidates | None = None
+    """Other answers that the gate accepts too, most probable first; scores are probabilities, the pose has the rest."""
     index: int = 0
     """Number of the record in the trace; stamped by the driver, like the times."""
     elapsed_s: float = 0.0
@@ -419,6 +421,7 @@ class Reason(StrEnum):
     INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
     PLACE_UNCERTAIN = "place_uncertain"
     OUTSIDE_PRIOR = "outside_prior"
+    AMBIGUOUS = "ambiguous"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -447,6 +450,10 @@ HINTS: dict[Reason, str] = {
     Reason.OUTSIDE_PRIOR: (
         "The photo fits the scene, but at a place that the prior's Gaussian or box excludes: check it, or send a wider "
         "one."
+    ),
+    Reason.AMBIGUOUS: (
+        "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
+        "or a Gaussian."
     ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }
@@ -508,3 +515,13 @@ class PoseEstimate:
     records: tuple[IterationRecord, ...]
     considered: tuple[tuple[str, int], ...] = ()
     """Where the photo was looked for in several scenes: each one's id, and how many matches agreed, best first."""
+
+    @property
+    def alternatives(self) -> tuple[tuple[Pose, float], ...]:
+        """Other poses that explain the photo, too, and how probable each is, most probable first."""
+        rivals = self.records[-1].rivals
+        return (
+            ()
+            if rivals is None
+            else tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))
+        )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,14 @@ from small_room import HALF_TURN, write_room
 from test_estimators import assert_near, photo_at, unseen_pose
 
 from service.errors import InvalidPrior
+from service.estimators.view_index import Options
 from service.geometry import moved
-from service.localize import LoadedScene, localize
+from service.localize import LoadedScene, Request, localize
 from service.pose.region import admits, excess, loosened
 from service.types import Box, Gaussian, Pose, Reason, Region, Status
 
 TRUTH = unseen_pose()
+FAST = Request(options=Options(effort="fast"))
 TWIN = Pose(HALF_TURN @ TRUTH.world_from_camera)
 
 
@@ -46,14 +47,14 @@ def test_a_region_decides_between_places_that_look_alike(kind: str, place: Pose,
 @pytest.mark.parametrize("region", [box_around(Pose(np.diag([1.0, -1, -1, 1])), 0.1), gaussian_at(TWIN, 2, 0.05)])
 def test_where_the_photo_was_not_taken_nothing_is_localized(region: Region, repeated: LoadedScene) -> None:
     elsewhere = moved(TRUTH, np.array([0.0, 1.5, 0, 0, 0, 0]))
-    found = localize(replace(photo_at(repeated, elsewhere), region=region), repeated)
+    found = localize(replace(photo_at(repeated, elsewhere), region=region), repeated, FAST)
     assert found.verdict.status is not Status.LOCALIZED
 
 
 def test_an_answer_that_the_prior_excludes_is_no_answer(repeated: LoadedScene) -> None:
     """Near enough for a pose before alignment, 17 standard deviations off after it."""
     region = gaussian_at(moved(TRUTH, np.array([0, 0, 0, 0.05, 0, 0])), 0.5, 0.003)
-    found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated)
+    found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated, FAST)
     assert found.verdict.status is Status.UNCERTAIN
     assert found.verdict.reason is Reason.OUTSIDE_PRIOR
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from service.api.geo import geographic
 from service.api.schemas import (
+    Alternative,
     Axes,
     CameraOut,
     CandidatesOut,
@@ -183,6 +184,7 @@ def result_out(
         hint=HINTS[verdict.reason],
         score=verdict.score,
         pose=pose_out(estimate.pose),
+        alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,

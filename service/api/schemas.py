@@ -233,6 +233,14 @@ class Considered(Model):
     """With one of its views, that agree on one camera."""
 
 
+class Alternative(Model):
+    """Another answer."""
+
+    probability: float
+    """0..1, if one of the answers is right; the result's `pose` has what is left."""
+    pose: PoseOut
+
+
 class Result(Model):
     """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
 
@@ -245,6 +253,9 @@ class Result(Model):
     is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
+    alternatives: list[Alternative] = []
+    """Other poses that explain the photo, too, most probable first. With a `pose` that isn't far more probable than
+    these the result is `uncertain`, and its reason `ambiguous`."""
     geopose: GeoPose | None
     """The same on Earth, for scenes whose manifest has a `geo_anchor`."""
     intrinsics: IntrinsicsOut

@@ -29,6 +29,7 @@ from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
 from service.pose.region import admits, excess, loosened
 from service.pose.retrieval import top, vlad, vote
+from service.pose.rivals import apart, ranked, rivals
 from service.pose.views import (
     PHOTO_PX,
     Correspondences,
@@ -104,9 +105,10 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
     hunt = _Hunt(query, tools)
-    for search in _searches(query, tools, options, hunt):
+    for search, sight, scores in _searches(query, tools, options, hunt):
         yield from hunt.follow(search)
         if hunt.accepted:
+            yield from hunt.contest(sight, scores)
             return
 
 
@@ -139,6 +141,32 @@ class _Hunt:
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
+    def contest(self, sight: _Sight, scores: np.ndarray) -> Iterator[IterationRecord]:
+        """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""
+        assert self.answer is not None
+        answers = [self.answer]
+        known = self.query.corrected(self.answer.lens)
+        seen, _ = rendered_view(self.answer.pose, known, self.tools)
+        distance = float(np.median(np.linalg.norm(seen.points_in_world - self.answer.pose.position_in_world, axis=1)))
+        pixels = sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
+        judged = (self.answer.pose, distance, verify(known, self.answer.pose, self.tools).signals)
+        suspected = rivals(
+            sight.features(self.query, self.tools), known.intrinsics, *judged,
+            self.tools.prepared.views, scores, self.tools.matcher, pixels,
+        )  # fmt: skip
+        for rival in suspected:
+            last: IterationRecord | None = None
+            for last in _refined(replace(rival, lens=self.answer.lens), self.query, self.tools):
+                yield self._with_answer(last)
+            if last is None or last.stage != "align" or not all(apart(last.pose, a.pose, distance) for a in answers):
+                continue
+            verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
+            if verdict.status is Status.LOCALIZED:
+                answers.append(last)
+        if len(answers) > 1:
+            self.answer, others = ranked(answers)
+            yield replace(self.answer, stage="contest", rivals=others)
+
     def _with_answer(self, record: IterationRecord) -> IterationRecord:
         return replace(record, pose=self.answer.pose, lens=self.answer.lens) if self.answer else record
 
@@ -161,20 +189,23 @@ class _Sight:
         return MATCH_ERROR_PX * max(1.0, PHOTO_PX / self.long_side)
 
 
-def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iterator[Iterator[IterationRecord]]:
-    """The ways to look for the photo, cheapest first."""
+def _searches(
+    query: Query, tools: Tools, options: Options, hunt: _Hunt
+) -> Iterator[tuple[Iterator[IterationRecord], _Sight, np.ndarray]]:
+    """The ways to look for the photo, cheapest first; with each how it looks, and how well the views look like it."""
     index: ViewIndex = tools.prepared
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
     words = vlad(sight.features(query, tools).descriptors, index.words)
-    yield _search("retrieve", sight, _within_reach(index.vectors @ words, query, index), query, tools, options)
+    scores = _within_reach(index.vectors @ words, query, index)
+    yield _search("retrieve", sight, scores, query, tools, options), sight, scores
     sight, scores = _turned_sight(sight, query, tools)
     scores = _within_reach(scores, query, index)
-    yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options)
+    yield _search("turn" if sight.eighths else "vote", sight, scores, query, tools, options), sight, scores
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
-        yield _sampled(sight, scores, query, tools)
+        yield _sampled(sight, scores, query, tools), sight, scores
 
 
 def _within_reach(scores: np.ndarray, query: Query, index: ViewIndex) -> np.ndarray:
@@ -246,8 +277,8 @@ def _sampled(sight: _Sight, scores: np.ndarray, query: Query, tools: Tools) -> I
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
         yield _match_record("sample", best or pose, matches, found, view.camera)
-    if best and best.num_inliers >= PROMISING and (best := (yield from _rematched(best, query, tools))):
-        yield from _aligned(best, query, tools)
+    if best and best.num_inliers >= PROMISING:
+        yield from _refined(best, query, tools)
 
 
 def _matched(
@@ -274,6 +305,12 @@ def _matched(
     count = len(pooled.photo_px)
     yield IterationRecord("pool", best.pose, best.lens, num_matches=count, num_inliers=best.num_inliers)
     return best
+
+
+def _refined(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+    """Match again, and align."""
+    if again := (yield from _rematched(found, query, tools)):
+        yield from _aligned(again, query, tools)
 
 
 def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
