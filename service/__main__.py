@@ -106,7 +106,7 @@ def localize(
         bool, typer.Option("--sequence", help="One camera's photos in their order: follow it. A video always is.")
     ] = False,
     intrinsics: IntrinsicsOption = "",
-    prior: Annotated[str, typer.Option(help="A guess of the pose, as the API takes it: JSON or a file.")] = "",
+    prior: Annotated[str, typer.Option(help="What is known of the pose, as the API takes it: JSON or a file.")] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
     matcher: MatcherOption = "",
     seed: int = 0,
@@ -217,14 +217,14 @@ def render(
     from service.api.pictures import picture
     from service.api.requests import RenderIn
 
-    fields = read_fields({"prior": _json(pose, "prior")})
-    if fields.prior is None:
+    fields = read_fields({"truth": _json(pose, "truth")})
+    if fields.truth is None:
         raise InvalidRequest("a pose is required.", where="--pose")
     kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
     if kind not in ("png", "jpg"):
         raise InvalidRequest("must end with .png or .jpg.", where="--out")
     wanted = RenderIn(
-        pose=fields.prior, intrinsics=_json(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
+        pose=fields.truth, intrinsics=_json(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
     )
     out_file.write_bytes(picture(_loaded(scene), wanted))
 

@@ -27,12 +27,13 @@ from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
-from service.pose.gate import verify
+from service.pose.gate import LOCALIZED, doubted, verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
 from service.types import (
+    Candidates,
     GaussianScene,
     IterationRecord,
     PoseEstimate,
@@ -200,7 +201,7 @@ def localize(
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
     renders = tally.count
     query = query.corrected(records[-1].lens)
-    verdict = _qualified(verify(query, records[-1].pose, tools), exhausted)
+    verdict = _qualified(verify(query, records[-1].pose, tools), records[-1].rivals, exhausted)
     return estimate_of(
         query, loaded, request, verdict, records, timings=_timings(records, clock), renders=renders, exhausted=exhausted
     )
@@ -282,8 +283,11 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
     return late or (request.budget_renders is not None and tally.count >= request.budget_renders)
 
 
-def _qualified(verdict: Verdict, exhausted: bool) -> Verdict:
-    """Put on record what the gate can't see in the pictures: a budget that cut the search short."""
+def _qualified(verdict: Verdict, rivals: Candidates | None, exhausted: bool) -> Verdict:
+    """Put on record what the gate can't see in the render: other answers, a budget that cut the search short."""
+    share = 1.0 if rivals is None else 1.0 - float(rivals.scores.sum())
+    if share < LOCALIZED:
+        return doubted(verdict, Reason.AMBIGUOUS, share * verdict.score)
     if exhausted and verdict.status is not Status.LOCALIZED:
         return replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
     return verdict

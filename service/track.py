@@ -130,7 +130,7 @@ class Tracker:
         if estimate is None or not _placed(estimate.verdict):
             estimate = self._searched(told, expected, estimate)
         self._renders += estimate.renders
-        if estimate.verdict.status is Status.NOT_LOCALIZED:
+        if estimate.verdict.status is Status.NOT_LOCALIZED or estimate.verdict.reason is Reason.AMBIGUOUS:
             self._past.clear()
         else:
             self._past.append((time_s, estimate.pose))

@@ -237,6 +237,53 @@ class GaussianScene:
         return sum(getattr(self, n).nbytes for n in ("means", "quats", "scales", "opacities", "sh"))
 
 
+@dataclass(frozen=True, slots=True)
+class Box:
+    """The camera's centre lies in a box along the world's axes. Raises InvalidPrior."""
+
+    lower_in_world: Float64[np.ndarray, "3"]
+    upper_in_world: Float64[np.ndarray, "3"]
+
+    def __post_init__(self) -> None:
+        corners = np.array([self.lower_in_world, self.upper_in_world], np.float64)
+        if not np.all(np.isfinite(corners)) or not np.all(corners[0] < corners[1]):
+            raise InvalidPrior(
+                "must be two corners of finite numbers, each of the first less than the second's.", where="box"
+            )
+        object.__setattr__(self, "lower_in_world", frozen(corners[0], np.float64))
+        object.__setattr__(self, "upper_in_world", frozen(corners[1], np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class Gaussian:
+    """The camera's pose is normally distributed. Raises InvalidPrior."""
+
+    pose: Pose
+    covariance: Float64[np.ndarray, "6 6"]
+    """Of the right perturbation in the camera's frame, like a verdict's: truth = pose @ exp(twist)."""
+
+    def __post_init__(self) -> None:
+        matrix = frozen(self.covariance, np.float64)
+        shaped = matrix.shape == (6, 6) and bool(np.all(np.isfinite(matrix)))
+        scale = np.sqrt(np.maximum(np.diag(matrix), 0.0)) if shaped else np.zeros(6)
+        # Scaled, for rad and scene units differ by orders of magnitude.
+        if (
+            not (scale > 0).all()
+            or np.abs(correlation := matrix / np.outer(scale, scale)).max() > 1 + 1e-6
+            or (np.abs(correlation - correlation.T).max() > 1e-6 or np.linalg.eigvalsh(correlation).min() < 1e-9)
+        ):
+            raise InvalidPrior(
+                "must be a 6x6 symmetric positive definite matrix.",
+                where="covariance",
+                hint="Of (rotation in rad, translation in scene units) in the camera's frame, like a result's.",
+            )
+        object.__setattr__(self, "covariance", matrix)
+
+
+Region = Box | Gaussian
+"""What is known for certain of where a photo was taken; poses outside are no answers."""
+
+
 FOCAL_SIGMA = {"given": 0.15, "exif": 0.06, "guessed": 0.5}
 """By the source of approximate intrinsics. EXIF is rounded to a millimetre, and its definition is ambiguous by 4 %."""
 
@@ -253,11 +300,14 @@ class Query:
     photo_intrinsics: Intrinsics
     """Of the whole upright photo in its own resolution, with its distortion: what results report."""
     prior: Pose | None = None
+    """A guess: one more place to search from, which may be wrong."""
     warnings: tuple[str, ...] = ()
     known: Bool[np.ndarray, "h w"] | None = None
     """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
     told_focal_sigma: float | None = None
     """As `focal_sigma`, where other photos of the camera have told more than the source of the intrinsics does."""
+    region: Region | None = None
+    """Where the camera is for certain."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
@@ -342,6 +392,8 @@ class IterationRecord:
     step_units: float | None = None
     matches: MatchVectors | None = None
     candidates: Candidates | None = None
+    rivals: Candidates | None = None
+    """Other answers that the gate accepts too, most probable first; scores are probabilities, the pose has the rest."""
     index: int = 0
     """Number of the record in the trace; stamped by the driver, like the times."""
     elapsed_s: float = 0.0
@@ -368,6 +420,8 @@ class Reason(StrEnum):
     FOCAL_UNCERTAIN = "focal_uncertain"
     INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
     PLACE_UNCERTAIN = "place_uncertain"
+    OUTSIDE_PRIOR = "outside_prior"
+    AMBIGUOUS = "ambiguous"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -392,6 +446,14 @@ HINTS: dict[Reason, str] = {
     ),
     Reason.PLACE_UNCERTAIN: (
         "The photo fits the scene, but hardly tells from where it was taken: show more of the scene, or nearer things."
+    ),
+    Reason.OUTSIDE_PRIOR: (
+        "The photo fits the scene, but at a place that the prior's Gaussian or box excludes: check it, or send a wider "
+        "one."
+    ),
+    Reason.AMBIGUOUS: (
+        "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
+        "or a Gaussian."
     ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }
@@ -453,3 +515,13 @@ class PoseEstimate:
     records: tuple[IterationRecord, ...]
     considered: tuple[tuple[str, int], ...] = ()
     """Where the photo was looked for in several scenes: each one's id, and how many matches agreed, best first."""
+
+    @property
+    def alternatives(self) -> tuple[tuple[Pose, float], ...]:
+        """Other poses that explain the photo, too, and how probable each is, most probable first."""
+        rivals = self.records[-1].rivals
+        return (
+            ()
+            if rivals is None
+            else tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))
+        )

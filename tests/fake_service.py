@@ -181,6 +181,7 @@ class FakeJob:
             deadline=None,
             options={},
             prior=None,
+            region=None,
             truth=self.truth and pose_out(self.truth),
             result=result,
             error=None,

@@ -16,12 +16,22 @@ WIDTH, HEIGHT, FOCAL = 320, 240, 240.0
 INTRINSICS = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
 
 
-def write_room(folder: Path, cameras: int = 24) -> Path:
-    """Write `scene.ply` (Inria's layout, degree 0) and `transforms.json`; return the folder."""
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+def write_room(folder: Path, cameras: int = 24, repeated: bool = False) -> Path:
+    """Write `scene.ply` (Inria's layout, degree 0) and `transforms.json`; return the folder.
+
+    A `repeated` room is the same after HALF_TURN: every photo has two places where it may have been taken.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(3)
     walls = [_wall(axis, side, rng) for axis in range(3) for side in (-1, 1)]
     means, quats, colours = (np.concatenate(parts) for parts in zip(*walls, strict=True))
+    if repeated:  # a half turn changes no Gaussian's shape here
+        one = means[:, 0] > 0
+        means = np.concatenate([means[one], means[one] * [-1, -1, 1]])
+        quats, colours = (np.concatenate([part[one]] * 2) for part in (quats, colours))
     scales = np.tile(np.log([0.5 * SPACING, 0.5 * SPACING, 0.003]), (len(means), 1))
     columns = {
         **dict(zip("xyz", means.T, strict=True)),

@@ -124,6 +124,19 @@ def test_the_prior_reaches_the_estimator_in_every_spelling(shared):
         job = post(shared, prior=prior).json()
         # 1e-12: the same numbers by another way.
         assert np.allclose(job["prior"]["world_from_camera"]["matrix"], TURNED, atol=1e-12)
+        assert job["region"] is None
+
+
+def test_a_job_tells_its_region(shared):
+    box = [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
+    job = post(shared, prior={"box": box}).json()
+    assert job["prior"] is None
+    assert job["region"] == {"box": box, "covariance": None}
+    guess = {"world_from_camera": TURNED.tolist()}
+    covariance = post(shared, prior=guess | {"sigma_deg": 2, "sigma_units": 0.5}).json()["region"]["covariance"]
+    assert np.allclose(covariance["matrix"], np.diag(np.r_[np.full(3, np.radians(2)), np.full(3, 0.5)] ** 2))
+    again = post(shared, prior=guess | {"covariance": covariance["matrix"]}).json()
+    assert again["region"]["covariance"] == covariance
 
 
 def test_events_come_live_from_the_first_and_end_with_the_result(client, stepping):
@@ -442,6 +455,8 @@ def bomb() -> bytes:
 
 GOOD = {"width": 96, "height": 64, "fx": 80, "fy": 80, "cx": 48, "cy": 32}
 SHEARED = [[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+AT_TWO = {"position": [2, 2, 2], "quaternion_wxyz": [1, 0, 0, 0]}
+LOPSIDED = (np.eye(6) + np.eye(6, k=1)).tolist()
 MIRRORED = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 NAN = '{"width": 96, "height": 64, "fx": NaN, "fy": 80, "cx": 48, "cy": 32}'
 
@@ -471,6 +486,16 @@ BAD_FIELDS = [
     ({"prior": {"position": [0, 0, 0], "quaternion_wxyz": [2, 0, 0, 0]}}, 422, "invalid_prior", "prior.position"),
     ({"prior": {"position": [0, 0, 0]}}, 422, "invalid_prior", "prior"),
     ({"prior": {}}, 422, "invalid_prior", "prior"),
+    ({"prior": {"box": [[0, 0, 0]]}}, 422, "invalid_prior", "prior.box"),
+    ({"prior": {"box": [[0, 0, 0], [1, 1, -1]]}}, 422, "invalid_prior", "prior.box"),
+    ({"prior": AT_TWO | {"box": [[0, 0, 0], [1, 1, 1]]}}, 422, "invalid_prior", "prior.box"),
+    ({"prior": AT_TWO | {"box": [[0, 0, 0], [9, 9, 9]], "sigma_deg": 1}}, 422, "invalid_prior", "prior.sigma_deg"),
+    ({"prior": {"sigma_deg": 1, "sigma_units": 1}}, 422, "invalid_prior", "prior"),
+    ({"prior": AT_TWO | {"sigma_deg": 1}}, 422, "invalid_prior", "prior.sigma_deg"),
+    ({"prior": AT_TWO | {"sigma_deg": 0, "sigma_units": 1}}, 422, "invalid_prior", "prior.sigma_deg"),
+    ({"prior": AT_TWO | {"covariance": [[0] * 6] * 6}}, 422, "invalid_prior", "prior.covariance"),
+    ({"prior": AT_TWO | {"covariance": LOPSIDED}}, 422, "invalid_prior", "prior.covariance"),
+    ({"truth": {"box": [[0, 0, 0], [1, 1, 1]]}}, 422, "invalid_prior", "truth.box"),
     ({"truth": {"world_from_camera": SHEARED}}, 422, "invalid_prior", "truth.world_from_camera"),
     ({"prior": {"convention": "blender"}}, 422, "invalid_prior", "prior.convention"),
     ({"seed": "x"}, 400, "invalid_request", "seed"),

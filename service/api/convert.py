@@ -8,6 +8,7 @@ import numpy as np
 
 from service.api.geo import geographic
 from service.api.schemas import (
+    Alternative,
     Axes,
     CameraOut,
     CandidatesOut,
@@ -23,6 +24,7 @@ from service.api.schemas import (
     NamedCameraOut,
     PoseOut,
     Record,
+    RegionOut,
     Result,
     SceneRef,
     Timing,
@@ -31,6 +33,7 @@ from service.api.schemas import (
 from service.geometry import quat_from_rotation
 from service.types import (
     HINTS,
+    Box,
     Camera,
     GeoAnchor,
     Intrinsics,
@@ -39,6 +42,7 @@ from service.types import (
     NamedCamera,
     Pose,
     PoseEstimate,
+    Region,
     StageTiming,
 )
 
@@ -157,6 +161,13 @@ def covariance_out(matrix: np.ndarray) -> Covariance:
     )
 
 
+def region_out(region: Region) -> RegionOut:
+    """Spell out what a prior admits."""
+    if isinstance(region, Box):
+        return RegionOut(box=[region.lower_in_world.tolist(), region.upper_in_world.tolist()])
+    return RegionOut(covariance=covariance_out(region.covariance))
+
+
 def timing_out(timing: StageTiming) -> Timing:
     """Spell out the time that a stage took."""
     return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
@@ -173,6 +184,7 @@ def result_out(
         hint=HINTS[verdict.reason],
         score=verdict.score,
         pose=pose_out(estimate.pose),
+        alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,

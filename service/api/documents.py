@@ -10,8 +10,8 @@ from importlib import metadata
 
 import numpy as np
 
-from service.api.convert import named_camera_out, pose_out
-from service.api.intake import options_adapter, prior_from
+from service.api.convert import named_camera_out, pose_out, region_out
+from service.api.intake import options_adapter, pose_from, prior_from
 from service.api.problems import problem_of
 from service.api.requests import LocalizeFields
 from service.api.scenes import Entry
@@ -73,6 +73,7 @@ def job_document(job: StoredJob, root: str) -> JobOut:
     summary = _summary(job, root)
     fields = LocalizeFields.model_validate_json(job.fields)
     error = Problem.model_validate_json(job.error) if job.error else None
+    pose, region = prior_from(fields.prior) if fields.prior else (None, None)
     return JobOut(
         **summary,
         scene_asked=fields.scene,
@@ -80,8 +81,9 @@ def job_document(job: StoredJob, root: str) -> JobOut:
         budget_s=fields.budget_s,
         deadline=_time(job.deadline) if job.deadline else None,
         options=fields.options,
-        prior=pose_out(prior_from(fields.prior)) if fields.prior else None,
-        truth=pose_out(prior_from(fields.truth)) if fields.truth else None,
+        prior=pose and pose_out(pose),
+        region=region and region_out(region),
+        truth=pose_out(pose_from(fields.truth, "truth")) if fields.truth else None,
         result=Result.model_validate_json(job.result) if job.result else None,
         error=error and error.model_copy(update={"instance": summary["links"].self}),
     )

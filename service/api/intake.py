@@ -20,7 +20,7 @@ from starlette.requests import Request as HttpRequest
 
 from service.api.convert import OPENCV_FROM_OPENGL
 from service.api.problems import described
-from service.api.requests import LocalizeFields, LocalizeIn, PriorIn
+from service.api.requests import LocalizeFields, LocalizeIn, PoseIn, PriorIn
 from service.api.scenes import several
 from service.api.sequence import Reading, check_sequence, is_packed, is_sequence, packed, read_sequence
 from service.errors import (
@@ -35,7 +35,8 @@ from service.geometry import rotation_from_quat
 from service.images import read_query
 from service.intrinsics import intrinsics_from
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
-from service.types import Intrinsics, Pose, Query, StageTiming
+from service.pose.region import admits
+from service.types import Box, Gaussian, Intrinsics, Pose, Query, Region, StageTiming
 
 _FIELDS = frozenset(LocalizeIn.model_fields)
 _ERRORS = {
@@ -171,9 +172,9 @@ def make_task(
         budget_s=fields.budget_s,
     )
     intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
-    prior = None if fields.prior is None else prior_from(fields.prior)
+    prior, region = (None, None) if fields.prior is None else prior_from(fields.prior)
     if fields.truth is not None:
-        prior_from(fields.truth, "truth")  # only checked: whoever measures errors reads it from the job
+        pose_from(fields.truth, "truth")  # only checked: whoever measures errors reads it from the job
     background = scene.scene.info.background_rgb
     wall, cpu = time.perf_counter(), time.thread_time()
     if is_sequence(body.photo):
@@ -186,7 +187,7 @@ def make_task(
                 where="scene",
                 hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
             )
-        reading = Reading(max_frames, fields.every, fields.times_s, intrinsics, prior, background)
+        reading = Reading(max_frames, fields.every, fields.times_s, intrinsics, prior, region, background)
         check_sequence(body.photo, reading)
         query = next(read_sequence(body.photo, reading)).query
     else:
@@ -195,6 +196,7 @@ def make_task(
                 raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
         reading = None
         query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
+        query = dataclasses.replace(query, region=region)
     decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
     return Task(request, decode, reading), query
 
@@ -246,32 +248,71 @@ def checked_intrinsics(values: Mapping[str, Any]) -> Intrinsics:
         raise
 
 
-def prior_from(prior: PriorIn, where: str = "prior") -> Pose:
+def prior_from(prior: PriorIn, where: str = "prior") -> tuple[Pose | None, Region | None]:
+    """Return the guess and the region of a prior. Raises InvalidPrior, at the field `where`."""
+    has_pose = any(getattr(prior, name) is not None for name in (*SPELLINGS, "quaternion_wxyz"))
+    pose = pose_from(prior, where) if has_pose or prior.box is None else None
+    spreads = [name for name in ("sigma_deg", "sigma_units", "covariance") if getattr(prior, name) is not None]
+    try:
+        if spreads:
+            return pose, _gaussian(prior, pose, spreads)
+        if prior.box is None:
+            return pose, None
+        box = Box(np.array(prior.box[0]), np.array(prior.box[1]))
+        if pose is not None and not admits(box, pose):
+            raise InvalidPrior("the pose lies outside the box.", where="box", hint="Leave one of them out.")
+        return pose, box
+    except InvalidPrior as error:
+        error.where = f"{where}.{error.where}"
+        raise
+
+
+def _gaussian(prior: PriorIn, pose: Pose | None, spreads: Sequence[str]) -> Gaussian:
+    """Return the Gaussian whose spreads were given. Raises InvalidPrior."""
+    if prior.box is not None:
+        raise InvalidPrior("a prior is a Gaussian or a box, not both.", where=spreads[0])
+    if pose is None:
+        raise InvalidPrior("a Gaussian needs a pose, its mean.", where=spreads[0])
+    if spreads == ["covariance"]:
+        return Gaussian(pose, np.array(prior.covariance, np.float64))
+    if prior.sigma_deg is None or prior.sigma_units is None or prior.covariance is not None:
+        raise InvalidPrior(
+            "give sigma_deg and sigma_units together, or a covariance instead of both.",
+            where=spreads[0],
+            hint="A sigma_deg of 180 says that the direction is unknown.",
+        )
+    spread = np.repeat([np.radians(prior.sigma_deg), prior.sigma_units], 3)
+    return Gaussian(pose, np.diag(spread**2))
+
+
+SPELLINGS = ("world_from_camera", "camera_from_world", "position")
+
+
+def pose_from(given_pose: PoseIn, where: str) -> Pose:
     """Return the pose in our conventions. Raises InvalidPrior, at the field `where`."""
-    spellings = ("world_from_camera", "camera_from_world", "position")
-    given = [name for name in spellings if getattr(prior, name) is not None]
-    if len(given) != 1 or (prior.position is None) != (prior.quaternion_wxyz is None):
+    given = [name for name in SPELLINGS if getattr(given_pose, name) is not None]
+    if len(given) != 1 or (given_pose.position is None) != (given_pose.quaternion_wxyz is None):
         raise InvalidPrior(
             "give exactly one of: world_from_camera; camera_from_world; position and quaternion_wxyz.",
             where=where,
         )
     try:
-        pose = _as_given(prior)
+        pose = _as_given(given_pose)
     except InvalidPrior as error:
         error.where = f"{where}.{given[0]}"
         raise
-    matrix = pose.camera_from_world if prior.camera_from_world else pose.world_from_camera
-    return Pose(matrix @ OPENCV_FROM_OPENGL if prior.convention == "opengl" else matrix)
+    matrix = pose.camera_from_world if given_pose.camera_from_world else pose.world_from_camera
+    return Pose(matrix @ OPENCV_FROM_OPENGL if given_pose.convention == "opengl" else matrix)
 
 
-def _as_given(prior: PriorIn) -> Pose:
+def _as_given(given: PoseIn) -> Pose:
     """Check what was given as a rigid motion, whatever its direction and axes."""
-    if prior.position is None or prior.quaternion_wxyz is None:
-        return Pose(np.array(prior.world_from_camera or prior.camera_from_world, np.float64))
+    if given.position is None or given.quaternion_wxyz is None:
+        return Pose(np.array(given.world_from_camera or given.camera_from_world, np.float64))
     # 1e-3, as for matrices: what was printed with 3 or 4 digits passes. NaN fails the comparison.
-    if not abs(np.linalg.norm(prior.quaternion_wxyz) - 1) < 1e-3:
+    if not abs(np.linalg.norm(given.quaternion_wxyz) - 1) < 1e-3:
         raise InvalidPrior("quaternion_wxyz must have length 1.")
     matrix = np.eye(4)
-    matrix[:3, :3] = rotation_from_quat(np.array(prior.quaternion_wxyz))
-    matrix[:3, 3] = prior.position
+    matrix[:3, :3] = rotation_from_quat(np.array(given.quaternion_wxyz))
+    matrix[:3, 3] = given.position
     return Pose(matrix)

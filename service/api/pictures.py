@@ -6,7 +6,7 @@ import io
 
 import numpy as np
 
-from service.api.intake import checked_intrinsics, prior_from
+from service.api.intake import checked_intrinsics, pose_from
 from service.api.requests import RenderIn
 from service.api.warmup import overview
 from service.errors import InvalidIntrinsics
@@ -28,7 +28,7 @@ def thumbnail(loaded: LoadedScene) -> bytes:
 
 def picture(loaded: LoadedScene, wanted: RenderIn) -> bytes:
     """Render to a file. Raises InvalidIntrinsics, InvalidPrior."""
-    camera = Camera(_intrinsics(loaded, wanted), prior_from(wanted.pose, "pose"))
+    camera = Camera(_intrinsics(loaded, wanted), pose_from(wanted.pose, "pose"))
     frame = loaded.rasterizer.render([camera])[0]
     if wanted.format == "depth":
         file = io.BytesIO()

@@ -11,10 +11,11 @@ from service.api.schemas import Model
 from service.video import MAX_EVERY
 
 Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
+Matrix6 = Annotated[list[Annotated[list[float], Len(6, 6)]], Len(6, 6)]
 
 
-class PriorIn(Model):
-    """A pose, a guess or a wish: exactly one of the three spellings."""
+class PoseIn(Model):
+    """A pose: exactly one of the three spellings."""
 
     convention: Literal["opencv", "opengl"] = "opencv"
     """The camera axes of what is given."""
@@ -26,10 +27,29 @@ class PriorIn(Model):
     """world_from_camera."""
 
 
+class PriorIn(PoseIn):
+    """What is known of the photo's pose: a guess, which may be wrong; or a Gaussian or a box that surely holds it.
+
+    A guess is a pose and no more. With `sigma_deg` and `sigma_units`, or `covariance`, the pose is a Gaussian's mean.
+    A `box` may stand alone or with a pose, a guess then. Poses beyond a Gaussian's 99.9 % or outside a box are
+    rejected. Of several photos it is about the first.
+    """
+
+    sigma_deg: float | None = Field(default=None, gt=0, le=180, allow_inf_nan=False)
+    """Standard deviation of the rotation, per axis. With 180 any direction is possible."""
+    sigma_units: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    """Standard deviation of the camera's centre, per axis, in scene units."""
+    covariance: Matrix6 | None = None
+    """Instead of the two: of (rotation in rad, translation in scene units) in the camera's frame and OpenCV's axes, as
+    results have it: true = pose @ exp(twist)."""
+    box: Annotated[list[Annotated[list[float], Len(3, 3)]], Len(2, 2)] | None = None
+    """Lower and upper corner, in the world, of a box along its axes that the camera's centre is in."""
+
+
 class RenderIn(Model):
     """A picture of a scene."""
 
-    pose: PriorIn
+    pose: PoseIn
     intrinsics: dict[str, Any] | None = None
     """Pinhole: `width, height, fx, fy, cx, cy`. Left out: those of the first training camera, or 640 x 480."""
     format: Literal["png", "jpeg", "depth"] = "png"
@@ -53,7 +73,7 @@ class LocalizeFields(Model):
     (the default), or `approximate`, whose focal length is estimated with the pose. Left out: taken from the EXIF
     data, or guessed; approximate then."""
     prior: PriorIn | None = None
-    truth: PriorIn | None = None
+    truth: PoseIn | None = None
     """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
     every: int = Field(default=1, ge=1, le=MAX_EVERY)
     """Of a video, or several photos: use each Nth, beginning with the first."""

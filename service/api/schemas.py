@@ -233,6 +233,14 @@ class Considered(Model):
     """With one of its views, that agree on one camera."""
 
 
+class Alternative(Model):
+    """Another answer."""
+
+    probability: float
+    """0..1, if one of the answers is right; the result's `pose` has what is left."""
+    pose: PoseOut
+
+
 class Result(Model):
     """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
 
@@ -245,6 +253,9 @@ class Result(Model):
     is `localized`."""
     pose: PoseOut
     """The best pose found. Don't use it unless `status` is `localized`."""
+    alternatives: list[Alternative] = []
+    """Other poses that explain the photo, too, most probable first. With a `pose` that isn't far more probable than
+    these the result is `uncertain`, and its reason `ambiguous`."""
     geopose: GeoPose | None
     """The same on Earth, for scenes whose manifest has a `geo_anchor`."""
     intrinsics: IntrinsicsOut
@@ -325,6 +336,14 @@ class JobSummary(Model):
     links: JobLinks
 
 
+class RegionOut(Model):
+    """A box that holds the camera's centre, or the covariance of a Gaussian about the prior."""
+
+    box: Matrix | None = None
+    """Lower and upper corner in the world."""
+    covariance: Covariance | None = None
+
+
 class JobOut(JobSummary):
     """A job with its result (state `succeeded`), or the error for which it has none (`failed`, `interrupted`)."""
 
@@ -336,6 +355,9 @@ class JobOut(JobSummary):
     """When the answer was of no use any more, if that was said."""
     options: dict[str, Any]
     prior: PoseOut | None
+    """The guess, or a Gaussian's mean."""
+    region: RegionOut | None
+    """Where the prior says that the camera is for certain."""
     truth: PoseOut | None
     """As it was sent; no part of the search."""
     result: Result | None

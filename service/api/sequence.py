@@ -6,7 +6,7 @@ import io
 import zipfile
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import UInt8
@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from service.errors import InvalidImage, InvalidRequest
 from service.images import photo_size, query_of, read_query
 from service.track import PHOTO_LONG_SIDE, SequencePhoto
-from service.types import Intrinsics, Pose
+from service.types import Intrinsics, Pose, Region
 from service.video import frame_count, is_video, read_video
 
 _ZIP = b"PK\x03\x04"
@@ -31,7 +31,8 @@ class Reading:
     """Of all photos, those that are left out as well; None: they come once a second, a video's at its own pace."""
     intrinsics: Intrinsics | None = None
     prior: Pose | None = None
-    """Of the first."""
+    """Of the first; so is the region."""
+    region: Region | None = None
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -85,6 +86,8 @@ def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, Non
                 query = read_query(source, prior=prior, background_rgb=reading.background_rgb, **given)
             else:
                 query = query_of(source, prior=prior, **given)
+            if first is None:
+                query = replace(query, region=reading.region)
             size = query.photo_intrinsics.width, query.photo_intrinsics.height
             first = first or size
             _check_size(size, first)

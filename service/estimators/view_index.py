@@ -30,7 +30,9 @@ from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
+from service.pose.region import admits, excess, loosened
 from service.pose.retrieval import top
+from service.pose.rivals import apart, ranked, rivals
 from service.pose.views import (
     PHOTO_PX,
     Correspondences,
@@ -76,6 +78,8 @@ LENS_SETTLED_PX = 0.05
 """The same while the focal length is free: it hides behind the distance, and hardly moves what is seen."""
 SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
+NEAREST = 16
+"""Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
 
@@ -107,9 +111,10 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
     hunt = _Hunt(query, tools)
-    for search in _searches(query, tools, options, hunt):
+    for search, sight, scores in _searches(query, tools, options, hunt):
         yield from hunt.follow(search)
         if hunt.accepted:
+            yield from hunt.contest(sight, scores)
             return
 
 
@@ -142,6 +147,32 @@ class _Hunt:
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
+    def contest(self, sight: _Sight, scores: np.ndarray) -> Iterator[IterationRecord]:
+        """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""
+        assert self.answer is not None
+        answers = [self.answer]
+        known = self.query.corrected(self.answer.lens)
+        seen, _ = rendered_view(self.answer.pose, known, self.tools)
+        distance = float(np.median(np.linalg.norm(seen.points_in_world - self.answer.pose.position_in_world, axis=1)))
+        pixels = sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
+        judged = (self.answer.pose, distance, verify(known, self.answer.pose, self.tools).signals)
+        suspected = rivals(
+            sight.features(self.query, self.tools), known.intrinsics, *judged,
+            self.tools.prepared.views, scores, self.tools.matcher, pixels,
+        )  # fmt: skip
+        for rival in suspected:
+            last: IterationRecord | None = None
+            for last in _refined(replace(rival, lens=self.answer.lens), self.query, self.tools):
+                yield self._with_answer(last)
+            if last is None or last.stage != "align" or not all(apart(last.pose, a.pose, distance) for a in answers):
+                continue
+            verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
+            if verdict.status is Status.LOCALIZED:
+                answers.append(last)
+        if len(answers) > 1:
+            self.answer, others = ranked(answers)
+            yield replace(self.answer, stage="contest", rivals=others)
+
     def _with_answer(self, record: IterationRecord) -> IterationRecord:
         return replace(record, pose=self.answer.pose, lens=self.answer.lens) if self.answer else record
 
@@ -164,23 +195,35 @@ class _Sight:
         return MATCH_ERROR_PX * max(1.0, PHOTO_PX / self.long_side)
 
 
-def _searches(query: Query, tools: Tools, options: Options, hunt: _Hunt) -> Iterator[Iterator[IterationRecord]]:
-    """The ways to look for the photo, cheapest first."""
+def _searches(
+    query: Query, tools: Tools, options: Options, hunt: _Hunt
+) -> Iterator[tuple[Iterator[IterationRecord], _Sight, np.ndarray]]:
+    """The ways to look for the photo, cheapest first; with each how it looks, and how well the views look like it."""
     index: ViewIndex = tools.prepared
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
-    votes = index.votes(sight.features(query, tools).descriptors)
-    ranked = deque(top(votes, options.candidates))
-    yield _search("retrieve", sight, votes, ranked, query, tools)
+    votes = _within_reach(index.votes(sight.features(query, tools).descriptors), query, index)
+    untried = deque(top(votes, options.candidates))
+    yield _search("retrieve", sight, votes, untried, query, tools), sight, votes
     sight, votes = _turned_sight(sight, votes, query, tools)
+    votes = _within_reach(votes, query, index)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
-    ranked.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
-    while ranked:
-        yield _search("turn" if sight.eighths else "further", sight, votes, ranked, query, tools)
+    untried.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
+    while untried:
+        yield _search("turn" if sight.eighths else "further", sight, votes, untried, query, tools), sight, votes
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
-        yield _sampled(sight, votes, query, tools)
+        yield _sampled(sight, votes, query, tools), sight, votes
+
+
+def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: ViewIndex) -> Float64[np.ndarray, "views"]:
+    """Return the views' votes, those of views that are far from the photo's region put below all others."""
+    if query.region is None:
+        return votes
+    away = np.array([excess(query.region, view.camera.pose) for view in index.views])
+    reach = np.sort(away)[min(NEAREST, len(away)) - 1]
+    return np.where(away <= reach, votes, min(0.0, float(votes.min())))
 
 
 def _turned_sight(
@@ -217,19 +260,19 @@ def _search(
     stage: str,
     sight: _Sight,
     votes: Float64[np.ndarray, "views"],
-    ranked: deque[int],
+    untried: deque[int],
     query: Query,
     tools: Tools,
 ) -> Iterator[IterationRecord]:
     """Go from views, the likeliest first, to an aligned pose; end early where too few matches agree.
 
-    The views that were looked at are taken from `ranked`.
+    The views that were looked at are taken from `untried`.
     """
     index: ViewIndex = tools.prepared
-    poses = [index.views[i].camera.pose for i in ranked]
-    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), votes[list(ranked)])
+    poses = [index.views[i].camera.pose for i in untried]
+    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), votes[list(untried)])
     yield IterationRecord(stage, query.prior or poses[0], candidates=candidates)
-    views = (index.views[ranked.popleft()] for _ in range(len(ranked)))
+    views = (index.views[untried.popleft()] for _ in range(len(untried)))
     if query.prior and stage == "retrieve":
         views = chain([rendered_view(query.prior, query, tools)[0]], views)
     found = yield from _matched(sight, views, query, tools)
@@ -253,8 +296,8 @@ def _sampled(
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
         yield _match_record("sample", best or pose, matches, found, view.camera)
-    if best and best.num_inliers >= PROMISING and (best := (yield from _rematched(best, query, tools))):
-        yield from _aligned(best, query, tools)
+    if best and best.num_inliers >= PROMISING:
+        yield from _refined(best, query, tools)
 
 
 def _matched(
@@ -281,6 +324,12 @@ def _matched(
     count = len(pooled.photo_px)
     yield IterationRecord("pool", best.pose, best.lens, num_matches=count, num_inliers=best.num_inliers)
     return best
+
+
+def _refined(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+    """Match again, and align."""
+    if again := (yield from _rematched(found, query, tools)):
+        yield from _aligned(again, query, tools)
 
 
 def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
@@ -339,13 +388,22 @@ def _resected(
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     given = (matches.photo_px, matches.points_in_world)
     if not query.focal_sigma:
-        return resection(*given, query.intrinsics, pixels, max_trials)
-    if near is None:
-        return focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
-    found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
-    if found is None:
-        return None
-    return refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
+        found = resection(*given, query.intrinsics, pixels, max_trials)
+    elif near is None:
+        found = focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
+    else:
+        found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
+        if found:
+            found = refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
+    return found if found and _possible(found.pose, matches, query) else None
+
+
+def _possible(pose: Pose, matches: Correspondences, query: Query) -> bool:
+    """Tell whether the photo's region may hold what the pose leads to."""
+    if query.region is None:
+        return True
+    distance = np.median(np.linalg.norm(matches.points_in_world - pose.position_in_world, axis=1))
+    return admits(loosened(query.region, float(distance)), pose)
 
 
 def _match_record(

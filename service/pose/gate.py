@@ -14,7 +14,7 @@ spheres has all edges in place, and other colours).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from service.interfaces import Frame, Tools
 from service.pose.alignment import Evidence, evidence
 from service.pose.pnp import reprojection_error_px
+from service.pose.region import admits
 from service.pose.views import (
     Correspondences,
     correspondences,
@@ -129,7 +130,15 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     signals |= _match_signals(found, _both_known(frame, known), query, size, pose)
     if known is not None:  # as many as a whole photo would have
         signals["inliers"] /= max(float(known.mean()), 0.1)
-    return judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
+    verdict = judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
+    return verdict if admits(query.region, pose) else doubted(verdict, Reason.OUTSIDE_PRIOR)
+
+
+def doubted(verdict: Verdict, reason: Reason, score: float = DOUBTFUL) -> Verdict:
+    """Return a verdict that would be `localized`, but for this reason; others have theirs already."""
+    if verdict.status is not Status.LOCALIZED:
+        return verdict
+    return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
 
 
 def pixel_signals(

@@ -47,7 +47,8 @@ def vectors_and_paths(
     """Figure 1: rows of match vectors, and below them the paths of the cameras and their rotation errors."""
     columns = max(len(row) for row in rows)
     figure = Figure(figsize=(3.1 * columns, 2.9 * (len(rows) + 1)), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(len(rows), 1))
+    parts: Any = figure.subfigures(2, 1, height_ratios=(len(rows), 1))
+    above, below = parts
     grid = above.subplots(len(rows), columns, squeeze=False)
     box = _box_of([vectors for row in rows for vectors in row])
     for places, row in zip(grid, rows, strict=True):

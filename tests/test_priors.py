@@ -1,0 +1,89 @@
+"""What is known beforehand of a photo's pose decides where the scene repeats itself, and holds for the answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_room import HALF_TURN, write_room
+from test_estimators import assert_near, photo_at, unseen_pose
+
+from service.errors import InvalidPrior
+from service.estimators.view_index import Options
+from service.geometry import moved
+from service.localize import LoadedScene, Request, localize
+from service.pose.region import admits, excess, loosened
+from service.types import Box, Gaussian, Pose, Reason, Region, Status
+
+TRUTH = unseen_pose()
+FAST = Request(options=Options(effort="fast"))
+TWIN = Pose(HALF_TURN @ TRUTH.world_from_camera)
+
+
+@pytest.fixture(scope="module")
+def repeated(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    folder = tmp_path_factory.mktemp("repeated")
+    return LoadedScene.load(write_room(folder / "room", repeated=True), cache_dir=folder / "cache")
+
+
+def box_around(pose: Pose, size: float) -> Box:
+    return Box(pose.position_in_world - size, pose.position_in_world + size)
+
+
+def gaussian_at(pose: Pose, degrees: float, units: float) -> Gaussian:
+    return Gaussian(pose, np.diag(np.repeat([np.radians(degrees), units], 3) ** 2))
+
+
+@pytest.mark.parametrize("place", [TRUTH, TWIN])
+@pytest.mark.parametrize("kind", ["box", "gaussian"])
+def test_a_region_decides_between_places_that_look_alike(kind: str, place: Pose, repeated: LoadedScene) -> None:
+    region: Region = box_around(place, 0.3) if kind == "box" else gaussian_at(moved(place, np.full(6, 0.05)), 5, 0.1)
+    found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated)
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, place)
+
+
+@pytest.mark.parametrize("region", [box_around(Pose(np.diag([1.0, -1, -1, 1])), 0.1), gaussian_at(TWIN, 2, 0.05)])
+def test_where_the_photo_was_not_taken_nothing_is_localized(region: Region, repeated: LoadedScene) -> None:
+    elsewhere = moved(TRUTH, np.array([0.0, 1.5, 0, 0, 0, 0]))
+    found = localize(replace(photo_at(repeated, elsewhere), region=region), repeated, FAST)
+    assert found.verdict.status is not Status.LOCALIZED
+
+
+def test_an_answer_that_the_prior_excludes_is_no_answer(repeated: LoadedScene) -> None:
+    """Near enough for a pose before alignment, 17 standard deviations off after it."""
+    region = gaussian_at(moved(TRUTH, np.array([0, 0, 0, 0.05, 0, 0])), 0.5, 0.003)
+    found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated, FAST)
+    assert found.verdict.status is Status.UNCERTAIN
+    assert found.verdict.reason is Reason.OUTSIDE_PRIOR
+
+
+def test_regions_end_where_they_say() -> None:
+    box = Box(np.zeros(3), np.array([1.0, 2.0, 3.0]))
+    inside, outside = np.eye(4), np.eye(4)
+    inside[:3, 3], outside[:3, 3] = [0.5, 2.0, 0.0], [1.3, 2.4, 1.0]
+    assert admits(box, Pose(inside))
+    assert excess(box, Pose(outside)) == pytest.approx(0.5)
+    assert admits(None, Pose(outside))
+    # 99.9 % of a chi-square with 6 degrees of freedom, by drawn twists.
+    covariance = np.diag(np.repeat([0.01, 0.2], 3) ** 2)
+    covariance[0, 4] = covariance[4, 0] = 0.0015
+    region = Gaussian(TRUTH, covariance)
+    draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 4_000)
+    kept = np.mean([admits(region, moved(TRUTH, twist)) for twist in draws])
+    assert kept == pytest.approx(0.999, abs=0.0015)  # three standard deviations
+    assert not admits(gaussian_at(TRUTH, 1, 1), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
+    assert admits(loosened(gaussian_at(TRUTH, 1, 1), 1.0), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
+
+
+@pytest.mark.parametrize("corners", [([0, 0, 0], [1, 1, 0]), ([0, 0, np.nan], [1, 1, 1])])
+def test_an_empty_box_is_refused(corners: tuple[list, list]) -> None:
+    with pytest.raises(InvalidPrior, match="corners"):
+        Box(*map(np.array, corners))
+
+
+@pytest.mark.parametrize("matrix", [np.zeros((6, 6)), -np.eye(6), np.eye(5), np.full((6, 6), np.nan), np.ones((6, 6))])
+def test_what_is_no_covariance_is_refused(matrix: np.ndarray) -> None:
+    with pytest.raises(InvalidPrior, match="positive definite"):
+        Gaussian(TRUTH, matrix)
