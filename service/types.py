@@ -519,9 +519,7 @@ class PoseEstimate:
     @property
     def alternatives(self) -> tuple[tuple[Pose, float], ...]:
         """Other poses that explain the photo, too, and how probable each is, most probable first."""
-        rivals = self.records[-1].rivals
-        return (
-            ()
-            if rivals is None
-            else tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))
-        )
+        rivals = self.records[-1].rivals if self.records else None
+        if rivals is None:
+            return ()
+        return tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))

@@ -216,11 +216,15 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         "blur=2",
         "--options",
         '{"candidates": 3}',
+        "--misses",
+        tmp_path / "misses",
         "--json",
         written,
     )
     assert code == 0, complaint
     assert asked.pop("progress")
+    assert asked.pop("on_miss")
+    assert (tmp_path / "misses").is_dir()
     assert asked.pop("options").candidates == 3
     assert asked.pop("budget") == service.bench.localize.Budget(None, 9)
     assert asked.pop("cache_dir") == Path(os.environ["SPLATFIX_CACHE_DIR"])

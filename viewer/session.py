@@ -7,6 +7,7 @@ once, so a dragged slider or a fast job never queues up work, and a slow browser
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 import time
@@ -94,6 +95,8 @@ class Session:
         self._library.ignore(self._jobs_changed)
         if self._feed is not None:
             self._library.leave(self._feed, self._feed_changed)
+        # A browser's widgets refer to one another: left to itself, Python finds them when many more have come and gone.
+        gc.collect()
 
     def _idle(self) -> None:
         """Nothing else waits: draw the picture that is due, or play on."""

@@ -26,7 +26,8 @@ class ViewerChild:
 
     def __init__(self, service_url: str, key: str) -> None:
         """`key` lets the viewer in; it goes by the environment, since everybody can see a process's arguments."""
-        self._environment = os.environ | {"SPLATFIX_VIEWER_KEY": key}
+        # Each browser has threads of its own there: with an arena for each, what they free is lost to the others.
+        self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"SPLATFIX_VIEWER_KEY": key}
         self.port = _free_port()
         self.command = [sys.executable, "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
