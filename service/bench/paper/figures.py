@@ -14,6 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from service.images import with_palette
+
 DPI, PICTURES_DPI = 110, 80
 MARGIN = 0.05
 """About the match vectors of Figure 1, of the photo's long side."""
@@ -188,4 +190,4 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> bytes:
 def _png(figure: Figure, dpi: int = DPI) -> bytes:
     stream = io.BytesIO()
     FigureCanvasAgg(figure).print_figure(stream, dpi=dpi, format="png")
-    return stream.getvalue()
+    return with_palette(stream.getvalue())

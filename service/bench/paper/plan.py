@@ -93,8 +93,9 @@ RANGES_DEG = (15.0, 30.0, 60.0, 120.0)
 @cache
 def cells() -> tuple[Cell, ...]:
     """Return all there is to run, in the order of worth."""
-    found = [_compared("table2", method, protocol) for protocol in ("hard", "easy") for method in MAIN]
-    found[2:2] = [Cell("table2", method, "none") for method in MAIN[:2]]
+    starts = (("table2", "hard"), ("table2", "none"), ("table2", "easy"), ("pnerf", "pnerf"))
+    found = [Cell(study, method, start) for study, start in starts for method in MAIN[:2]]
+    found += [Cell(study, method, start, 0.25) for study, start in starts if start != "none" for method in MAIN[2:]]
     for row, stages in ABLATION.items():
         options = _NO_STAGE | {key: value for stage in stages for key, value in _STAGES[stage].items()}
         method = _mc_do(f"mc_do:{row or 'descent'}", **options)
@@ -103,18 +104,13 @@ def cells() -> tuple[Cell, ...]:
     found.append(Cell("table5", MAIN[0], "random", share=1.25, photos=IMAGES_OF_TABLE_5))
     for loss in LOSSES:
         method = _mc_do(f"mc_do:{loss}", **_NO_STAGE | {"refinement_steps": STEPS_OF_TABLE_1, "loss": loss})
-        found.append(Cell("table1", method, "near", share=0.5))
+        found.append(Cell("table1", method, "near", share=0.25))
     for degrees in RANGES_DEG:
         found.append(Cell("range", _mc_do(f"mc_do:range{degrees:g}", range_deg=degrees), "hard", share=0.25))
     for pixels in RESOLUTIONS_PX:
         sizes = {"hypothesis_px": pixels, "render_px": pixels}
         found.append(Cell("resolution", _mc_do(f"mc_do:{pixels}px", **sizes), "hard", share=0.125))
-    found += [_compared("pnerf", method, "pnerf") for method in MAIN]
     return tuple(sorted(found, key=lambda cell: cell.method.name == "pnerf"))  # a trial of it takes longest
-
-
-def _compared(study: str, method: Method, protocol: str) -> Cell:
-    return Cell(study, method, protocol, share=0.25 if method.name == "mc_do_gradient" else 1.0)
 
 
 def chosen(

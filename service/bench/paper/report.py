@@ -22,7 +22,8 @@ body{font:15px/1.5 system-ui,sans-serif;max-width:1180px;margin:2rem auto;paddin
 h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2.2rem}
 .scroll{overflow-x:auto}table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums}
 th,td{padding:.22rem .6rem;text-align:right;border-bottom:1px solid #ddd;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}thead th{border-bottom:2px solid #888}
+th:first-child,td:first-child{text-align:left}
+thead th{border-bottom:2px solid #888;white-space:normal;vertical-align:bottom}
 tr.published td{color:#6a6a6a}p.note{font-size:13px;color:#444;max-width:75ch;margin:.2rem 0}
 img{max-width:100%}td.yes{color:#1d7a3a}td.no{color:#b3261e}
 """

@@ -259,7 +259,7 @@ def _times(lines: Sequence[Line], scenes: Sequence[str]) -> Iterator[Table]:
     yield Table(
         "times",
         "Time and renders a query",
-        (*_notes([line for line in chosen if line["profile"]]), "Seconds. CPU time is the process's; wall time also"
+        (*_notes(chosen), "Seconds. CPU time is the process's; wall time also"
          " holds what else the machine did. Renders: pictures, and gradients as one more each; the median."),
         ("method", "start", "scene", "queries", "CPU p50", "CPU p95", "wall p50", "wall p95", "renders"),
         tuple(rows),
