@@ -433,7 +433,7 @@ def bench_gate(
         from service.bench.paper.figures import reliability
 
         plot.write_bytes(reliability({name: outcome[name]["reliability"] for name in ("with_matches", "by_pixels")}))
-    for name in ("with_matches", "by_pixels"):
+    for name in ("with_matches", "by_pixels", "glance"):
         for key, value in outcome[name].items():
             if key not in ("reliability", "by_kind"):
                 out.print(f"{name:13} {key:30} {value}", markup=False, highlight=False, soft_wrap=True)

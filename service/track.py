@@ -159,11 +159,11 @@ class Tracker:
         rng = np.random.default_rng(self._request.seed)
         rasterizer = Counted(rasterizer_for(query, self._loaded), tally)
         tools = Tools(self._loaded.scene, rasterizer, self._loaded.matcher, rng, tally=tally)
-        found = _aligned(query, expected, self._seen, tools)
+        found = aligned_from(query, expected, self._seen, tools)
         if found is None:
             return None
         self._seen = found.seen
-        verdict = _glance(query, found, tools)
+        verdict = glance(query, found, tools)
         timings = [StageTiming("track", clock.wall_s, clock.cpu_s)]
         renders = tally.count
         self._unverified += 1
@@ -230,7 +230,7 @@ class _Aligned:
     evidence: Evidence
 
 
-def _aligned(query: Query, expected: Pose, seen: _Seen | None, tools: Tools) -> _Aligned | None:
+def aligned_from(query: Query, expected: Pose, seen: _Seen | None, tools: Tools) -> _Aligned | None:
     """Align with what was seen last, then with the scene as it looks from there; None where too little overlaps."""
     size = sized(query.intrinsics, TRACK_PX)
     photo = photo_at(query, tools, size)
@@ -253,7 +253,7 @@ def _aligned(query: Query, expected: Pose, seen: _Seen | None, tools: Tools) -> 
     return None if weighed is None else _Aligned(pose, seen, first.loss, weighed)
 
 
-def _glance(query: Query, found: _Aligned, tools: Tools) -> Verdict | None:
+def glance(query: Query, found: _Aligned, tools: Tools) -> Verdict | None:
     """Judge a pose as the gate does, by the pixels alone: matches cost most; None where these don't make it clear."""
     size = found.seen.camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)

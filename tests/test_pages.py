@@ -153,6 +153,16 @@ def test_a_pasted_photo_that_shows_nothing_is_refused_with_reason_and_hint(page:
     _audit(page)
 
 
+def test_an_ambiguous_photo_tells_the_other_places(page: Page, url: str) -> None:
+    job = posted(url, PHOTO.read_bytes(), {"scene": "studio"})
+    other = {"probability": 0.42, "pose": job["result"]["pose"] | {"position": [1.0, -2.5, 0.125]}}
+    job["result"] |= {"status": "uncertain", "reason": "ambiguous", "hint": "Show more.", "alternatives": [other]}
+    page.route(f"{url}/jobs/{job['id']}", lambda route: route.fulfill(json=job))
+    page.goto(f"{url}/#/jobs/{job['id']}")
+    expect(page.get_by_text("It may as well have been taken at")).to_contain_text("1.000, -2.500, 0.125 (42 %)")
+    _audit(page)
+
+
 def test_the_answer_can_be_copied_and_taken_along(page: Page, url: str) -> None:
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     job = posted(url, PHOTO.read_bytes(), {"scene": "studio"})

@@ -9,6 +9,8 @@ import pytest
 from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
+from service.api.convert import result_out
+from service.api.schemas import Timing
 from service.geometry import pose_distance
 from service.localize import LoadedScene, Request, localize
 from service.pose.rivals import ranked
@@ -34,6 +36,9 @@ def test_a_room_that_repeats_itself_has_two_answers(seed: int, repeated: LoadedS
     both = sorted((found.pose, other), key=lambda pose: pose_distance(pose, truth)[1])
     assert_near(both[0], truth)
     assert_near(both[1], Pose(HALF_TURN @ truth.world_from_camera))
+    (told,) = result_out(found, Timing(stage="decode", wall_s=0.0, cpu_s=0.0), {}).alternatives
+    assert told.probability == probability
+    assert told.pose.position == other.position_in_world.tolist()
 
 
 def test_with_an_approximate_lens_too(repeated: LoadedScene) -> None:

@@ -8,6 +8,7 @@ bound. Wrong ones are made by stress:
     moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are (by 0.002 to 0.012 units and up
                 to 0.12 degrees they are right: samples of what less exact methods answer: near)
     drifted     the same, aligned from there, where that doesn't lead back
+    followed    the same, as the tracker does it: judged by its glance alone, with the weights that are in use
 
 Weights and floors are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a
 result is of those tests. Those in `service/pose/gate.py` are the fit on all. Floors are of right poses within reason.
@@ -34,7 +35,8 @@ from service.localize import Request, localize
 from service.pose.alignment import align
 from service.pose.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
 from service.pose.views import photo_at, rendered_frame
-from service.types import Camera, Intrinsics, Pose, Query, Reason, Verdict
+from service.track import aligned_from, glance
+from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
 
 WITHIN_REASON: tuple[tuple[str, ...], ...] = (
     (), ("gain=0.7",), ("gain=1.4",), ("gamma=0.6",), ("gamma=1.6",), ("white_balance=1.25",), ("blur=4",),
@@ -62,6 +64,7 @@ OTHER_DOUBTS = (
     Reason.INTRINSICS_CONTRADICTED,
     Reason.LITTLE_SCENE_IN_VIEW,
     Reason.PLACE_UNCERTAIN,
+    Reason.AMBIGUOUS,
 )
 
 
@@ -75,6 +78,8 @@ class Sample:
     doubted: bool
     """For another reason than the signals: never localized."""
     nees: float | None
+    glanced: bool | None = None
+    """Whether the tracker's glance takes the pose for right; None: that wasn't asked."""
 
 
 def run(
@@ -104,7 +109,7 @@ def run(
 
 
 def _line(sample: Sample) -> dict[str, Any]:
-    names = ("scene", "kind", "photo", "right", "doubted", "nees")
+    names = ("scene", "kind", "photo", "right", "doubted", "nees", "glanced")
     return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
 
 
@@ -130,6 +135,7 @@ def _of_photo(
         pose = _moved(photo.camera.pose, one, *MOVED, rng)
         tools = _tools(one)
         yield _sample(one, "moved", photo.name, photo.camera.pose, pose, verify(query, pose, tools))
+        yield from _followed(one, photo, query, pose)
         frame, camera = rendered_frame(pose, query, tools)
         size = camera.intrinsics
         start = Camera(query.intrinsics.resized(size.width, size.height), pose)
@@ -137,6 +143,18 @@ def _of_photo(
         if np.isfinite(found.loss):
             verdict = verify(query, found.pose, _tools(one))
             yield _sample(one, "drifted", photo.name, photo.camera.pose, found.pose, verdict)
+
+
+def _followed(one: Subject, photo: BenchPhoto, query: Query, expected: Pose) -> Iterator[Sample]:
+    """Yield what the tracker makes of a camera that isn't where it is expected."""
+    tools = _tools(one)
+    found = aligned_from(query, expected, None, tools)
+    if found is None:
+        return
+    seen = glance(query, found, tools)
+    verdict = seen or verify(query, found.pose, tools)
+    sample = _sample(one, "followed", photo.name, photo.camera.pose, found.pose, verdict)
+    yield replace(sample, glanced=seen is not None and seen.status is Status.LOCALIZED)
 
 
 def _foreign(one: Subject, others: Sequence[Subject]) -> Iterator[Sample]:
@@ -218,12 +236,14 @@ def _sample(
 
 def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     """Return weights fitted on all samples, and what such weights say of scenes that they were not fitted on."""
+    glanced = [sample for sample in samples if sample.glanced is not None]
+    samples = [sample for sample in samples if sample.glanced is None]
     right = np.array([sample.right for sample in samples])
     scenes = np.array([sample.scene for sample in samples])
     kinds = np.array([sample.kind for sample in samples])
     doubted = np.array([sample.doubted for sample in samples])
     usual = right & ~np.char.startswith(kinds, "beyond")
-    result: dict[str, Any] = {}
+    result: dict[str, Any] = {"glance": _glances(glanced)}
     for name, model in (("with_matches", WITH_MATCHES), ("by_pixels", BY_PIXELS)):
         features = scaled(samples, model)
         tested = np.zeros(len(samples))
@@ -241,6 +261,17 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
             "reliability": _reliability(tested, right),
         }
     return result
+
+
+def _glances(samples: Sequence[Sample]) -> dict[str, int]:
+    """Return how many right and wrong poses the tracker's glance takes for right."""
+    right, wrong = [s for s in samples if s.right], [s for s in samples if not s.right]
+    return {
+        "right": len(right),
+        "right_localized": sum(bool(s.glanced) for s in right),
+        "wrong": len(wrong),
+        "wrong_localized": sum(bool(s.glanced) for s in wrong),
+    }
 
 
 def scaled(samples: Sequence[Sample], model: Mapping[str, float]) -> Float64[np.ndarray, "n k"]:

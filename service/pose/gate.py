@@ -206,12 +206,15 @@ def judged(
     """Return the verdict on a pose; `focal_sigma` is what was known of the lens."""
     score = min(probability(signals), DOUBTFUL if in_doubt(signals) else 1.0)
     doubt, covariance, sigma = _of_lens(pixels, focal_sigma)
-    if signals["coverage"] < MIN_COVERAGE:
+    little = signals["coverage"] < MIN_COVERAGE
+    if little:
         doubt = Reason.LITTLE_SCENE_IN_VIEW
     elif doubt is None and signals["sigma_share"] > MAX_SIGMA_SHARE:
         doubt = Reason.PLACE_UNCERTAIN
     if score < LOCALIZED:
         reason = Reason.FEW_FEATURES if few_features else _weakest(signals)
+        if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_DISAGREES):
+            reason = Reason.LITTLE_SCENE_IN_VIEW  # of which the others are consequences
     elif doubt:
         score, reason = DOUBTFUL, doubt
     else:

@@ -26,8 +26,14 @@ function verdict({ result, error, state }) {
   const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
   return [
     h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, `${sentence(result.reason)}.`), " ", lead)),
+    ...(result.alternatives.length ? [alternatives(result)] : []),
     ...result.warnings.map(warning => h("p", { class: "warning" }, warning)),
   ];
+}
+
+function alternatives({ alternatives: others }) {
+  const place = ({ pose, probability }) => h("li", {}, `${pose.position.map(x => x.toFixed(3)).join(", ")} (${Math.round(100 * probability)} %)`);
+  return h("div", { class: "warning" }, "It may as well have been taken at", h("ul", {}, ...others.map(place)));
 }
 
 function pictures(job) {

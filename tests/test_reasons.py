@@ -1,0 +1,97 @@
+"""Every reason of a result, provoked, and what it tells the user to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from small_room import write_room
+from test_estimators import LENS, photo_at, unseen_pose
+
+from service.estimators.view_index import Options
+from service.geometry import look_at
+from service.interfaces import Tools
+from service.localize import LoadedScene, Request, localize
+from service.pose.gate import verify
+from service.types import HINTS, Box, Pose, Query, Reason, Status, Verdict
+
+TRUTH = unseen_pose()
+UP = np.array([0.0, 0.0, 1.0])
+BEFORE_A_WALL = look_at(np.array([0.7, 0.1, 0.0]), np.array([2.0, 0.1, 0.0]), UP)
+FAR_OUTSIDE = look_at(np.array([25.0, 3.0, 4.0]), np.zeros(3), UP)
+FAST = Request(options=Options(effort="fast"))
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, LoadedScene]:
+    """An ordinary room, and (True) one that repeats itself."""
+    folder = tmp_path_factory.mktemp("rooms")
+    return {
+        r: LoadedScene.load(write_room(folder / str(r), repeated=r), cache_dir=folder / "cache") for r in (False, True)
+    }
+
+
+def judged(room: LoadedScene, query: Query, pose: Pose = TRUTH) -> Verdict:
+    return verify(query, pose, Tools(room.scene, room.rasterizer, room.matcher, np.random.default_rng(0)))
+
+
+def blurred(query: Query, sigma_px: float) -> Query:
+    return replace(query, rgb=np.asarray(cv2.GaussianBlur(query.rgb, (0, 0), sigma_px)))
+
+
+def grey(query: Query) -> Query:
+    return replace(query, rgb=np.full_like(query.rgb, 127))
+
+
+PROVOKED: dict[Reason, Callable[[LoadedScene, LoadedScene], Verdict]] = {
+    Reason.AGREES: lambda room, _: judged(room, photo_at(room, TRUTH)),
+    Reason.FEW_FEATURES: lambda room, _: localize(grey(photo_at(room, TRUTH)), room, FAST).verdict,
+    Reason.NO_MATCHING_VIEW: lambda room, _: judged(room, photo_at(room, TRUTH), unseen_pose(4)),
+    Reason.RENDER_DISAGREES: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
+    Reason.FEW_INLIERS: lambda room, _: judged(room, blurred(photo_at(room, TRUTH), 10.0)),
+    Reason.LITTLE_SCENE_IN_VIEW: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
+    Reason.FOCAL_UNCERTAIN: lambda room, _: localize(of_a_wall(room), room, FAST).verdict,
+    Reason.INTRINSICS_CONTRADICTED: lambda room, _: localize(with_a_wrong_lens(room), room, FAST).verdict,
+    Reason.PLACE_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
+    Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
+    Reason.AMBIGUOUS: lambda _, repeated: localize(photo_at(repeated, TRUTH), repeated, FAST).verdict,
+    Reason.BUDGET_EXHAUSTED: lambda room, _: (
+        localize(photo_at(room, TRUTH), room, replace(FAST, budget_s=1e-9)).verdict
+    ),
+}
+ELSEWHERE = Box(np.array([0.0, 0, 0]), np.array([0.01, 0.01, 0.01]))
+
+
+def with_swapped_colours(query: Query) -> Query:
+    return replace(query, rgb=np.ascontiguousarray(query.rgb[..., [1, 2, 0]]))
+
+
+def of_a_wall(room: LoadedScene) -> Query:
+    """Straight before a flat wall a longer lens is as good as a shorter distance."""
+    return photo_at(room, BEFORE_A_WALL, replace(LENS, trust="approximate"))
+
+
+def with_a_wrong_lens(room: LoadedScene) -> Query:
+    query = photo_at(room, TRUTH)
+    lens = replace(LENS, fx=1.04 * LENS.fx, fy=1.04 * LENS.fy)
+    return replace(query, intrinsics=lens, photo_intrinsics=lens)
+
+
+def middle_of_a_wall(room: LoadedScene) -> Query:
+    """A small, flat part: what a turn does to it, a step aside does as well."""
+    query = photo_at(room, BEFORE_A_WALL)
+    known = np.zeros(query.rgb.shape[:2], bool)
+    height, width = known.shape
+    known[height // 4 : -height // 4, width // 4 : -width // 4] = True
+    return replace(query, known=known)
+
+
+@pytest.mark.parametrize("reason", list(Reason))
+def test_every_reason_is_given_where_it_is_due(reason: Reason, rooms: dict[bool, LoadedScene]) -> None:
+    verdict = PROVOKED[reason](rooms[False], rooms[True])
+    assert verdict.reason is reason, (verdict.score, dict(verdict.signals))
+    assert (verdict.status is Status.LOCALIZED) == (reason is Reason.AGREES)
+    assert bool(HINTS[reason]) == (reason is not Reason.AGREES)
