@@ -489,6 +489,25 @@ def bench_scale(
         out.print(f"{name:20}" + " ".join(f"{_short(row[name]):>14}" for row in rows), highlight=False, soft_wrap=True)
 
 
+@bench_app.command("ablation")
+def bench_ablation(
+    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
+    parts: Annotated[list[str] | None, typer.Option("--part", help="Remove only this; may be repeated.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
+) -> None:
+    """Remove each part of the default estimator in turn; print a Markdown table of what is left."""
+    from service.bench.ablation import run, table
+
+    _tell_machine()
+    if len(folders) < 2:
+        raise InvalidRequest("needs two scenes or more, to hide the photos of one by another's.", where="folders")
+    with _progress() as progress:
+        counter = _counter(progress, "conditions")
+        rows = run(folders, parts=parts or (), cache_dir=_settings({}).cache_dir, progress=counter)
+    _write_json(json_file, rows)
+    out.print(table(rows), markup=False, highlight=False, soft_wrap=True)
+
+
 @scenes_app.command("list")
 def list_scenes(
     folder: Annotated[Path, typer.Argument(help="A scene, or a folder of scenes.")] = Path(),

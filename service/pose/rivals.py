@@ -10,6 +10,7 @@ suspicions: whoever asks aligns them, has the gate judge them, and compares what
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 
 import numpy as np
 
@@ -58,8 +59,8 @@ def rivals(
     `distance` is that from the answer to what it sees, `signals` are the gate's of it; `scores` say which views are
     like the photo. `photo` and `max_error_px` are in pixels of the intrinsics.
     """
-    elsewhere = np.array([not _alike(view, answer) for view in views])
-    chosen = [i for i in top(np.where(elsewhere, scores, -np.inf), VIEWS) if elsewhere[i]]
+    elsewhere = (i for i in top(scores, len(scores)) if not _alike(views[i], answer))
+    chosen = list(islice(elsewhere, VIEWS))
     if not chosen:
         return
     strong = _strongest(photo)

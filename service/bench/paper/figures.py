@@ -166,16 +166,16 @@ def reliability(models: Mapping[str, Sequence[Mapping[str, float]]]) -> bytes:
 
 
 def growth(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Draw time and memory against the number of Gaussians; the rows are those of `bench scale`."""
+    """Draw CPU time and memory against the number of Gaussians; the rows are those of `bench scale`."""
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     times, latency, memory = figure.subplots(1, 3)
     size = [row["gaussians"] for row in rows]
-    for name, label in (("load_s", "load from the file"), ("load_again_s", "load again"), ("index_s", "index")):
+    stages = (("load_cpu_s", "load from the file"), ("load_again_cpu_s", "load again"), ("index_cpu_s", "index"))
+    for name, label in stages:
         times.plot(size, [row[name] for row in rows], "o-", label=label)
-    times.set(title="seconds to be ready", yscale="log")
-    latency.plot(size, [row["latency_ms_p50"] for row in rows], "o-", label="wall")
-    latency.plot(size, [row["cpu_ms_p50"] for row in rows], "o-", label="CPU")
-    latency.set(title="ms per photo, median", ylim=(0, None))
+    times.set(title="CPU seconds to be ready", yscale="log")
+    latency.plot(size, [row["cpu_ms_p50"] for row in rows], "o-", label="localize")
+    latency.set(title="CPU ms per photo, median", ylim=(0, None))
     for name, label in (("peak_bytes", "peak"), ("resident_bytes", "resident"), ("anonymous_bytes", "anonymous")):
         memory.plot(size, [row[name] / 1e6 for row in rows], "o-", label=label)
     memory.plot(size, [row["file_bytes"] / 1e6 for row in rows], "--", label="scene file", color="gray")

@@ -1,0 +1,216 @@
+"""`splatfix bench ablation`: what each part of the default estimator contributes, each removed in turn.
+
+Every third photo of each scene, as it is and spoilt in several ways; the index of views is always the whole one's. A
+part is removed by putting something simpler in its place for the time of a run: the estimator has no switches for it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.bench.localize import Subject, Trial, answered, subject, trials_of
+from service.bench.metrics import COARSE, FINE, Outcome, errors
+from service.errors import UnknownName
+from service.estimators import view_index
+from service.localize import Request
+from service.pose import alignment
+from service.pose.decoupled import MatchedPoints, least_squares_solve
+from service.pose.index import ViewIndex
+from service.pose.pnp import Resection
+from service.pose.views import Correspondences
+from service.render import cpu
+from service.types import IterationRecord, Pose, Query
+
+EVERY = 3
+CONDITIONS = {
+    "clean": (), "gain 0.7": ("gain=0.7",), "roll 45": ("roll=45",), "crop 0.5": ("crop=0.5",),
+    "occlusion 0.35": ("occlusion=0.35",), "focal 5 % off": ("focal=1.05",),
+}  # fmt: skip
+APPROXIMATE = "focal 5 % off"
+"""The condition whose focal length is told to be approximate."""
+
+
+DEFAULTS = view_index.Options()
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """What stands in for a part."""
+
+    patches: tuple[tuple[Any, str, Any], ...] = ()
+    """(module or class, name, stand-in)."""
+    options: view_index.Options = DEFAULTS
+    exact_focal: bool = False
+
+
+def removals() -> dict[str, Removal]:
+    """Return the parts, and how the estimator does without each."""
+    v, a = view_index, alignment
+    return {
+        "nothing": Removal(),
+        "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
+        "all views but the likeliest": Removal(options=view_index.Options(candidates=1)),
+        "views' matches pooled": Removal(((Correspondences, "pooled", staticmethod(_first)),)),
+        "photo at the views' scale": Removal(((v, "SAME_SCALE", np.inf),)),
+        "photo turned": Removal(((v, "_turned_sight", _upright),)),
+        "sampled poses (effort fast)": Removal(options=view_index.Options(effort="fast")),
+        "rendering and matching again": Removal(((v, "STRONG", 0),)),
+        "alignment": Removal(((v, "_aligned", _as_found),)),
+        "second render of the alignment": Removal(((v, "ALIGNMENTS", 1),)),
+        "gain, bias, gamma, blur": Removal(((a, "_solved", _without_look),)),
+        "L1 weights": Removal(((a._Level, "residuals", _evenly_weighted),)),
+        "cut of large residuals": Removal(((a, "_bisquare", _uncut),)),
+        "cut-off where saturated": Removal(((a, "_cut_off", _as_rendered),)),
+        "depth of the occluder at edges": Removal(((a, "_edge_owner_depth", _own_depth),)),
+        "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
+        "focal length estimated": Removal(exact_focal=True),
+        "PnP again (decoupled instead)": Removal(((v, "_resected", _decoupled),)),
+    }
+
+
+def run(
+    folders: Sequence[Path],
+    *,
+    parts: Sequence[str] = (),
+    cache_dir: Path | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Return the list that `--json` writes, a row per part and condition. Raises SceneError, UnknownName.
+
+    The photos of the next folder hide those of each. `parts` are all if none is named.
+    """
+    known = removals()
+    for part in parts:
+        if part not in known:
+            raise UnknownName(f"there is no part '{part}'; known: {', '.join(known)}.", where="part")
+    chosen = {part: known[part] for part in parts or known}
+    outcomes: dict[tuple[str, str], list[Outcome]] = {(p, c): [] for p in chosen for c in CONDITIONS}
+    for number, folder in enumerate(folders):
+        one = subject(folder, cache_dir=cache_dir)
+        one = replace(one, photos=one.photos[::EVERY])
+        one.loaded.prepare(view_index.__name__.rsplit(".", 1)[-1])
+        for i, (condition, modify) in enumerate(CONDITIONS.items()):
+            trials = list(trials_of(one, "none", len(one.photos), 0, modify, folders[(number + 1) % len(folders)]))
+            for part, removal in chosen.items():
+                outcomes[part, condition] += _outcomes(one, trials, removal, condition)
+            if progress:
+                progress(number * len(CONDITIONS) + i + 1, len(folders) * len(CONDITIONS))
+    return [_row(part, condition, some) for (part, condition), some in outcomes.items()]
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Return the rows as a Markdown table: how many are within 5 deg / 0.05 and 1 deg / 0.01, and CPU time."""
+    cells = {(row["part"], row["condition"]): row for row in rows}
+    lines = ["| without | " + " | ".join(CONDITIONS) + " | false | CPU ms, clean |", "| --- |" + " --- |" * 8]
+    for part in dict.fromkeys(row["part"] for row in rows):
+        own = [cells[part, condition] for condition in CONDITIONS]
+        counts = [f"{row['success_5deg_0p05']} / {row['success_1deg_0p01']}" for row in own]
+        false = sum(row["false_localized"] for row in own)
+        lines.append(f"| {part} | " + " | ".join(counts) + f" | {false} | {own[0]['cpu_ms_p50']:.0f} |")
+    return "\n".join(lines)
+
+
+def _outcomes(one: Subject, trials: Sequence[Trial], removal: Removal, condition: str) -> list[Outcome]:
+    request = Request(options=removal.options)
+    trust = "approximate" if condition == APPROXIMATE and not removal.exact_focal else "given"
+    outcomes = []
+    with _patched(removal.patches):
+        for trial in trials:
+            wall, cpu_s = time.perf_counter(), time.process_time()
+            estimate = answered(one, trial, request, trust)
+            spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu_s)
+            error = errors(estimate.pose, trial.truth.pose, one.units)
+            outcomes.append(Outcome(estimate.verdict.status, *error, *spent))
+    return outcomes
+
+
+def _row(part: str, condition: str, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+    return {
+        "part": part,
+        "condition": condition,
+        "photos": len(outcomes),
+        "success_5deg_0p05": sum(o.success(COARSE) for o in outcomes),
+        "success_1deg_0p01": sum(o.success(FINE) for o in outcomes),
+        "false_localized": sum(o.false for o in outcomes),
+        "cpu_ms_p50": float(np.median([o.cpu_ms for o in outcomes])),
+    }
+
+
+@contextmanager
+def _patched(patches: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
+    before = [(place, name, vars(place)[name]) for place, name, _ in patches]
+    try:
+        for place, name, stand_in in patches:
+            setattr(place, name, stand_in)
+        yield
+    finally:
+        for place, name, original in before:
+            setattr(place, name, original)
+
+
+# --- what stands in for the parts
+
+_SOLVED, _RESIDUALS, _RESECTED = alignment._solved, alignment._Level.residuals, view_index._resected
+DECOUPLED_STEPS = 8
+
+
+def _any_views(index: ViewIndex, descriptors: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(0).random(len(index.views))
+
+
+def _first(parts: Sequence[Correspondences]) -> Correspondences:
+    return parts[0]
+
+
+def _upright(sight: Any, votes: Any, query: Any, tools: Any) -> tuple[Any, Any]:
+    return sight, votes
+
+
+def _as_found(found: Resection, query: Any, tools: Any) -> Iterator[IterationRecord]:
+    yield IterationRecord("align", found.pose, found.lens, num_inliers=found.num_inliers)
+
+
+def _without_look(columns: np.ndarray, *others: Any) -> np.ndarray:
+    columns = columns.copy()
+    columns[alignment.LOOK] = 0
+    return _SOLVED(columns, *others)
+
+
+def _evenly_weighted(level: Any, state: Any) -> tuple[np.ndarray, np.ndarray, float]:
+    residuals, weights, loss = _RESIDUALS(level, state)
+    return residuals, np.where(weights > 0, np.float32(1 / alignment.DELTA), np.float32(0)), loss
+
+
+def _uncut(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    return np.ones_like(residuals)
+
+
+def _as_rendered(photo: np.ndarray, frame: Any) -> np.ndarray:
+    return frame.rgb
+
+
+def _own_depth(frame: Any) -> np.ndarray:
+    return np.where(frame.alpha > alignment.MIN_ALPHA, frame.median_depth, np.float32(0))
+
+
+def _fixed_dilation(camera: Any, info: Any) -> float:
+    return cpu.DILATION
+
+
+def _decoupled(
+    matches: Correspondences, query: Query, max_error_px: float, max_trials: int, near: Resection | None = None
+) -> Resection | None:
+    """Solve the matches with the render at a pose from there, where the lens is known."""
+    if near is None or query.focal_sigma or len(matches.photo_px) < 6:
+        return _RESECTED(matches, query, max_error_px, max_trials, near)
+    points = matches.points_in_world.astype(np.float64)
+    given = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, np.median(points, axis=0))
+    solved = least_squares_solve(given, Pose(near.pose.world_from_camera), DECOUPLED_STEPS)
+    return Resection(solved.pose, solved.weights >= 0.5, near.lens)
