@@ -2,50 +2,50 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.console import Console
 from rich.logging import RichHandler
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
+from rich.progress import track
 
+from service.bench_commands import bench_app
 from service.errors import InvalidRequest, SplatfixError
+from service.terminal import (
+    MatcherOption,
+    err,
+    loaded_scene,
+    out,
+    parsed_option,
+    print_json,
+    read_file,
+    say,
+    settings_of,
+)
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from service.api.intake import Body
     from service.api.requests import LocalizeFields
     from service.api.schemas import Result
-    from service.api.settings import Settings
-    from service.bench.paper.runs import Standing
     from service.localize import LoadedScene
 
 # Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="Photo in, pose out.")
-bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
 scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes.")
 keys_app = typer.Typer(no_args_is_help=True, help="Who may use the service.")
 app.add_typer(bench_app, name="bench")
 app.add_typer(keys_app, name="keys")
 app.add_typer(scenes_app, name="scenes")
-out, err = Console(), Console(stderr=True)
 
 SceneOption = Annotated[Path, typer.Option("--scene", help="Scene folder or scene file.")]
 IntrinsicsOption = Annotated[
     str,
     typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
 ]
-MatcherOption = Annotated[str, typer.Option("--matcher", help="Of local features; `splatfix doctor` lists them.")]
 
 
 def main() -> None:
@@ -80,20 +80,7 @@ def serve(
     from service.serve import run
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
-    run(_settings({name: value for name, value in given.items() if value is not None}), out, err)
-
-
-def _settings(given: dict[str, Any]) -> Settings:
-    from pydantic import ValidationError
-
-    from service.api.problems import described
-    from service.api.settings import Settings
-
-    try:
-        return Settings(**given)
-    except ValidationError as error:
-        where, message = described(error.errors())
-        raise InvalidRequest(message, where=where) from error
+    run(settings_of({name: value for name, value in given.items() if value is not None}), out, err)
 
 
 @app.command()
@@ -125,9 +112,9 @@ def localize(
 
     given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every}
     nested = {"intrinsics": intrinsics, "prior": prior, "times_s": times}
-    given |= {name: _json(text, name) for name, text in nested.items()}
+    given |= {name: parsed_option(text, name) for name, text in nested.items()}
     fields = read_fields({name: value for name, value in given.items() if value is not None})
-    files = [(str(photo), _bytes(photo)) for photo in photos]
+    files = [(str(photo), read_file(photo)) for photo in photos]
     follow = sequence or any(is_sequence(data) for _, data in files)
     for option, given_for_one in (("--tum", tum_file), ("--every", every > 1), ("--times", times)):
         if given_for_one and not follow:
@@ -139,7 +126,7 @@ def localize(
             where="--scene",
             hint="Name one scene; one photo of the sequence, by itself, can tell which.",
         )
-    loaded = [_loaded(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
+    loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
     if follow:
         _localize_sequence(body_of(files, {}), fields, loaded[0], csv_file, tum_file, as_json)
     else:
@@ -166,9 +153,9 @@ def _localize_each(
         anchor = found.loaded.scene.info.geo_anchor
         results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
         if not as_json:
-            _say(answers.photo_line(*results[-1]))
+            say(answers.photo_line(*results[-1]))
     if as_json:
-        _print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
+        print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
     if csv_file:
         answers.write_photo_table(csv_file, results)
 
@@ -195,10 +182,10 @@ def _localize_sequence(
     for found in localize_sequence(read_sequence(body.photo, task.reading), loaded, task.request):
         frame = trajectory.add(found).frame
         if frame and not as_json:
-            _say(answers.frame_line(frame))
+            say(answers.frame_line(frame))
     result = trajectory.result(loaded.scene.info.geo_anchor)
     if as_json:
-        _print_json({"photo": body.name, **result.model_dump(mode="json")})
+        print_json({"photo": body.name, **result.model_dump(mode="json")})
     if csv_file:
         answers.write_frame_table(csv_file, result.frames or [])
     if tum_file:
@@ -217,295 +204,16 @@ def render(
     from service.api.pictures import picture
     from service.api.requests import RenderIn
 
-    fields = read_fields({"truth": _json(pose, "truth")})
+    fields = read_fields({"truth": parsed_option(pose, "truth")})
     if fields.truth is None:
         raise InvalidRequest("a pose is required.", where="--pose")
     kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
     if kind not in ("png", "jpg"):
         raise InvalidRequest("must end with .png or .jpg.", where="--out")
     wanted = RenderIn(
-        pose=fields.truth, intrinsics=_json(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
+        pose=fields.truth, intrinsics=parsed_option(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
     )
-    out_file.write_bytes(picture(_loaded(scene), wanted))
-
-
-@bench_app.command("localize")
-def bench_localize(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses, or a scene file.")],
-    data: Annotated[Path | None, typer.Option(help="The data set's folder, if it isn't the scene's.")] = None,
-    layout: Annotated[
-        str, typer.Option(help="auto, nerf_synthetic, llff, mipnerf360, deep_blending, nerfstudio or scene.")
-    ] = "auto",
-    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
-    estimator: str = "view_index",
-    matcher: MatcherOption = "",
-    start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
-    trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
-    seed: int = 0,
-    intrinsics: Annotated[Literal["given", "approximate", "withheld"], typer.Option()] = "given",
-    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
-    modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
-    occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
-    options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
-    budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
-    budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
-    misses: Annotated[Path | None, typer.Option(help="A folder for a picture of each miss at 1 deg, 0.01.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-) -> None:
-    """Localize a scene's test photos and compare with the truth."""
-    from service.api.intake import options_from
-    from service.bench import misses as pictures
-    from service.bench.localize import Budget, run
-    from service.localize import DEFAULT_MATCHER
-
-    _tell_machine()
-    with _progress() as progress:
-        outcome = run(
-            folder,
-            data=data,
-            layout=layout,
-            background=background,
-            estimator=estimator,
-            matcher=matcher or DEFAULT_MATCHER,
-            start=start,
-            trials=trials,
-            seed=seed,
-            intrinsics=intrinsics,
-            cameras=cameras,
-            modify=tuple(modify or ()),
-            occluders=occluders,
-            options=options_from(estimator, _json(options, "options") or {}),
-            budget=Budget(budget_s, budget_renders),
-            progress=_counter(progress, "photos"),
-            cache_dir=_settings({}).cache_dir,
-            on_miss=pictures.kept_in(misses) if misses else None,
-        )
-    _write_json(json_file, outcome)
-    for name, value in outcome.items():
-        if name != "per_query":
-            _say(f"{name:28} {_short(value)}")
-
-
-@bench_app.command("track")
-def bench_track(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with training cameras.")],
-    frames: Annotated[int, typer.Option(min=2, help="Of the path.")] = 300,
-    seed: int = 0,
-    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-) -> None:
-    """Follow a camera along a smooth path through a scene."""
-    from service.bench.track import run
-
-    _tell_machine()
-    with _progress() as progress:
-        outcome = run(
-            folder,
-            frames=frames,
-            seed=seed,
-            intrinsics=intrinsics,
-            progress=_counter(progress, "frames"),
-            cache_dir=_settings({}).cache_dir,
-        )
-    _write_json(json_file, outcome)
-    for name, value in outcome.items():
-        if name != "per_frame":
-            _say(f"{name:28} {_short(value)}")
-
-
-def _say(text: str) -> None:
-    out.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-@bench_app.command("paper")
-def bench_paper(
-    scenes: Annotated[list[str], typer.Argument(help="Scene folders; SCENE=DATA where the data set is elsewhere.")],
-    folder: Annotated[Path, typer.Option("--out", help="Where results are kept; a run there is gone on with.")],
-    trials: Annotated[int, typer.Option(min=1, help="Of fast methods, a scene and protocol.")] = 40,
-    slow_trials: Annotated[int, typer.Option(min=0, help="Of the baselines.")] = 5,
-    study: Annotated[list[str] | None, typer.Option(help="table1, table2, table5, pnerf, range, resolution.")] = None,
-    method: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
-    protocol: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
-    layout: Annotated[str, typer.Option(help="Of the data sets.")] = "auto",
-    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
-    matcher: MatcherOption = "",
-    seed: int = 0,
-    report: Annotated[Path | None, typer.Option(help="Write tables, figures and page to this folder.")] = None,
-    run: Annotated[bool, typer.Option("--run/--report-only", help="Run what is missing first.")] = True,
-) -> None:
-    """Reproduce the paper: methods x scenes x protocols, then its tables and figures."""
-    from service.bench.paper import runs
-    from service.bench.paper.plan import chosen
-    from service.localize import DEFAULT_MATCHER
-
-    asked = runs.Asked(
-        scenes=_scene_arguments(scenes),
-        cells=chosen(study or (), method or (), protocol or ()),
-        out=folder,
-        trials=trials,
-        slow_trials=slow_trials,
-        seed=seed,
-        matcher=matcher or DEFAULT_MATCHER,
-        layout=layout,
-        background=background,
-        cache_dir=_settings({}).cache_dir,
-    )
-    if run:
-        _tell_machine()
-        with _live_table() as show:
-            runs.run(asked, show)
-    if report:
-        from service.bench.paper.report import write
-
-        with err.status("drawing"):
-            write(asked, report)
-        out.print(str(report / "index.html"), highlight=False, soft_wrap=True)
-
-
-def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
-    """SCENE or SCENE=DATA; a scene's name is its folder's."""
-    found: dict[str, tuple[Path, Path | None]] = {}
-    for text in given:
-        scene, _, data = text.partition("=")
-        name = Path(scene).resolve().stem
-        if name in found:
-            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
-        found[name] = Path(scene), Path(data) if data else None
-    return found
-
-
-@contextmanager
-def _live_table() -> Iterator[Callable[[Standing], None]]:
-    """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
-    from rich.live import Live
-
-    told = time.monotonic()
-    with Live(console=err, auto_refresh=False, transient=True) as live:
-
-        def show(standing: Standing) -> None:
-            nonlocal told
-            if err.is_terminal:
-                live.update(_standing_table(standing), refresh=True)
-            elif time.monotonic() - told > 60:
-                told = time.monotonic()
-                done, total = sum(standing.done.values()), sum(standing.total.values())
-                err.print(f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go", highlight=False)
-
-        yield show
-
-
-def _standing_table(standing: Standing) -> Table:
-    from rich.table import Table
-
-    scenes = list(dict.fromkeys(scene for scene, _ in standing.total))
-    table = Table("study / method / start", *scenes, title="within 5 deg / 0.05, of done, of all")
-    for cell in dict.fromkeys(cell for _, cell in standing.total):
-        places = [(scene, cell) for scene in scenes]
-        if any(standing.done.get(place) for place in places):
-            counts = [(standing.within.get(p, 0), standing.done.get(p, 0), standing.total[p]) for p in places]
-            table.add_row(cell, *(f"{a} / {b} / {c}" for a, b, c in counts))
-    done, total = sum(standing.done.values()), sum(standing.total.values())
-    table.caption = f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go"
-    return table
-
-
-@bench_app.command("gate")
-def bench_gate(
-    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
-    seed: int = 0,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Write a reliability plot, a .png.")] = None,
-) -> None:
-    """Test the verification gate on right, wrong and foreign poses, leaving one scene out of its fit in turn."""
-    from service.bench.gate import run
-
-    _tell_machine()
-    if len(folders) < 2:
-        raise InvalidRequest("needs two scenes or more, to test on another one than it fits on.", where="folders")
-    with _progress() as progress:
-        outcome = run(folders, seed=seed, progress=_counter(progress, "photos"), cache_dir=_settings({}).cache_dir)
-    _write_json(json_file, outcome)
-    if plot:
-        from service.bench.paper.figures import reliability
-
-        plot.write_bytes(reliability({name: outcome[name]["reliability"] for name in ("with_matches", "by_pixels")}))
-    for name in ("with_matches", "by_pixels", "glance"):
-        for key, value in outcome[name].items():
-            if key not in ("reliability", "by_kind"):
-                out.print(f"{name:13} {key:30} {value}", markup=False, highlight=False, soft_wrap=True)
-
-
-@bench_app.command("render")
-def bench_render(
-    repeats: Annotated[int, typer.Option(min=1, help="Of each picture; the least time counts.")] = 30,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-) -> None:
-    """Time the renderer on the synthetic room."""
-    from service.bench.render import run
-
-    _tell_machine()
-    with _progress() as progress:
-        outcome = run(repeats=repeats, progress=_counter(progress, "cases"))
-    _write_json(json_file, outcome)
-    for row in [outcome[0].keys(), *(row.values() for row in outcome)]:
-        out.print(" ".join(f"{_short(value):>13}" for value in row), highlight=False, soft_wrap=True)
-
-
-@bench_app.command("scale")
-def bench_scale(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
-    around: Annotated[list[Path] | None, typer.Option(help="Scenes to put around it; else varied copies.")] = None,
-    sizes: Annotated[list[int] | None, typer.Option("--size", min=1000, help="Gaussians; may be repeated.")] = None,
-    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "ignored",
-    compressed: Annotated[bool, typer.Option("--compressed", help="Write compressed scene files.")] = False,
-    work: Annotated[Path | None, typer.Option(help="Where to write the large scenes meanwhile.")] = None,
-    plot_file: Annotated[Path | None, typer.Option("--plot", help="Draw the curves, a .png.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-) -> None:
-    """Measure loading, indexing, memory and localization of scenes of growing size."""
-    from service.bench.scale import SIZES, run
-
-    _tell_machine()
-    with _progress() as progress:
-        rows = run(
-            folder,
-            others=around or (),
-            sizes=sizes or SIZES,
-            cameras=cameras,
-            compressed=compressed,
-            work=work,
-            progress=_counter(progress, "sizes"),
-        )
-    _write_json(json_file, rows)
-    if plot_file:
-        from service.bench.paper.figures import growth  # loads matplotlib
-
-        plot_file.write_bytes(growth(rows))
-    for name in rows[0]:
-        out.print(f"{name:20}" + " ".join(f"{_short(row[name]):>14}" for row in rows), highlight=False, soft_wrap=True)
-
-
-@bench_app.command("ablation")
-def bench_ablation(
-    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
-    parts: Annotated[list[str] | None, typer.Option("--part", help="Remove only this; may be repeated.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")] = None,
-) -> None:
-    """Remove each part of the default estimator in turn; print a Markdown table of what is left."""
-    from service.bench.ablation import run, table
-
-    _tell_machine()
-    if len(folders) < 2:
-        raise InvalidRequest("needs two scenes or more, to hide the photos of one by another's.", where="folders")
-    with _progress() as progress:
-        counter = _counter(progress, "conditions")
-        rows = run(folders, parts=parts or (), cache_dir=_settings({}).cache_dir, progress=counter)
-    _write_json(json_file, rows)
-    out.print(table(rows), markup=False, highlight=False, soft_wrap=True)
+    out_file.write_bytes(picture(loaded_scene(scene), wanted))
 
 
 @scenes_app.command("list")
@@ -516,7 +224,7 @@ def list_scenes(
     from service.scene_formats.discovery import find_scenes
 
     for scene in find_scenes(folder):
-        _say(str(scene))
+        say(str(scene))
 
 
 @scenes_app.command("inspect")
@@ -530,10 +238,10 @@ def inspect_scene(
     with err.status(f"looking at {scene}"):
         facts = inspected(scene)
     if as_json:
-        _print_json(facts)
+        print_json(facts)
         return
     for name, value in told(facts).items():
-        _say(f"{name:18} {value}")
+        say(f"{name:18} {value}")
 
 
 @keys_app.command("add")
@@ -553,7 +261,7 @@ def list_keys() -> None:
     from service.api import keys
 
     for key in keys.read_keys(_keys_file()):
-        _say(f"{key.role:9} {key.name}")
+        say(f"{key.role:9} {key.name}")
 
 
 @keys_app.command("remove")
@@ -565,7 +273,7 @@ def remove_key(name: str) -> None:
 
 
 def _keys_file() -> Path:
-    path = _settings({}).keys_file
+    path = settings_of({}).keys_file
     if path is None:
         raise InvalidRequest("there is no file for keys.", where="SPLATFIX_KEYS_FILE")
     return path
@@ -586,10 +294,10 @@ def doctor(
     with err.status("examining"):
         for finding in findings():
             mark = "ok  " if finding.ok else "FAIL" if finding.needed else "no  "
-            _say(f"{mark} {finding.subject:24} {finding.detail}")
+            say(f"{mark} {finding.subject:24} {finding.detail}")
             healthy &= finding.ok or not finding.needed
-    for name, value in _settings({}).model_dump().items():
-        _say(f"     SPLATFIX_{name.upper():22} {value}")
+    for name, value in settings_of({}).model_dump().items():
+        say(f"     SPLATFIX_{name.upper():22} {value}")
     if not healthy:
         raise typer.Exit(1)
 
@@ -600,61 +308,6 @@ def openapi() -> None:
     from service.api.app import openapi_yaml
 
     print(openapi_yaml(), end="")
-
-
-def _json(text: str, where: str) -> Any:
-    """Parse an option that is JSON, or names a file of it; None if it is empty."""
-    from service.api.intake import parsed_json
-
-    if not text:
-        return None
-    return parsed_json(text if text.lstrip()[:1] in ("{", "[") else _bytes(Path(text)), where)
-
-
-def _bytes(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InvalidRequest(f"{error.strerror}.", where=str(path)) from error
-
-
-def _loaded(scene: Path, estimator: str | None = None, matcher: str = "") -> LoadedScene:
-    """Load a scene and, if an estimator is to use it, make what that prepares for it."""
-    from service.localize import LoadedScene
-
-    with err.status(f"reading {scene}") as status:
-        settings = _settings({"matcher": matcher} if matcher else {})
-        loaded = LoadedScene.load(scene, cache_dir=settings.cache_dir, matcher=settings.matcher)
-        if estimator:
-            status.update("preparing")
-            loaded.prepare(estimator)
-    return loaded
-
-
-def _tell_machine() -> None:
-    from service.doctor import processor
-
-    err.print(processor(), markup=False, highlight=False, soft_wrap=True)
-
-
-def _progress() -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    return Progress(*columns, console=err, transient=True)
-
-
-def _counter(progress: Progress, unit: str) -> Callable[[int, int], None]:
-    """Return a function that shows (done, of how many) as a bar."""
-    task = progress.add_task(unit, total=None)
-    return lambda done, total: progress.update(task, completed=done, total=total)
-
-
-def _write_json(path: Path | None, value: Any) -> None:
-    if path:
-        path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
-
-
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=1))
 
 
 if __name__ == "__main__":

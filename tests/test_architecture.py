@@ -26,7 +26,8 @@ LAYERS = [
     {"track", "anywhere"},
     {"api", "bench"},
     {"doctor", "example", "answers", "inspection"},
-    {"serve"},
+    {"serve", "terminal"},
+    {"bench_commands"},
     {"__main__"},
 ]
 FOUNDATIONS = {("types", "errors"), ("plugins", "errors"), ("images", "geometry"), ("images", "intrinsics")}
@@ -56,7 +57,7 @@ WRAPPED = {
     "starlette": {"service/api"},
     "anyio": {"service/api"},
     "annotated_types": {"service/api/requests.py"},
-    "pydantic": {"service/api", "service/__main__.py"},
+    "pydantic": {"service/api", "service/terminal.py"},
     "pydantic_core": {"service/api/intake.py"},
     "pydantic_settings": {"service/api/settings.py"},
     "limits": {"service/api/admission.py"},
@@ -68,8 +69,8 @@ WRAPPED = {
     "httpx": {"service/api/relay.py", "viewer/client.py"},
     "uvicorn": {"service/serve.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
-    "typer": {"service/__main__.py"},
-    "rich": {"service/__main__.py", "service/serve.py"},
+    "typer": {"service/__main__.py", "service/bench_commands.py", "service/terminal.py"},
+    "rich": {"service/__main__.py", "service/bench_commands.py", "service/terminal.py", "service/serve.py"},
     "viser": {"viewer"},
 }
 
