@@ -15,8 +15,9 @@ from service.estimators.view_index import Options
 from service.geometry import look_at
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
+from service.pose.alignment import align
 from service.pose.gate import verify
-from service.types import HINTS, Box, Pose, Query, Reason, Status, Verdict
+from service.types import HINTS, Box, Camera, Pose, Query, Reason, Status, Verdict
 
 TRUTH = unseen_pose()
 UP = np.array([0.0, 0.0, 1.0])
@@ -53,8 +54,8 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, LoadedScene], Verdict]] = {
     Reason.RENDER_DISAGREES: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
     Reason.FEW_INLIERS: lambda room, _: judged(room, blurred(photo_at(room, TRUTH), 10.0)),
     Reason.LITTLE_SCENE_IN_VIEW: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
-    Reason.FOCAL_UNCERTAIN: lambda room, _: localize(of_a_wall(room), room, FAST).verdict,
-    Reason.INTRINSICS_CONTRADICTED: lambda room, _: localize(with_a_wrong_lens(room), room, FAST).verdict,
+    Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room)), BEFORE_A_WALL),
+    Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
     Reason.PLACE_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
     Reason.AMBIGUOUS: lambda _, repeated: localize(photo_at(repeated, TRUTH), repeated, FAST).verdict,
@@ -69,19 +70,22 @@ def with_swapped_colours(query: Query) -> Query:
     return replace(query, rgb=np.ascontiguousarray(query.rgb[..., [1, 2, 0]]))
 
 
-def of_a_wall(room: LoadedScene) -> Query:
-    """Straight before a flat wall a longer lens is as good as a shorter distance."""
-    return photo_at(room, BEFORE_A_WALL, replace(LENS, trust="approximate"))
+def with_any_lens(query: Query) -> Query:
+    return replace(query, intrinsics=replace(query.intrinsics, trust="approximate"))
 
 
-def with_a_wrong_lens(room: LoadedScene) -> Query:
+def with_a_wrong_lens(room: LoadedScene) -> tuple[Query, Pose]:
+    """The photo with a focal length 4 % too long, and the pose that makes up for it best."""
     query = photo_at(room, TRUTH)
-    lens = replace(LENS, fx=1.04 * LENS.fx, fy=1.04 * LENS.fy)
-    return replace(query, intrinsics=lens, photo_intrinsics=lens)
+    lens, pose = replace(LENS, fx=1.04 * LENS.fx, fy=1.04 * LENS.fy), TRUTH
+    for _ in range(3):
+        camera = Camera(lens, pose)
+        pose = align(query.rgb, room.rasterizer.render([camera])[0], camera, camera, 2).pose
+    return replace(query, intrinsics=lens, photo_intrinsics=lens), pose
 
 
 def middle_of_a_wall(room: LoadedScene) -> Query:
-    """A small, flat part: what a turn does to it, a step aside does as well."""
+    """A small, flat part: a step aside is as good as a turn, a shorter distance as good as a longer lens."""
     query = photo_at(room, BEFORE_A_WALL)
     known = np.zeros(query.rgb.shape[:2], bool)
     height, width = known.shape
