@@ -13,14 +13,14 @@ from PIL import Image
 
 from service.bench import localize as bench
 from service.bench import render as render_bench
-from service.bench.metrics import Units, units_of
+from service.bench.metrics import Units, nees, units_of
 from service.bench.misses import kept_in
 from service.bench.modifications import MODIFICATIONS, Shot, modified
 from service.bench.queries import find_photos, sent
 from service.bench.starts import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
 from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
-from service.images import encode_image, read_query
+from service.images import encode_image, read_query, with_palette
 from service.interfaces import Frame
 from service.localize import LoadedScene
 from service.pose.focus import centre_depth
@@ -575,3 +575,21 @@ def test_encode_image():
     assert np.array_equal(read_query(encode_image(rgb, "png")).rgb, rgb)
     assert np.array_equal(read_query(encode_image(rgb.astype(np.float32) / 255, "png")).rgb, rgb)
     assert len(encode_image(rgb, quality=20)) < len(encode_image(rgb, quality=90))
+
+
+def test_the_squared_error_in_units_of_the_covariance():
+    found = estimate(Pose(np.eye(4)))
+    truth = moved(found.pose, np.array([0.0, 0.0, 0.02, 0.0, 0.3, 0.0]))
+    spread = np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1])
+    told = [np.diag(spread**2), np.diag([0.0, *spread[1:] ** 2]), None]
+    weighed = [nees(replace(found, verdict=replace(found.verdict, covariance=c)), truth) for c in told]
+    assert weighed == [pytest.approx(2**2 + 3**2), None, None]
+
+
+def test_a_palette_saves_most_of_the_bytes():
+    shades = np.linspace(0, 255, 200).astype(np.uint8)
+    picture = np.stack(np.meshgrid(shades, shades), 2)
+    rgb = np.concatenate([picture, np.random.default_rng(0).integers(0, 9, (200, 200, 1), np.uint8)], 2)
+    small = with_palette(encode_image(rgb, "png"))
+    assert len(small) < len(encode_image(rgb, "png")) / 2
+    assert np.abs(read_query(small).rgb.astype(int) - rgb).mean() < 6  # seen: 3.6

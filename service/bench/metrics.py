@@ -70,9 +70,12 @@ def errors(estimate: Pose, truth: Pose, units: Units) -> tuple[float, float]:
 
 
 def nees(estimate: PoseEstimate, truth: Pose) -> float | None:
-    """Return the normalized error squared: 6 on average if the covariance is true. None without a covariance."""
+    """Return the normalized error squared: 6 on average if the covariance is true.
+
+    None without a covariance, or where it is singular: with little to see at a wrong pose, few residuals made it.
+    """
     covariance = estimate.verdict.covariance
-    if covariance is None:
+    if covariance is None or np.linalg.matrix_rank(covariance, hermitian=True) < len(covariance):
         return None
     twist = se3_log(estimate.pose.camera_from_world @ truth.world_from_camera)
     return float(twist @ np.linalg.solve(covariance, twist))
