@@ -80,6 +80,8 @@ SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 NEAREST = 16
 """Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
+FIRST_ALIGNED_PX = 256
+"""Long side of the first render that is aligned: it is as good as the big one at bringing the pose near."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
 
@@ -356,7 +358,8 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
     pose, camera, lens = found.pose, None, found.lens
     for round_number in range(ALIGNMENTS):
         settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
-        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0)
+        size_px = FIRST_ALIGNED_PX if camera is None and not query.focal_sigma else None
+        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0, size_px)
         if new_camera is camera:
             return
         camera = new_camera

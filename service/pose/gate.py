@@ -297,23 +297,28 @@ def colour_agreement(
     layers = (photo, to_uint8(frame.rgb), _both_known(frame, known))
     small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in layers]
     opaque = small[2] > MIN_ALPHA
-    a, b = (image[opaque].astype(np.float64) for image in small[:2])
-    if len(a) < 8:
+    a, b = (np.ascontiguousarray(image[opaque].T, np.float32) for image in small[:2])
+    if a.shape[1] < 8:
         return 0.0, 0.0
     return _correlation(a, b, HIDDEN_SHARE), _correlation(a, b, HALF)
 
 
-def _correlation(a: Float64[np.ndarray, "n 3"], b: Float64[np.ndarray, "n 3"], hidden: float) -> float:
+def _correlation(a: Float32[np.ndarray, "3 n"], b: Float32[np.ndarray, "3 n"], hidden: float) -> float:
     """Return the correlation of what is left when the share that fits worst is left out, after three fits."""
-    kept = np.ones(len(a), bool)
+    kept = np.ones(a.shape[1], np.float32)
     for _ in range(3):
-        x, y = a - a[kept].mean(0), b - b[kept].mean(0)
-        gain = (x * y)[kept].sum(0) / np.maximum((y * y)[kept].sum(0), 1e-6)
-        misfit = np.abs(x - gain * y).sum(1)
-        count = len(a) - int(hidden * len(a))
-        kept = misfit <= np.partition(misfit, count - 1)[count - 1]
-    x, y = a[kept] - a[kept].mean(0), b[kept] - b[kept].mean(0)
-    return float((x * y).sum() / max(np.sqrt((x * x).sum() * (y * y).sum()), 1e-6))
+        x, y = _centred(a, kept), _centred(b, kept)
+        gain = ((x * y) @ kept) / np.maximum((y * y) @ kept, np.float32(1e-6))
+        misfit = np.abs(x - gain[:, None] * y).sum(0)
+        count = len(kept) - int(hidden * len(kept))
+        kept = (misfit <= np.partition(misfit, count - 1)[count - 1]).astype(np.float32)
+    x, y = _centred(a, kept), _centred(b, kept)
+    both, of_x, of_y = (float((u * v @ kept).sum()) for u, v in ((x, y), (x, x), (y, y)))
+    return both / max(np.sqrt(of_x * of_y), 1e-6)
+
+
+def _centred(values: Float32[np.ndarray, "3 n"], kept: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "3 n"]:
+    return values - (values @ kept / kept.sum())[:, None]
 
 
 def _block_sums(image: Float32[np.ndarray, "h w c"]) -> Float64[np.ndarray, "blocks"]:

@@ -153,9 +153,12 @@ def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
     return lifted(matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
 
 
-def rendered_frame(pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0) -> tuple[Frame, Camera]:
+def rendered_frame(
+    pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0, long_side: int | None = None
+) -> tuple[Frame, Camera]:
     """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
-    camera = Camera(sized(query.intrinsics, LENS_RENDER_PX if query.focal_sigma else RENDER_PX), pose)
+    long_side = long_side or (LENS_RENDER_PX if query.focal_sigma else RENDER_PX)
+    camera = Camera(sized(query.intrinsics, long_side), pose)
     last: tuple[Frame, Camera] | None = tools.memo.get("last_frame")
     if last and _nearly_seen(*last, camera, tolerance_px):
         return last
@@ -216,4 +219,4 @@ def correspondences(photo: Features, view: View, matcher: Matcher) -> Correspond
 
 def to_uint8(rgb: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return a render as a photo has it."""
-    return (np.clip(rgb, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+    return np.asarray(cv2.convertScaleAbs(np.maximum(rgb, 0), alpha=255.0))
