@@ -54,7 +54,8 @@ MAX_PIXELS = 8_000
 """A level with more uses every second, third...: 6000 were as exact as 30000 on the six test scenes."""
 MIN_PIXELS = 200
 FAR = np.float32(1e30)
-SETTLED_PX = 0.005
+SETTLED_PX, SETTLED_COARSE_PX = 0.005, 0.05
+"""Of the level, at the finest one and at those that a finer one follows."""
 UNKNOWN = np.float32(-1e4)
 """In a photo; whatever mixes with it is negative, too."""
 UNTOUCHED = np.array([1.0, 0.0, 0.0, 0.0])
@@ -91,9 +92,10 @@ def align(
     """
     state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma, UNTOUCHED.copy())
     loss = np.inf
-    for level in _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma)):
+    pyramid = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
+    for finer, level in zip(reversed(range(levels)), pyramid, strict=True):
         state.look[3] = 0.0  # another at each level
-        loss = _align_level(level, state)
+        loss = _align_level(level, state, SETTLED_COARSE_PX if finer else SETTLED_PX)
         if not np.isfinite(loss):
             return Alignment(start.pose, lens, loss)
     render_from_photo = np.linalg.inv(state.photo_from_render)
@@ -164,7 +166,7 @@ def _levels(
         yield _Level(photo_level, pixels, points, columns, photo_lens.resized(width, height))
 
 
-def _align_level(level: _Level, state: _State) -> float:
+def _align_level(level: _Level, state: _State, settled_px: float = SETTLED_PX) -> float:
     """Run Gauss-Newton at one level, changing `state`; return the mean absolute residual."""
     if len(level.pixels) < MIN_PIXELS:
         return np.inf
@@ -183,7 +185,7 @@ def _align_level(level: _Level, state: _State) -> float:
             state.lens = stepped(state.lens, step[LENS], state.focal_sigma)
         lens = level.photo_lens
         moved_px = lens.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
-        if moved_px + lens.long_side * np.abs(step[LENS]).max() < SETTLED_PX:
+        if moved_px + lens.long_side * np.abs(step[LENS]).max() < settled_px:
             break
     return loss
 
