@@ -54,7 +54,7 @@ GOOD_MATCH = 60
 """Inliers with one view that make further views needless."""
 CHANCE = 15
 """Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
-STRONG = 150
+STRONG = 80
 """Inliers with which alignment needs no further match."""
 FURTHER = 16
 """One view in so many is tried before the search is given up: in a building the likeliest five may all be wrong."""
