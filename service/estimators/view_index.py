@@ -78,6 +78,8 @@ LENS_SETTLED_PX = 0.05
 """The same while the focal length is free: it hides behind the distance, and hardly moves what is seen."""
 SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
+OUT_OF_QUESTION = 3.0
+"""Times the answer's mean residual, after one alignment: no such rival is an answer, or nearly as good as one."""
 NEAREST = 16
 """Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
 FIRST_ALIGNED_PX = 256
@@ -163,8 +165,11 @@ class _Hunt:
             self.tools.prepared.views, scores, self.tools.matcher, pixels,
         )  # fmt: skip
         for rival in suspected:
-            last: IterationRecord | None = None
-            for last in _refined(replace(rival, lens=self.answer.lens), self.query, self.tools):
+            rival, last = replace(rival, lens=self.answer.lens), None
+            glance = next(_aligned(rival, self.query, self.tools), None)
+            if glance is None or (glance.loss or 0.0) > OUT_OF_QUESTION * (self.answer.loss or np.inf):
+                continue
+            for last in _refined(rival, self.query, self.tools):
                 yield self._with_answer(last)
             if last is None or last.stage != "align" or not all(apart(last.pose, a.pose, distance) for a in answers):
                 continue
