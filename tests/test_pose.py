@@ -20,6 +20,7 @@ from service.pose.pnp import reprojection_error_px, resection
 from service.pose.retrieval import top, vote
 from service.pose.viewpoints import farthest_points, spread
 from service.pose.views import (
+    PHOTO_PX,
     correspondences,
     lifted,
     photo_at,
@@ -193,9 +194,9 @@ def test_features_of_the_turned_photo_lie_where_they_are_in_the_photo(eighths: i
             point = np.array([[column + 0.5, row + 0.5]], np.float32)
             return Features(point, np.ones(1, np.float32), np.eye(1, dtype=np.float32))
 
-    rgb = np.zeros((384, 512, 3), np.uint8)
+    rgb = np.zeros((320, PHOTO_PX, 3), np.uint8)  # as large as it is looked at
     rgb[100, 37] = 255
-    lens = Intrinsics(512, 384, 400.0, 400.0, 256.0, 192.0)
+    lens = Intrinsics(PHOTO_PX, 320, 400.0, 400.0, 208.0, 160.0)
     tools = Tools(a_scene(), PaintedWalls(), BrightDot(), np.random.default_rng(0))
     found = photo_features(Query(rgb, lens, "given", lens), tools, eighths=eighths)
     # Turned by an odd eighth, the dot is spread over pixels.

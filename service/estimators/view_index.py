@@ -45,7 +45,7 @@ from service.pose.views import (
     rendered_view,
     sized,
 )
-from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Status
+from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Reason, Status
 
 MATCH_ERROR_PX = 4.0
 """At PHOTO_PX; XFeat's points scatter by 1.5 px."""
@@ -80,6 +80,8 @@ SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 OUT_OF_QUESTION = 3.0
 """Times the answer's mean residual, after one alignment: no such rival is an answer, or nearly as good as one."""
+UNMENDABLE = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
+"""Doubts about a pose at which photo and render agree: no other search knows better."""
 NEAREST = 16
 """Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
 FIRST_ALIGNED_PX = 256
@@ -146,7 +148,7 @@ class _Hunt:
         verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
             self.answer, self.score = last, verdict.score
-        self.accepted = verdict.status is Status.LOCALIZED
+        self.accepted = verdict.status is Status.LOCALIZED or verdict.reason in UNMENDABLE
         yield self._with_answer(
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )

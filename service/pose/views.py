@@ -7,7 +7,7 @@ features and the last render of the estimator.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -171,9 +171,21 @@ def rendered_view(pose: Pose, query: Query, tools: Tools) -> tuple[View, Frame]:
     frame, camera = rendered_frame(pose, query, tools)
     last: View | None = tools.memo.get("last_view")
     if last is None or last.camera is not camera:
-        found = tools.matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES)
+        found = _features_of(frame, camera.intrinsics, tools.matcher)
         last = tools.memo["last_view"] = lifted(found, frame, camera)
     return last, frame
+
+
+def _features_of(frame: Frame, lens: Intrinsics, matcher: Matcher) -> Features:
+    """Return a render's features, found at RENDER_PX: in a larger one they would be finer than the photo's."""
+    rgb, size = to_uint8(frame.rgb), sized(lens, RENDER_PX)
+    if size.width * size.height >= lens.width * lens.height:
+        return matcher.extract(rgb, VIEW_FEATURES)
+    found = matcher.extract(
+        np.asarray(cv2.resize(rgb, (size.width, size.height), interpolation=cv2.INTER_AREA)), VIEW_FEATURES
+    )
+    scale = np.array([lens.width / size.width, lens.height / size.height], np.float32)
+    return replace(found, points_px=found.points_px * scale)
 
 
 def _nearly_seen(frame: Frame, camera: Camera, now: Camera, tolerance_px: float) -> bool:
