@@ -58,6 +58,8 @@ STRONG = 80
 """Inliers with which alignment needs no further match."""
 FURTHER = 16
 """One view in so many is tried before the search is given up: in a building the likeliest five may all be wrong."""
+SECOND_LOOK = 1.25
+"""A photo that isn't found at once is looked at in a size larger by this."""
 SAME_SCALE = 1.4
 """Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
 SCALES_PX = (160, 640)
@@ -214,6 +216,8 @@ def _searches(
     votes = _within_reach(index.votes(sight.features(query, tools).descriptors), query, index)
     untried = deque(top(votes, options.candidates))
     yield _search("retrieve", sight, votes, untried, query, tools), sight, votes
+    sight = replace(sight, long_side=round(SECOND_LOOK * sight.long_side))
+    votes = index.votes(sight.features(query, tools).descriptors)
     sight, votes = _turned_sight(sight, votes, query, tools)
     votes = _within_reach(votes, query, index)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
