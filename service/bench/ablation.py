@@ -169,8 +169,8 @@ def _first(parts: Sequence[Correspondences]) -> Correspondences:
     return parts[0]
 
 
-def _upright(sight: Any, votes: Any, query: Any, tools: Any) -> tuple[Any, Any]:
-    return sight, votes
+def _upright(upright: Any, query: Any, tools: Any) -> Any:
+    return upright
 
 
 def _as_found(found: Resection, query: Any, tools: Any) -> Iterator[IterationRecord]:

@@ -63,7 +63,7 @@ SECOND_LOOK = 1.25
 SAME_SCALE = 1.4
 """Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
 SCALES_PX = (160, 640)
-VOTE_SHARE, CLOSER_LOOKS = 0.6, 2
+VOTE_SHARE, CLOSER_LOOKS = 0.5, 2
 """Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
 TURN_BIAS = 0.77
 """On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
@@ -200,6 +200,10 @@ class _Sight:
         shrink = ODD_SHRINK if self.eighths % 2 else 1.0
         return photo_features(query, tools, round(self.long_side * shrink * share), self.eighths)
 
+    def votes(self, query: Query, tools: Tools, share: float = 1.0) -> Float64[np.ndarray, "views"]:
+        """Return how much each view is like the photo, looked at like this."""
+        return tools.prepared.votes(self.features(query, tools, share).descriptors)
+
     @property
     def max_error_px(self) -> float:
         """At PHOTO_PX."""
@@ -213,13 +217,11 @@ def _searches(
     index: ViewIndex = tools.prepared
     # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
     sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
-    votes = _within_reach(index.votes(sight.features(query, tools).descriptors), query, index)
+    votes = _within_reach(sight.votes(query, tools), query, index)
     untried = deque(top(votes, options.candidates))
     yield _search("retrieve", sight, votes, untried, query, tools), sight, votes
-    sight = replace(sight, long_side=round(SECOND_LOOK * sight.long_side))
-    votes = index.votes(sight.features(query, tools).descriptors)
-    sight, votes = _turned_sight(sight, votes, query, tools)
-    votes = _within_reach(votes, query, index)
+    sight = _turned_sight(replace(sight, long_side=round(SECOND_LOOK * sight.long_side)), query, tools)
+    votes = _within_reach(sight.votes(query, tools), query, index)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
     untried.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
     while untried:
@@ -239,24 +241,18 @@ def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: View
     return np.where(away <= reach, votes, min(0.0, float(votes.min())))
 
 
-def _turned_sight(
-    sight: _Sight, upright: Float64[np.ndarray, "views"], query: Query, tools: Tools
-) -> tuple[_Sight, Float64[np.ndarray, "views"]]:
-    """Return the photo upright, with the votes given, or turned as the views' votes say, with those.
+def _turned_sight(upright: _Sight, query: Query, tools: Tools) -> _Sight:
+    """Return the photo upright, or turned as the views' votes say.
 
     Votes on a smaller photo choose the turns that are worth a closer look.
     """
-
-    def votes(turned: _Sight, share: float) -> Float64[np.ndarray, "views"]:
-        return tools.prepared.votes(turned.features(query, tools, share).descriptors)
-
-    turns = [replace(sight, eighths=eighths) for eighths in range(1, 8)]
-    turns.sort(key=lambda turned: -votes(turned, VOTE_SHARE).max())
-    best, best_votes = sight, upright
+    turns = [replace(upright, eighths=eighths) for eighths in range(1, 8)]
+    turns.sort(key=lambda turned: -turned.votes(query, tools, VOTE_SHARE).max())
+    best, most = upright, upright.votes(query, tools).max()
     for turned in turns[:CLOSER_LOOKS]:
-        if (found := votes(turned, 1.0)).max() * TURN_BIAS > best_votes.max() * (TURN_BIAS if best.eighths else 1.0):
-            best, best_votes = turned, found
-    return best, best_votes
+        if (found := TURN_BIAS * turned.votes(query, tools).max()) > most:
+            best, most = turned, found
+    return best
 
 
 def _same_scale_px(query: Query, index: ViewIndex) -> int:
