@@ -25,7 +25,7 @@ from service.geometry import pose_distance
 from service.interfaces import Features, Tools
 from service.pose.alignment import align
 from service.pose.focal import WIDER, focal_resection, refine
-from service.pose.gate import verify
+from service.pose.gate import glance, verify
 from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
@@ -63,6 +63,8 @@ SECOND_LOOK = 1.25
 SAME_SCALE = 1.4
 """Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
 SCALES_PX = (160, 640)
+GLANCE_PX = 256
+"""Of the photo, enough to see whether it could be elsewhere."""
 VOTE_SHARE, CLOSER_LOOKS = 0.5, 2
 """Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
 TURN_BIAS = 0.77
@@ -82,6 +84,8 @@ SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
 """A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 OUT_OF_QUESTION = 3.0
 """Times the answer's mean residual, after one alignment: no such rival is an answer, or nearly as good as one."""
+MISFIT = 0.1
+"""Mean residual (0..1) of an alignment that led nowhere; right ones have 0.005 to 0.06."""
 UNMENDABLE = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
 """Doubts about a pose at which photo and render agree: no other search knows better."""
 NEAREST = 16
@@ -119,11 +123,15 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
     hunt = _Hunt(query, tools)
-    for search, sight, scores in _searches(query, tools, options, hunt):
+    if query.prior:
+        yield from hunt.follow(_from_prior(query, tools), expected=True)
+    for search, sight in () if hunt.accepted else _searches(query, tools, options, hunt):
         yield from hunt.follow(search)
         if hunt.accepted:
-            yield from hunt.contest(sight, scores)
+            yield from hunt.contest(sight)
             return
+    if hunt.accepted and query.region is None:  # a guess doesn't decide between places that look alike
+        yield from hunt.contest(_Sight(GLANCE_PX))
 
 
 @dataclass(slots=True)
@@ -139,15 +147,19 @@ class _Hunt:
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance gives: foreign photos never do."""
 
-    def follow(self, search: Iterator[IterationRecord]) -> Iterator[IterationRecord]:
-        """Yield a search's records, with the best answer so far, and put its end before the gate."""
+    def follow(self, search: Iterator[IterationRecord], expected: bool = False) -> Iterator[IterationRecord]:
+        """Yield a search's records, with the best answer so far, and put its end before the gate.
+
+        An answer that was expected need not have matches if the pixels are clear.
+        """
         last: IterationRecord | None = None
         for last in search:
             self.recognised |= last.stage == "rematch"
             yield self._with_answer(last)
         if last is None or (self.answer and last.stage != "align"):
             return  # the search gave up
-        verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
+        known = self.query.corrected(last.lens)
+        verdict = (glance(known, last.pose, self.tools) if expected else None) or verify(known, last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
             self.answer, self.score = last, verdict.score
         self.accepted = verdict.status is Status.LOCALIZED or verdict.reason in UNMENDABLE
@@ -155,18 +167,18 @@ class _Hunt:
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
-    def contest(self, sight: _Sight, scores: np.ndarray) -> Iterator[IterationRecord]:
+    def contest(self, sight: _Sight) -> Iterator[IterationRecord]:
         """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""
         assert self.answer is not None
         answers = [self.answer]
         known = self.query.corrected(self.answer.lens)
-        seen, _ = rendered_view(self.answer.pose, known, self.tools)
-        distance = float(np.median(np.linalg.norm(seen.points_in_world - self.answer.pose.position_in_world, axis=1)))
+        frame, _ = rendered_frame(self.answer.pose, known, self.tools)
+        distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
         pixels = sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
         judged = (self.answer.pose, distance, verify(known, self.answer.pose, self.tools).signals)
         suspected = rivals(
             sight.features(self.query, self.tools), known.intrinsics, *judged,
-            self.tools.prepared.views, scores, self.tools.matcher, pixels,
+            self.tools.prepared.views, sight.votes(self.query, self.tools), self.tools.matcher, pixels,
         )  # fmt: skip
         for rival in suspected:
             rival, last = replace(rival, lens=self.answer.lens), None
@@ -201,8 +213,12 @@ class _Sight:
         return photo_features(query, tools, round(self.long_side * shrink * share), self.eighths)
 
     def votes(self, query: Query, tools: Tools, share: float = 1.0) -> Float64[np.ndarray, "views"]:
-        """Return how much each view is like the photo, looked at like this."""
-        return tools.prepared.votes(self.features(query, tools, share).descriptors)
+        """Return how much each view is like the photo, looked at like this; those far from its region are last."""
+        key = ("votes", self.long_side, self.eighths, share)
+        if key not in tools.memo:
+            votes = tools.prepared.votes(self.features(query, tools, share).descriptors)
+            tools.memo[key] = _within_reach(votes, query, tools.prepared)
+        return tools.memo[key]
 
     @property
     def max_error_px(self) -> float:
@@ -212,24 +228,36 @@ class _Sight:
 
 def _searches(
     query: Query, tools: Tools, options: Options, hunt: _Hunt
-) -> Iterator[tuple[Iterator[IterationRecord], _Sight, np.ndarray]]:
-    """The ways to look for the photo, cheapest first; with each how it looks, and how well the views look like it."""
-    index: ViewIndex = tools.prepared
-    # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
-    sight = _Sight(_same_scale_px(query, index) if tools.scene.cameras else PHOTO_PX)
-    votes = _within_reach(sight.votes(query, tools), query, index)
+) -> Iterator[tuple[Iterator[IterationRecord], _Sight]]:
+    """The ways to look for the photo, cheapest first; with each how it looks."""
+    sight = _first_sight(query, tools)
+    votes = sight.votes(query, tools)
     untried = deque(top(votes, options.candidates))
-    yield _search("retrieve", sight, votes, untried, query, tools), sight, votes
+    yield _search("retrieve", sight, untried, query, tools), sight
     sight = _turned_sight(replace(sight, long_side=round(SECOND_LOOK * sight.long_side)), query, tools)
-    votes = _within_reach(sight.votes(query, tools), query, index)
+    votes = sight.votes(query, tools)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
-    untried.extend(further[: max(options.candidates, len(index.views) // FURTHER)])
+    untried.extend(further[: max(options.candidates, len(votes) // FURTHER)])
     while untried:
-        yield _search("turn" if sight.eighths else "further", sight, votes, untried, query, tools), sight, votes
+        yield _search("turn" if sight.eighths else "further", sight, untried, query, tools), sight
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
-        yield _sampled(sight, votes, query, tools), sight, votes
+        yield _sampled(sight, query, tools), sight
+
+
+def _first_sight(query: Query, tools: Tools) -> _Sight:
+    # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
+    return _Sight(_same_scale_px(query, tools.prepared) if tools.scene.cameras else PHOTO_PX)
+
+
+def _from_prior(query: Query, tools: Tools) -> Iterator[IterationRecord]:
+    """Align from the prior pose, which may be some ten degrees off; end early where nothing fits."""
+    assert query.prior is not None
+    for record in _aligned(Resection(query.prior, np.zeros(0, bool)), query, tools):
+        if (record.loss or 0.0) > MISFIT:
+            return
+        yield replace(record, num_inliers=None)
 
 
 def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: ViewIndex) -> Float64[np.ndarray, "views"]:
@@ -268,7 +296,6 @@ def _same_scale_px(query: Query, index: ViewIndex) -> int:
 def _search(
     stage: str,
     sight: _Sight,
-    votes: Float64[np.ndarray, "views"],
     untried: deque[int],
     query: Query,
     tools: Tools,
@@ -279,7 +306,8 @@ def _search(
     """
     index: ViewIndex = tools.prepared
     poses = [index.views[i].camera.pose for i in untried]
-    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), votes[list(untried)])
+    scores = sight.votes(query, tools)[list(untried)]
+    candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), scores)
     yield IterationRecord(stage, query.prior or poses[0], candidates=candidates)
     views = (index.views[untried.popleft()] for _ in range(len(untried)))
     if query.prior and stage == "retrieve":
@@ -291,11 +319,10 @@ def _search(
         yield from _aligned(found, query, tools)
 
 
-def _sampled(
-    sight: _Sight, votes: Float64[np.ndarray, "views"], query: Query, tools: Tools
-) -> Iterator[IterationRecord]:
+def _sampled(sight: _Sight, query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Render at sampled poses and match; go on from the one that most matches agree with."""
     index: ViewIndex = tools.prepared
+    votes = sight.votes(query, tools)
     poses = poses_near_views(index.views, votes, -0.25 * np.pi * sight.eighths, SAMPLES, tools.rng)
     lens = sized(query.intrinsics, SAMPLE_PX)
     best: Resection | None = None

@@ -94,6 +94,8 @@ def align(
     loss = np.inf
     pyramid = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
     for finer, level in zip(reversed(range(levels)), pyramid, strict=True):
+        if finer and len(level.pixels) < MIN_PIXELS:
+            continue  # so small, what is seen of the scene says nothing
         state.look[3] = 0.0  # another at each level
         loss = _align_level(level, state, SETTLED_COARSE_PX if finer else SETTLED_PX)
         if not np.isfinite(loss):

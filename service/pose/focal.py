@@ -48,9 +48,7 @@ def focal_resection(
         if one := resection(photo_px, points_in_world, camera, WIDER * max_error_px, SEARCH_TRIALS):
             found.append(replace(one, lens=lens))
     found.sort(key=lambda one: -one.num_inliers)
-    refined = [
-        refine(photo_px, points_in_world, intrinsics, one, focal_sigma, max_error_px) for one in found[:REFINED]
-    ]
+    refined = [refine(photo_px, points_in_world, intrinsics, one, focal_sigma, max_error_px) for one in found[:REFINED]]
     return max(refined, key=lambda one: one.num_inliers, default=None)
 
 

@@ -30,6 +30,7 @@ from service.pose.views import (
     known_at,
     photo_at,
     photo_features,
+    rendered_frame,
     rendered_view,
     to_uint8,
 )
@@ -112,25 +113,55 @@ CONTRADICTION = 0.02
 
 def verify(query: Query, pose: Pose, tools: Tools) -> Verdict:
     """Judge a pose. Costs a render and its features unless the job has just made them (see pose/views.py)."""
-    key = ("verdict", pose.world_from_camera.tobytes(), query.intrinsics)
+    key = _key(query, pose)
     if key not in tools.memo:
         tools.memo[key] = _verdict(query, pose, tools)
     return tools.memo[key]
 
 
+def glance(query: Query, pose: Pose, tools: Tools) -> Verdict | None:
+    """Judge a pose by the pixels alone: matches cost most. None where these don't make it clear.
+
+    For poses that something else speaks for: the camera was expected there. `verify` then says the same.
+    """
+    frame, camera = rendered_frame(pose, query, tools)
+    signals, pixels = _seen(query, pose, frame, camera, tools)
+    if probability(signals) < LOCALIZED or in_doubt(signals):
+        return None
+    verdict = _within_region(judged(signals, pixels, query.focal_sigma), query, pose)
+    tools.memo[_key(query, pose)] = verdict
+    return verdict
+
+
+def _key(query: Query, pose: Pose) -> tuple[str, bytes, Intrinsics]:
+    return "verdict", pose.world_from_camera.tobytes(), query.intrinsics
+
+
 def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     view, frame = rendered_view(pose, query, tools)
-    photo, camera = photo_features(query, tools), view.camera
+    photo, size = photo_features(query, tools), view.camera.intrinsics
+    signals, pixels = _seen(query, pose, frame, view.camera, tools)
+    known = known_at(query, tools, size)
     found = correspondences(photo, view, tools.matcher)
-    size = camera.intrinsics
-    resized, known = photo_at(query, tools, size), known_at(query, tools, size)
-    answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
-    pixels = evidence(resized, frame, camera, answer, query.focal_sigma, known)
-    signals = pixel_signals(resized, frame, known, size, pixels)
     signals |= _match_signals(found, _both_known(frame, known), query, size, pose)
     if known is not None:  # as many as a whole photo would have
         signals["inliers"] /= max(float(known.mean()), 0.1)
     verdict = judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
+    return _within_region(verdict, query, pose)
+
+
+def _seen(
+    query: Query, pose: Pose, frame: Frame, camera: Camera, tools: Tools
+) -> tuple[dict[str, float], Evidence | None]:
+    """Return the signals and the evidence of the pixels; `camera` rendered the frame at the pose or nearby."""
+    size = camera.intrinsics
+    photo, known = photo_at(query, tools, size), known_at(query, tools, size)
+    answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
+    pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known)
+    return pixel_signals(photo, frame, known, size, pixels), pixels
+
+
+def _within_region(verdict: Verdict, query: Query, pose: Pose) -> Verdict:
     return verdict if admits(query.region, pose) else doubted(verdict, Reason.OUTSIDE_PRIOR)
 
 
