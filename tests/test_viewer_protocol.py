@@ -365,18 +365,20 @@ def test_a_browser_without_a_gpu_gets_no_splats_but_pictures_while_it_moves(fake
     with _browser(viewer, "/jobs/j?gl=software") as browser:
         browser.wait(lambda: "agrees" in browser.text() and _background(browser) == "exact", "the job")
         assert browser.widget("splats")["value"] is False
+        browser.wait(lambda: "300 Gaussians, drawn by the service" in browser.text(), "the scene's line")
+        count = len(fake.renders)
         for x in np.linspace(4, 5, 20).tolist():
             browser.send(**{**CAMERA, "position": [x, 0.0, 0.0]})
             time.sleep(0.02)
         assert _background(browser) == "exact"
-        assert fake.renders[-1]["intrinsics"]["width"] == 480, "small while it moves"
+        assert any(r["intrinsics"]["width"] == 480 for r in fake.renders[count:]), "small while it moves"
         browser.wait(
             lambda: np.allclose(_rendered_from(fake), [5, 0, 0]) and fake.renders[-1]["intrinsics"]["width"] == 800,
             "the view at rest",
         )
         assert "/splats/splats" not in browser.nodes
         browser.set("splats", True)
-        browser.wait(lambda: "/splats/splats" in browser.nodes, "the splats")
+        browser.wait(lambda: "/splats/splats" in browser.nodes and "300 splats" in browser.text(), "the splats")
 
 
 def test_a_step_comes_as_widgets_first_and_only_what_changed(fake: FakeService, viewer: Viewer) -> None:

@@ -177,9 +177,10 @@ def _swatch(ground: str, width: str = ".7em") -> str:
 
 
 def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:
-    """How much of the scene is drawn, and what viser can't draw."""
+    """How much of the scene the browser draws, and what viser can't draw; 0: the service draws it."""
     of = f"{drawn:,} splats" if drawn == total else f"{drawn:,} of {total:,} splats, the most important ones"
-    return _small(f"{escape(name)}: {of}, without view-dependent colour; {cameras} training cameras")
+    said = f"{of}, without view-dependent colour" if drawn else f"{total:,} Gaussians, drawn by the service"
+    return _small(f"{escape(name)}: {said}; {cameras} training cameras")
 
 
 def answer_colour(answer: Answer | None) -> tuple[int, int, int]:

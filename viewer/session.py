@@ -23,7 +23,7 @@ from viewer.client import ServiceTrouble
 from viewer.detail import Detail
 from viewer.draw import Mode
 from viewer.exact import ExactView
-from viewer.feed import JobFeed, Library
+from viewer.feed import JobFeed, Library, SceneContent
 from viewer.panel import NO_JOB, NO_SCENE, Panel
 from viewer.playback import Playback, headline_html, job_label, legend_html, scene_html
 from viewer.replay import replay_html
@@ -243,9 +243,12 @@ class Session:
         self._scene_id = self.panel.scenes.value = scene_id
         self._exact.stand_alone(True)
         self._exact.use(scene_id)
-        self.panel.scene.content = scene_html(
-            content.view.name, len(content.splats.rgba), content.splats.total, len(content.view.cameras)
-        )
+        self._describe(content)
+
+    def _describe(self, content: SceneContent) -> None:
+        """Tell what is drawn of the scene."""
+        drawn = len(content.splats.rgba) if self.panel.layers["splats"].value else 0
+        self.panel.scene.content = scene_html(content.view.name, drawn, content.splats.total, len(content.view.cameras))
 
     def _show(self) -> None:
         """Show the record at the playback's position; its picture follows when nothing else waits."""
@@ -284,8 +287,9 @@ class Session:
     def _user_chose_layer(self, layer: Layer) -> None:
         shown = self.panel.layers[layer].value
         self.stage.set_visible(layer, shown)
-        if layer == "splats":
+        if layer == "splats" and self._scene_id is not None:
             self._exact.stand_alone(not shown or self.stage.lacks_splats)
+            self._describe(self._library.scene(self._scene_id))
 
     def _user_chose_newest(self) -> None:
         self._follows = self.panel.newest.value
