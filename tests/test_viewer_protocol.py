@@ -194,7 +194,8 @@ def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: 
 def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 3, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: not browser.widget("look through this camera")["disabled"], "the job")
+        browser.wait(lambda: browser.widget("step")["max"] == 2, "the job")
+        assert not browser.widget("look through this camera")["disabled"]
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "step 1")
         (client,) = viewer.server.get_clients().values()
@@ -414,6 +415,25 @@ def test_what_the_next_step_needs_is_at_hand(fake: FakeService, viewer: Viewer) 
         browser.set("step", 3)
         until(lambda: "/jobs/j/iterations/2/render.jpg" in fake.asked, "and again")
         assert fake.asked.count("/jobs/j/iterations/3/render.jpg") == 1
+
+
+def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it(
+    fake: FakeService, viewer: Viewer
+) -> None:
+    job = fake.job("walk", 3)
+    job.walk = [Status.LOCALIZED, Status.LOCALIZED, Status.UNCERTAIN]
+    job.finish()
+    texture = lambda: draw.decode(bytes(browser.nodes["/trajectory/current"]["props"]["_image_data"])).mean((0, 1))  # noqa: E731
+    with _browser(viewer, "/jobs/walk") as browser:
+        for step, told, colour in (
+            (2, "only the photo of step 1 is kept", render_rgb(2, matched=False)),
+            (1, "photo, and the render", (120, 160, 200)),
+            (0, "only the photo of step 1 is kept", render_rgb(0, matched=False)),
+        ):
+            browser.wait(lambda: browser.widget("step")["max"] == 2, "the job")
+            browser.set("step", step)
+            browser.wait(lambda told=told: told in browser.text(), "what is shown")
+            browser.wait(lambda colour=colour: np.abs(texture() - colour).max() < 6, "the picture in the camera")
 
 
 def test_a_replay_has_the_splats_and_every_step(fake: FakeService) -> None:

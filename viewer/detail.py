@@ -39,8 +39,8 @@ class Detail:
         self._panel, self._stage = panel, stage
         self._shown: tuple[str, int] | None = None
         """Job and record that are shown."""
-        self._textured = ""
-        """Job whose photo is in the camera that is shown."""
+        self._textured: tuple[str, int | None] | None = None
+        """Job, and of several photos the step, whose picture is in the camera that is shown."""
         self._todo: list[tuple[float, Callable[[], None]]] = []
         """What is still to be done for the step, and the earliest time for it."""
 
@@ -59,7 +59,7 @@ class Detail:
         self._todo.pop(0)[1]()
 
     def clear(self) -> None:
-        self._shown, self._textured = None, ""
+        self._shown = self._textured = None
         self._todo = []
         self._stage.clear_job()
 
@@ -102,9 +102,14 @@ class Detail:
         """Bring the 3D up to the step."""
         if feed.job is None:
             return
-        photo = None if self._textured == feed.id else feed.photo()
-        self._stage.show_current(feed.job.camera(record), None if photo is None else reduced(photo, _TEXTURE_PX))
-        self._textured = feed.id
+        several = feed.job.photo_step is not None
+        picture, textured = None, (feed.id, record.index if several else None)
+        if self._textured != textured:
+            picture = _photo(feed, record)
+            if picture is None and several:
+                picture = feed.render(record.index, matched=False)
+        self._stage.show_current(feed.job.camera(record), None if picture is None else reduced(picture, _TEXTURE_PX))
+        self._textured = textured
         weighed = (r.candidates for r in reversed(feed.records[: record.index + 1]) if r.candidates)
         self._stage.show_candidates(next(weighed, None), feed.job.photo)
         self._stage.show_matches(view, None if view is None else match_colours(view, self._colour_by))
@@ -123,7 +128,7 @@ class Detail:
         """Draw the match vectors over the photo, or over what it should look like."""
         self._panel.flow.visible = view is not None
         if view is not None:
-            photo = feed.photo()
+            photo = _photo(feed, record)
             ground = feed.render(record.index, matched=False) if photo is None else photo
             self._panel.flow.image = flow(ground, view, match_colours(view, self._colour_by))
 
@@ -134,10 +139,12 @@ class Detail:
         panel.weight.visible, panel.flicker.visible = mode == "blend", mode == "flicker"
         panel.picture.visible = mode != "flicker"
         view = view if self._with_lines else None
-        photo = feed.photo()
+        photo = _photo(feed, record)
         if photo is None:
+            step = feed.job.photo_step if feed.job else None
+            why = "the photo was deleted after the job" if step is None else f"only the photo of step {step} is kept"
             panel.picture.image, panel.picture.visible = feed.render(record.index, matched=False), True
-            panel.caption.content = small_html("The render at this step's pose; the photo was deleted after the job.")
+            panel.caption.content = small_html(f"The render at this step's pose; {why}.")
             panel.window.visible, panel.flicker.visible = True, False
             return
         render = self._render(feed, record, view)
@@ -165,3 +172,9 @@ class Detail:
     @property
     def _colour_by(self) -> ColourBy:
         return cast(ColourBy, self._panel.colour_by.value)
+
+
+def _photo(feed: JobFeed, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the photo that a step is about; None: it isn't there (any more). Raises ServiceTrouble, ValueError."""
+    of = feed.job.photo_step if feed.job else None
+    return feed.photo() if of in (None, record.index) else None

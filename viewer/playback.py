@@ -192,7 +192,7 @@ def _why(answer: Answer) -> str:
     words = [answer.reason.replace("_", " ")]
     if answer.score is not None:
         words.append(f"score {answer.score:.2f}")
-    if answer.inliers is not None:
+    if answer.inliers:  # following a camera needs no matches
         words.append(f"{answer.inliers} inliers")
     return ", ".join(w for w in words if w)
 
