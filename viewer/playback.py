@@ -105,10 +105,10 @@ def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
         ("inliers", _or_dash(record.num_inliers, "d")),
         ("loss", _or_dash(record.loss, ".4g")),
         ("turned", _or_dash(record.step_deg, ".3g", "°")),
-        ("moved", _or_dash(record.step_units, ".3g", " units")),
+        ("moved, units", _or_dash(record.step_units, ".3g")),
     ]
     if truth:
-        rows += [("turned off", _or_dash(off[0], ".3g", "°")), ("away", _or_dash(off[1], ".3g", " units"))]
+        rows += [("turned off", _or_dash(off[0], ".3g", "°")), ("away, units", _or_dash(off[1], ".3g"))]
     cells = "".join(
         f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
