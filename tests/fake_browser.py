@@ -42,6 +42,8 @@ class FakeBrowser:
         """What lies behind the scene."""
         self.types: set[str] = set()
         """Of all messages so far."""
+        self.frames: list[list[dict[str, Any]]] = []
+        """The messages as they came: what comes in one frame is shown together."""
         self._changed = threading.Condition()
         self._reader = threading.Thread(target=self._read)
 
@@ -93,7 +95,8 @@ class FakeBrowser:
                 size = int.from_bytes(frame[8:16], "little")
                 inner = zstandard.ZstdDecompressor().decompress(frame[16 : 16 + size])
                 with self._changed:
-                    for message in msgspec.msgpack.decode(inner)["messages"]:
+                    self.frames.append(msgspec.msgpack.decode(inner)["messages"])
+                    for message in self.frames[-1]:
                         self._take(message)
                     self._changed.notify_all()
         except ConnectionClosed:

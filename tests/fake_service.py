@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image
 
 from service.api.convert import intrinsics_out, named_camera_out, pose_out, record_out, result_out
-from service.api.schemas import JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
+from service.api.schemas import FrameOut, JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
 from service.api.splats import packed_splats
 from service.geometry import look_at
 from service.types import (
@@ -125,6 +125,8 @@ class FakeJob:
     records: list[IterationRecord] = field(default_factory=list)
     estimate: PoseEstimate | None = None
     truth: Pose | None = None
+    walk: list[Status] = field(default_factory=list)
+    """Of several photos, what became of each."""
     created: datetime = field(default_factory=lambda: datetime.now(UTC))
     changed: threading.Condition = field(default_factory=threading.Condition)
 
@@ -159,6 +161,9 @@ class FakeJob:
     def out(self) -> JobOut:
         versions = {"splatfix": "0"}
         result = self.estimate and result_out(self.estimate, Timing(stage="decode", wall_s=0, cpu_s=0), versions)
+        if result and self.walk:
+            frames = [self._frame(k, status) for k, status in enumerate(self.walk)]
+            result = result.model_copy(update={"frames": frames})
         links = dict.fromkeys(JobLinks.model_fields, "/")
         return JobOut(
             id=self.id,
@@ -185,6 +190,19 @@ class FakeJob:
             truth=self.truth and pose_out(self.truth),
             result=result,
             error=None,
+        )
+
+    def _frame(self, index: int, status: Status) -> FrameOut:
+        return FrameOut(
+            index=index,
+            name=f"{index}.jpg",
+            time_s=index,
+            status=status,
+            reason=Reason.AGREES,
+            score=0.9,
+            followed=index > 0,
+            world_from_camera=pose_out(self.records[index].pose).world_from_camera,
+            covariance=None,
         )
 
     def events(self) -> Iterator[bytes]:

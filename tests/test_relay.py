@@ -121,8 +121,18 @@ def test_every_path_gets_the_page_with_our_script(viewer, path):
     with relaying(viewer.port) as address:
         page = httpx.get(f"http://{address}{path}", trust_env=False)
     script = b'<script src="/ui/viewer.js"></script>'
-    assert (page.status_code, page.content) == (200, PAGE.replace(b"</head>", script + b"</head>"))
+    assert (page.status_code, page.content) == (200, PAGE.replace(b"<head>", b"<head>" + script))
     assert page.headers["content-type"].startswith("text/html")
+
+
+@pytest.mark.parametrize(("cookie", "seen"), [("software", "/jobs/abc?gl=software"), ("gpu", "/jobs/abc")])
+def test_the_viewer_hears_that_a_browser_has_no_gpu(viewer, cookie, seen):
+    headers = {"Cookie": f"splatfix_gl={cookie}"}
+    with (
+        relaying(viewer.port) as address,
+        connect(address, "/viewer/jobs/abc", subprotocols=["viser-v1.1.1"], additional_headers=headers) as socket,
+    ):
+        assert socket.recv() == f"{seen} viser-v1.1.1"
 
 
 @pytest.mark.parametrize(("path", "seen"), [("/viewer", "/"), ("/viewer/", "/"), ("/viewer/jobs/abc", "/jobs/abc")])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 import signal
 import socket
 import subprocess
@@ -18,6 +20,7 @@ import httpx
 import numpy as np
 import pytest
 import viser
+import zstandard
 from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
@@ -25,7 +28,8 @@ from service.types import Lens, Reason, Status
 from viewer import app, draw, private, session, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble
-from viewer.feed import JobFeed
+from viewer.feed import JobFeed, Library
+from viewer.replay import replay_html
 
 
 @pytest.fixture
@@ -102,8 +106,11 @@ def test_steps_change_picture_pose_and_numbers(fake: FakeService, viewer: Viewer
             browser.wait(lambda k=index: f">{100 + k}<" in browser.text(), f"the numbers of step {index}")
             browser.wait(lambda k=index: shows(render_rgb(k, matched=True)), f"the picture of step {index}")
             assert browser.widget("step")["value"] == index
-            position = browser.nodes["/trajectory/current"]["position"]
-            np.testing.assert_allclose(position, records(5)[index].pose.position_in_world, atol=1e-6)
+            there = records(5)[index].pose.position_in_world
+            browser.wait(
+                lambda there=there: np.allclose(browser.nodes["/trajectory/current"]["position"], there, atol=1e-6),
+                "the camera",
+            )
         browser.set("match lines", False)
         browser.wait(lambda: shows(render_rgb(0, matched=False)), "the render at the pose")
         browser.set("compare", "difference")
@@ -187,7 +194,8 @@ def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: 
 def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 3, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: not browser.widget("look through this camera")["disabled"], "the job")
+        browser.wait(lambda: browser.widget("step")["max"] == 2, "the job")
+        assert not browser.widget("look through this camera")["disabled"]
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "step 1")
         (client,) = viewer.server.get_clients().values()
@@ -329,6 +337,118 @@ def _background(browser: FakeBrowser) -> str:
     data = browser.background["rgb_data"]
     picture = draw.decode(bytes(data)) if data else np.zeros((1, 1, 3))
     return "exact" if np.abs(picture.mean((0, 1)) - EXACT_RGB).max() < 4 else "ground"
+
+
+def test_a_view_that_was_set_from_here_is_rendered_at_once_and_its_echo_changes_nothing(
+    fake: FakeService, viewer: Viewer
+) -> None:
+    fake.job("j", 3, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: _background(browser) == "exact" and "/splats/splats" in browser.nodes, "both")
+        first = next(k for k, frame in enumerate(browser.frames) if any(m.get("rgb_data") for m in frame[1:]))
+        sent = next(
+            k for k, frame in enumerate(browser.frames) if any(m.get("name") == "/splats/splats" for m in frame)
+        )
+        assert first <= sent
+        (client,) = viewer.server.get_clients().values()
+        browser.wait(lambda: not client.scene._handle_from_node_name["/splats/splats"].visible, "the view at rest")
+        camera, count = client.camera, len(fake.renders)
+        moved = {n: [float(x) for x in getattr(camera, n)] for n in ("wxyz", "position", "look_at", "up_direction")}
+        browser.send(**{**CAMERA, **moved, "fov": camera.fov, "near": camera.near, "far": camera.far})
+        browser.set("step", 0)
+        browser.wait(lambda: ">100<" in browser.text(), "what is sent after")
+        assert _background(browser) == "exact"
+        assert [r for r in fake.renders[count:] if r["format"] != "depth"] == []
+
+
+def test_a_browser_without_a_gpu_gets_no_splats_but_pictures_while_it_moves(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 3, finished=True)
+    with _browser(viewer, "/jobs/j?gl=software") as browser:
+        browser.wait(lambda: "agrees" in browser.text() and _background(browser) == "exact", "the job")
+        assert browser.widget("splats")["value"] is False
+        browser.wait(lambda: "300 Gaussians, drawn by the service" in browser.text(), "the scene's line")
+        count = len(fake.renders)
+        for x in np.linspace(4, 5, 20).tolist():
+            browser.send(**{**CAMERA, "position": [x, 0.0, 0.0]})
+            time.sleep(0.02)
+        assert _background(browser) == "exact"
+        assert any(r["intrinsics"]["width"] == 480 for r in fake.renders[count:]), "small while it moves"
+        browser.wait(
+            lambda: np.allclose(_rendered_from(fake), [5, 0, 0]) and fake.renders[-1]["intrinsics"]["width"] == 800,
+            "the view at rest",
+        )
+        assert "/splats/splats" not in browser.nodes
+        browser.set("splats", True)
+        browser.wait(lambda: "/splats/splats" in browser.nodes and "300 splats" in browser.text(), "the splats")
+
+
+def test_a_step_comes_as_widgets_first_and_only_what_changed(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 5, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        place = lambda: browser.nodes["/trajectory/current"]["position"]  # noqa: E731
+        there = [r.pose.position_in_world for r in records(5)]
+        browser.wait(lambda: np.allclose(place(), there[4], atol=1e-6) and _background(browser) == "exact", "the end")
+        before = len(browser.frames)
+        browser.set("step", 2)
+        browser.wait(lambda: np.allclose(place(), there[2], atol=1e-6), "the camera of the step")
+        frames = browser.frames[before:]
+        of_3d = [[m for m in frame if "name" in m] for frame in frames]
+        first = next(k for k, messages in enumerate(of_3d) if messages)
+        said = [m["updates"] for frame in frames[:first] for m in frame if m["type"] == "GuiUpdateMessage"]
+        assert any(">102<" in u.get("content", "") for u in said), "the numbers wait for no 3D"
+        assert any("_data" in u for u in said), "nor does the picture"
+        names = {m["name"] for messages in of_3d for m in messages}
+        assert "/trajectory/current" in names
+        assert not names & {
+            "/candidates/cloud",
+            "/candidates/candidates",
+            "/splats/splats",
+            "/training cameras/cameras",
+        }
+
+
+def test_what_the_next_step_needs_is_at_hand(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 5, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: browser.widget("step")["value"] == 4 and "agree" in browser.text(), "the job")
+        until(lambda: "/jobs/j/iterations/3/render.jpg" in fake.asked, "the render of the step before")
+        browser.set("step", 3)
+        until(lambda: "/jobs/j/iterations/2/render.jpg" in fake.asked, "and again")
+        assert fake.asked.count("/jobs/j/iterations/3/render.jpg") == 1
+
+
+def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it(
+    fake: FakeService, viewer: Viewer
+) -> None:
+    job = fake.job("walk", 3)
+    job.walk = [Status.LOCALIZED, Status.LOCALIZED, Status.UNCERTAIN]
+    job.finish()
+    texture = lambda: draw.decode(bytes(browser.nodes["/trajectory/current"]["props"]["_image_data"])).mean((0, 1))  # noqa: E731
+    with _browser(viewer, "/jobs/walk") as browser:
+        for step, told, colour in (
+            (2, "only the photo of step 1 is kept", render_rgb(2, matched=False)),
+            (1, "photo, and the render", (120, 160, 200)),
+            (0, "only the photo of step 1 is kept", render_rgb(0, matched=False)),
+        ):
+            browser.wait(lambda: browser.widget("step")["max"] == 2, "the job")
+            browser.set("step", step)
+            browser.wait(lambda told=told: told in browser.text(), "what is shown")
+            browser.wait(lambda colour=colour: np.abs(texture() - colour).max() < 6, "the picture in the camera")
+
+
+def test_a_replay_has_the_splats_and_every_step(fake: FakeService) -> None:
+    fake.job("saved", 3, finished=True)
+    service = Service("http://fake", fake.transport)
+    feed = JobFeed(service, "saved")
+    feed.start()
+    until(lambda: feed.complete, "the job")
+    page = replay_html(feed, Library(service).scene("ball"))
+    match = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
+    assert match is not None
+    data = base64.b64decode(match[1])
+    said = zstandard.ZstdDecompressor().decompressobj().decompress(data[data.index(b"\x28\xb5\x2f\xfd") :])
+    assert said.count(b"GaussianSplatsMessage") == 1
+    assert all(f"step {k} of 2".encode() in said for k in range(3))
 
 
 def test_a_scene_can_be_looked_at_without_a_job(fake: FakeService, viewer: Viewer) -> None:

@@ -52,7 +52,8 @@ class Viewer:
         self.server.stop()
 
     def _open(self, client: viser.ClientHandle) -> None:
-        session = Session(client, self._library, job_of(requested_path(self.server, client.client_id)))
+        path = requested_path(self.server, client.client_id)
+        session = Session(client, self._library, job_of(path), splats=not path.endswith("?gl=software"))
         with self._lock:
             self._sessions[client.client_id] = session
         session.start()

@@ -97,6 +97,8 @@ class JobView:
     """As whoever sent the photo knows it."""
     answer: Answer | None
     """None until it has ended."""
+    photo_step: int | None = None
+    """Of several photos, the step that `Service.photo` belongs to; None: there is one photo, or it isn't known yet."""
 
     def camera(self, record: IterationRecord) -> Camera:
         """Return the photo's camera as a step has it: its pose, its estimate of the lens."""
@@ -263,7 +265,15 @@ def _job(raw: dict[str, Any]) -> JobView:
         _intrinsics(raw["photo"]["intrinsics"]),
         raw["truth"] and Pose(np.array(raw["truth"]["world_from_camera"]["matrix"], np.float64)),
         _answer(raw),
+        _photo_step((raw["result"] or {}).get("frames")),
     )
+
+
+def _photo_step(frames: list[dict[str, Any]] | None) -> int | None:
+    """The service keeps the last photo that was localized; if none was, the last."""
+    if not frames:
+        return None
+    return next((f["index"] for f in reversed(frames) if f["status"] == "localized"), frames[-1]["index"])
 
 
 def _answer(raw: dict[str, Any]) -> Answer | None:

@@ -1,11 +1,20 @@
 """What one browser sees of one step of a job: numbers, camera, matches, pictures and charts.
 
-The light part follows a dragged slider at once (`show`); pictures and charts come when nothing else waits (`draw`).
+Numbers follow a dragged slider at once (`show`). The rest comes when nothing else waits, one after the other (`go_on`):
+pictures and charts, the 3D, at last what the neighbouring steps will need. viser's page shows widgets as soon as they
+come; but a message that also has to do with the 3D waits for its next frame, so they go by messages of their own.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from typing import cast
+
+import numpy as np
+from jaxtyping import UInt8
 
 from service.types import IterationRecord
 from viewer.charts import curves_html, stages_html, vectors_html
@@ -18,6 +27,8 @@ from viewer.playback import caption_html, flow_caption_html, record_html, small_
 from viewer.stage import Stage
 
 _TEXTURE_PX = 512
+_APART_S = 0.02
+"""viser puts in one message what comes within a sixtieth of a second."""
 
 
 class Detail:
@@ -25,66 +36,99 @@ class Detail:
 
     def __init__(self, panel: Panel, stage: Stage) -> None:
         self.mode: Mode = "beside"
-        self.due = False
-        """Pictures and charts are older than the step."""
         self._panel, self._stage = panel, stage
         self._shown: tuple[str, int] | None = None
-        """Job and record that the 3D shows."""
+        """Job and record that are shown."""
+        self._textured: tuple[str, int | None] | None = None
+        """Job, and of several photos the step, whose picture is in the camera that is shown."""
+        self._todo: list[tuple[float, Callable[[], None]]] = []
+        """What is still to be done for the step, and the earliest time for it."""
 
     @property
     def fresh(self) -> bool:
         """Nothing of this job has been shown yet."""
         return self._shown is None
 
+    @property
+    def due_in_s(self) -> float | None:
+        """When `go_on` has something to do; None: all is done."""
+        return max(0.0, self._todo[0][0] - time.monotonic()) if self._todo else None
+
+    def go_on(self) -> None:
+        """Do what is due next. Raises ServiceTrouble, ValueError."""
+        self._todo.pop(0)[1]()
+
     def clear(self) -> None:
-        self._shown = None
+        self._shown = self._textured = None
+        self._todo = []
         self._stage.clear_job()
 
     def show(self, feed: JobFeed, index: int) -> None:
-        """Show a record; its pictures follow with `draw`. Raises ServiceTrouble, ValueError."""
+        """Show a record; the rest follows with `go_on`."""
         record, job = feed.records[index], feed.job
         if job is None:
             return
         self._panel.step.value = index
         self._panel.numbers.content = record_html(record, job.truth)
         self._panel.strip.content = stages_html(feed.records, index)
-        if self._shown == (feed.id, index):
-            return
-        photo = feed.photo() if self._shown is None else None
-        texture = None if photo is None else reduced(photo, _TEXTURE_PX)
-        self._stage.show_current(job.camera(record), texture)
-        weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
-        self._stage.show_candidates(next(weighed, None), job.photo)
-        self._shown = feed.id, index
-        self.due = True
+        self._panel.flush()
+        if self._shown != (feed.id, index):
+            self._shown = feed.id, index
+            self.redraw(feed, index)
 
-    def draw(self, feed: JobFeed, index: int) -> None:
-        """Bring pictures, matches and charts up to the step."""
-        self.due = False
-        record = feed.records[index]
+    def redraw(self, feed: JobFeed, index: int) -> None:
+        """Let pictures, charts and 3D follow with `go_on`."""
+        nearby = [k for k in (index - 1, index + 1) if 0 <= k < len(feed.records)]
+        self._todo = [(0.0, partial(self._draw, feed, index))]
+        self._todo += [(0.0, partial(self._fetch, feed, feed.records[k])) for k in nearby]
+
+    def _draw(self, feed: JobFeed, index: int) -> None:
+        """Bring pictures and charts up to the step."""
+        record, view = feed.records[index], None
         try:
-            view = self._matches(feed, record)
+            view = self._view(feed, record)
+            self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
             self._picture(feed, record, view)
+            self._panel.flush()
             self._flow(feed, record, view)
         except (ServiceTrouble, ValueError) as error:
             self._panel.caption.content = small_html(f"There is no picture of this step: {error}")
         truth = feed.job.truth if feed.job else None
         self._panel.curves.content = curves_html(feed.records, truth, index)
+        self._panel.flush()
+        self._todo.insert(0, (time.monotonic() + _APART_S, partial(self._place, feed, record, view)))
 
-    def _matches(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
-        """Show the match vectors, 3D and histograms; return them."""
+    def _place(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
+        """Bring the 3D up to the step."""
+        if feed.job is None:
+            return
+        several = feed.job.photo_step is not None
+        picture, textured = None, (feed.id, record.index if several else None)
+        if self._textured != textured:
+            picture = _photo(feed, record)
+            if picture is None and several:
+                picture = feed.render(record.index, matched=False)
+        self._stage.show_current(feed.job.camera(record), None if picture is None else reduced(picture, _TEXTURE_PX))
+        self._textured = textured
+        weighed = (r.candidates for r in reversed(feed.records[: record.index + 1]) if r.candidates)
+        self._stage.show_candidates(next(weighed, None), feed.job.photo)
+        self._stage.show_matches(view, None if view is None else match_colours(view, self._colour_by))
+
+    def _fetch(self, feed: JobFeed, record: IterationRecord) -> None:
+        """Have at hand what the pictures of a step need."""
+        with suppress(ServiceTrouble, ValueError):
+            self._render(feed, record, self._view(feed, record))
+
+    def _view(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
+        """Return the match vectors as the step sees them."""
         source = feed.matches(record.index)
-        view = seen(source, feed.job.camera(record), record.index) if source and feed.job else None
-        colours = None if view is None else match_colours(view, self._colour_by)
-        self._stage.show_matches(view, colours)
-        self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
-        return view
+        return seen(source, feed.job.camera(record), record.index) if source and feed.job else None
 
     def _flow(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
         """Draw the match vectors over the photo, or over what it should look like."""
         self._panel.flow.visible = view is not None
         if view is not None:
-            photo = feed.photo()
+            photo = _photo(feed, record)
             ground = feed.render(record.index, matched=False) if photo is None else photo
             self._panel.flow.image = flow(ground, view, match_colours(view, self._colour_by))
 
@@ -94,16 +138,16 @@ class Detail:
         panel.matches.visible = mode == "beside"
         panel.weight.visible, panel.flicker.visible = mode == "blend", mode == "flicker"
         panel.picture.visible = mode != "flicker"
-        if mode != "beside" or not panel.matches.value:
-            view = None
-        photo = feed.photo()
+        view = view if self._with_lines else None
+        photo = _photo(feed, record)
         if photo is None:
+            step = feed.job.photo_step if feed.job else None
+            why = "the photo was deleted after the job" if step is None else f"only the photo of step {step} is kept"
             panel.picture.image, panel.picture.visible = feed.render(record.index, matched=False), True
-            panel.caption.content = small_html("The render at this step's pose; the photo was deleted after the job.")
+            panel.caption.content = small_html(f"The render at this step's pose; {why}.")
             panel.window.visible, panel.flicker.visible = True, False
             return
-        # Matches of this very step may refer to another view than its pose: then that view stands beside the photo.
-        render = feed.render(record.index, matched=view is not None and view.carried_from is None)
+        render = self._render(feed, record, view)
         if mode == "flicker":
             panel.flicker.content = flicker_html(photo, render)
         elif mode == "beside":
@@ -115,6 +159,22 @@ class Detail:
         panel.caption.content = caption_html(mode, view, self._colour_by)
         panel.window.visible = True
 
+    def _render(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> UInt8[np.ndarray, "h w 3"]:
+        """Return what stands beside the photo."""
+        # Matches of this very step may refer to another view than its pose: then it is that view.
+        matched = self._with_lines and view is not None and view.carried_from is None
+        return feed.render(record.index, matched=matched)
+
+    @property
+    def _with_lines(self) -> bool:
+        return self.mode == "beside" and self._panel.matches.value
+
     @property
     def _colour_by(self) -> ColourBy:
         return cast(ColourBy, self._panel.colour_by.value)
+
+
+def _photo(feed: JobFeed, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the photo that a step is about; None: it isn't there (any more). Raises ServiceTrouble, ValueError."""
+    of = feed.job.photo_step if feed.job else None
+    return feed.photo() if of in (None, record.index) else None

@@ -127,6 +127,8 @@ class JobFeed:
     def _take(self, event: IterationRecord | JobView) -> None:
         if isinstance(event, JobView):
             self.job, self.complete = event, True
+            if event.photo_step is not None:
+                self._asked_photo = False  # it was another one while the job ran
         elif event.index == len(self.records):  # after a broken stream they come again from the first one on
             self.records.append(event)
         else:

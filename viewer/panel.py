@@ -21,8 +21,11 @@ _SPEEDS = ("1", "2", "5", "10", "20")
 class Panel:
     """The handles, by what they are for. What happens on a click is wired in `session`."""
 
-    def __init__(self, client: viser.ClientHandle) -> None:
+    def __init__(self, client: viser.ClientHandle, *, splats: bool) -> None:
+        """`splats`: whether the browser draws them, to begin with."""
         gui = client.gui
+        self.flush = client.flush
+        """Send what has been set without waiting for more."""
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH_PX)
         gui.add_html(
@@ -41,12 +44,13 @@ class Panel:
         self.fly = gui.add_button("fly to result", disabled=True)
         self.replay = gui.add_button("save as replay file", disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
-            self.layers = {layer: gui.add_checkbox(layer, True) for layer in get_args(Layer)}
+            self.layers = {layer: gui.add_checkbox(layer, layer != "splats" or splats) for layer in get_args(Layer)}
             self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
                 "exact render at rest",
                 True,
-                hint="When the view rests, the service's renderer draws it: what the estimator sees.",
+                hint="When the view rests, the service's renderer draws it: what the estimator sees. Without splats it "
+                "also draws while the view moves.",
             )
             self.legend = gui.add_html("")
             self.scene = gui.add_html("")

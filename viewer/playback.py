@@ -105,10 +105,10 @@ def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
         ("inliers", _or_dash(record.num_inliers, "d")),
         ("loss", _or_dash(record.loss, ".4g")),
         ("turned", _or_dash(record.step_deg, ".3g", "°")),
-        ("moved", _or_dash(record.step_units, ".3g", " units")),
+        ("moved, units", _or_dash(record.step_units, ".3g")),
     ]
     if truth:
-        rows += [("turned off", _or_dash(off[0], ".3g", "°")), ("away", _or_dash(off[1], ".3g", " units"))]
+        rows += [("turned off", _or_dash(off[0], ".3g", "°")), ("away, units", _or_dash(off[1], ".3g"))]
     cells = "".join(
         f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
@@ -177,9 +177,10 @@ def _swatch(ground: str, width: str = ".7em") -> str:
 
 
 def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:
-    """How much of the scene is drawn, and what viser can't draw."""
+    """How much of the scene the browser draws, and what viser can't draw; 0: the service draws it."""
     of = f"{drawn:,} splats" if drawn == total else f"{drawn:,} of {total:,} splats, the most important ones"
-    return _small(f"{escape(name)}: {of}, without view-dependent colour; {cameras} training cameras")
+    said = f"{of}, without view-dependent colour" if drawn else f"{total:,} Gaussians, drawn by the service"
+    return _small(f"{escape(name)}: {said}; {cameras} training cameras")
 
 
 def answer_colour(answer: Answer | None) -> tuple[int, int, int]:
@@ -191,7 +192,7 @@ def _why(answer: Answer) -> str:
     words = [answer.reason.replace("_", " ")]
     if answer.score is not None:
         words.append(f"score {answer.score:.2f}")
-    if answer.inliers is not None:
+    if answer.inliers:  # following a camera needs no matches
         words.append(f"{answer.inliers} inliers")
     return ", ".join(w for w in words if w)
 

@@ -34,6 +34,7 @@ def replay_html(feed: JobFeed, content: SceneContent) -> str:
         forbid_sharing(server)
         stage = Stage(_Tape(server))
         stage.show_scene(_decimated(content), None)
+        stage.add_splats()
         _look(server, shapes.behind(records[-1].pose, content.extent, content.splats.centres))
         stage.show_trajectory(records, job)
         tape = server.get_scene_serializer()

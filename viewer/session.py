@@ -12,6 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -22,11 +23,11 @@ from viewer.client import ServiceTrouble
 from viewer.detail import Detail
 from viewer.draw import Mode
 from viewer.exact import ExactView
-from viewer.feed import JobFeed, Library
+from viewer.feed import JobFeed, Library, SceneContent
 from viewer.panel import NO_JOB, NO_SCENE, Panel
 from viewer.playback import Playback, headline_html, job_label, legend_html, scene_html
 from viewer.replay import replay_html
-from viewer.stage import Stage
+from viewer.stage import Layer, Stage
 
 log = logging.getLogger(__name__)
 
@@ -38,9 +39,10 @@ Action = Callable[[], None]
 class Session:
     """Ends with its browser tab: `close` frees everything."""
 
-    def __init__(self, client: viser.ClientHandle, library: Library, job_id: str | None) -> None:
-        self.panel = Panel(client)
-        self.stage = Stage(client)
+    def __init__(self, client: viser.ClientHandle, library: Library, job_id: str | None, *, splats: bool) -> None:
+        """`splats`: whether the browser is to draw them, to begin with; else the service does."""
+        self.panel = Panel(client, splats=splats)
+        self.stage = Stage(client, splats=splats)
         self._client = client
         self._library = library
         self._follows = job_id is None
@@ -53,7 +55,7 @@ class Session:
         self._detail = Detail(self.panel, self.stage)
         self._exact = ExactView(client, library.service, self._show_exact)
         self._saving = False
-        self._opened = 0.0
+        self._opened = self._ticked = 0.0
         self._asked: dict[str, Any] = {}
         """What the user last set; a running job sets the same widgets, perhaps before it is looked at."""
         self._todo: list[Action] = []
@@ -84,9 +86,7 @@ class Session:
     def _run(self) -> None:
         while True:
             with self._ready:
-                playing = 1 / float(self.panel.speed.value) if self._playback.playing else None
-                waits = 0.0 if self._detail.due else playing
-                self._ready.wait_for(lambda: self._closed or self._todo, waits)
+                self._ready.wait_for(lambda: self._closed or self._todo, self._idle_in_s())
                 if self._closed:
                     break
                 actions, self._todo = self._todo, []
@@ -98,11 +98,25 @@ class Session:
         # A browser's widgets refer to one another: left to itself, Python finds them when many more have come and gone.
         gc.collect()
 
+    def _idle_in_s(self) -> float | None:
+        """How long at most to wait for something to do; None: until it comes."""
+        if self._detail.due_in_s is not None:
+            return self._detail.due_in_s
+        if self.stage.lacks_splats:
+            return 0.0
+        if self._playback.playing:
+            return max(0.0, self._ticked + 1 / float(self.panel.speed.value) - time.monotonic())
+        return None
+
     def _idle(self) -> None:
-        """Nothing else waits: draw the picture that is due, or play on."""
-        if self._detail.due:
-            self._draw()
-        else:
+        """Nothing else waits: go on with the step that is shown, send the splats, or play on."""
+        if self._detail.due_in_s is not None:
+            self._detail.go_on()
+        elif self.stage.lacks_splats:
+            self.stage.add_splats()
+            self._exact.stand_alone(False)
+        elif self._playback.playing:
+            self._ticked = time.monotonic()
             self._playback.tick()
             self._show()
 
@@ -124,10 +138,10 @@ class Session:
         self._on_user(panel.step, self._user_moved_slider, "step")
         self._on_user(panel.scenes, self._user_chose_scene, "scene")
         for widget in (panel.matches, panel.weight, panel.colour_by):
-            self._on_user(widget, self._draw)
+            self._on_user(widget, self._redraw)
         self._on_user(panel.exact, lambda: self._exact.want(panel.exact.value))
-        for layer, box in panel.layers.items():
-            self._on_user(box, lambda layer=layer, box=box: self.stage.set_visible(layer, box.value))
+        for layer in panel.layers:
+            self._on_user(panel.layers[layer], partial(self._user_chose_layer, layer))
         panel.play.on_click(lambda event: self.post(lambda press=event.target.value: self._press(press)))
         panel.mode.on_click(lambda event: self.post(lambda mode=event.target.value: self._set_mode(mode)))
         panel.look_through.on_click(lambda _: self.post(self._look_through))
@@ -227,10 +241,14 @@ class Session:
         self.stage.show_scene(content, pose)
         self._opened = time.monotonic()
         self._scene_id = self.panel.scenes.value = scene_id
+        self._exact.stand_alone(True)
         self._exact.use(scene_id)
-        self.panel.scene.content = scene_html(
-            content.view.name, len(content.splats.rgba), content.splats.total, len(content.view.cameras)
-        )
+        self._describe(content)
+
+    def _describe(self, content: SceneContent) -> None:
+        """Tell what is drawn of the scene."""
+        drawn = len(content.splats.rgba) if self.panel.layers["splats"].value else 0
+        self.panel.scene.content = scene_html(content.view.name, drawn, content.splats.total, len(content.view.cameras))
 
     def _show(self) -> None:
         """Show the record at the playback's position; its picture follows when nothing else waits."""
@@ -238,10 +256,10 @@ class Session:
         if feed is not None and index < self._playback.count:
             self._detail.show(feed, index)
 
-    def _draw(self) -> None:
+    def _redraw(self) -> None:
         feed, index = self._feed, self._playback.index
         if feed is not None and index < len(feed.records):
-            self._detail.draw(feed, index)
+            self._detail.redraw(feed, index)
 
     def _show_exact(self, picture: np.ndarray | None) -> None:
         self.post(lambda: self.stage.show_exact(picture))
@@ -266,6 +284,13 @@ class Session:
         self._show_scene(scene_id, None)
         self.panel.headline.content = headline_html(None, 0, "")
 
+    def _user_chose_layer(self, layer: Layer) -> None:
+        shown = self.panel.layers[layer].value
+        self.stage.set_visible(layer, shown)
+        if layer == "splats" and self._scene_id is not None:
+            self._exact.stand_alone(not shown or self.stage.lacks_splats)
+            self._describe(self._library.scene(self._scene_id))
+
     def _user_chose_newest(self) -> None:
         self._follows = self.panel.newest.value
         self._wanted = self._feed.id if self._feed is not None else None
@@ -285,7 +310,7 @@ class Session:
 
     def _set_mode(self, mode: str) -> None:
         self._detail.mode = cast(Mode, mode)
-        self._draw()
+        self._redraw()
 
     def _look_through(self) -> None:
         feed, index = self._feed, self._playback.index

@@ -44,10 +44,11 @@ class Canvas(Protocol):
 class Stage:
     """What one browser sees. All methods are called from one thread."""
 
-    def __init__(self, client: Canvas) -> None:
+    def __init__(self, client: Canvas, *, splats: bool = True) -> None:
         self._client = client
         self._scene: SceneContent | None = None
         self._visible: dict[Layer, bool] = dict.fromkeys(get_args(Layer), True)
+        self._visible["splats"] = splats
         self._splats_wanted = True
         self._ground = np.zeros((1, 1, 3), np.uint8)
         self._steps: tuple[list[int], Float64[np.ndarray, "k 4 4"]] = [], np.zeros((0, 4, 4))
@@ -55,7 +56,8 @@ class Stage:
         self._nodes: dict[Layer, dict[str, viser.SceneNodeHandle]] = {layer: {} for layer in self._visible}
 
     def show_scene(self, content: SceneContent, pose: Pose | None) -> None:
-        """Draw a scene; stand behind a camera in it, or at its first view."""
+        """Draw a scene but for its splats; stand behind a camera in it, or at its first view."""
+        self._remove("splats", "splats")
         self._scene = content
         self._ground = (255 * np.array([[content.view.background_rgb]])).astype(np.uint8)
         scene, client = content.extent, self._client
@@ -73,7 +75,6 @@ class Stage:
         poses = shapes.stacked([c.pose for c in cameras])
         segments = shapes.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
         self._lines("training cameras", "cameras", segments, TRAINING_COLOUR, 1.0)
-        self._add_splats(content)
 
     def show_trajectory(self, records: Sequence[IterationRecord], job: JobView) -> None:
         """Draw the way from the first to the last record, in the verdict's colour once there is one."""
@@ -143,7 +144,7 @@ class Stage:
         self._steps = [], np.zeros((0, 4, 4))
         for layer in ("trajectory", "candidates", "match vectors"):
             for name in tuple(self._nodes[layer]):
-                self._nodes[layer].pop(name).remove()
+                self._remove(layer, name)
 
     def set_visible(self, layer: Layer, visible: bool) -> None:
         self._visible[layer] = visible
@@ -205,8 +206,16 @@ class Stage:
             self._client.flush()
             time.sleep(_FRAME_S)
 
-    def _add_splats(self, content: SceneContent) -> None:
-        splats = content.splats
+    @property
+    def lacks_splats(self) -> bool:
+        """They are to be seen, and have not been sent yet."""
+        return self._scene is not None and self._visible["splats"] and not self._nodes["splats"]
+
+    def add_splats(self) -> None:
+        """Send the scene's splats: megabytes, which nothing else should have to wait for."""
+        if self._scene is None:
+            return
+        splats = self._scene.splats
         # viser sends covariances as float16: scaled so that the largest just fits, small ones keep digits.
         largest = float(splats.covariances[:, [0, 3, 5]].max(initial=1e-12))
         k = 200.0 / np.sqrt(largest)
@@ -228,10 +237,13 @@ class Stage:
         colours: np.ndarray | tuple[int, int, int],
         width_px: float,
     ) -> None:
-        old = self._nodes[layer].pop(name, None)
         if not len(segments):
-            if old is not None:
-                old.remove()
+            self._remove(layer, name)
+            return
+        old = self._nodes[layer].get(name)
+        if isinstance(old, viser.LineSegmentsHandle):
+            with self._client.atomic():
+                old.points, old.colors = segments, np.asarray(colours, np.uint8)
             return
         self._nodes[layer][name] = self._client.scene.add_line_segments(
             f"/{layer}/{name}",
@@ -246,10 +258,8 @@ class Stage:
         """The way of the camera's centre."""
         apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-9
         points = points[np.concatenate([[True], apart])]
-        old = self._nodes["trajectory"].pop("path", None)
         if len(points) < 2:
-            if old is not None:
-                old.remove()
+            self._remove("trajectory", "path")
             return
         self._nodes["trajectory"]["path"] = self._client.scene.add_spline_catmull_rom(
             "/trajectory/path",
@@ -263,20 +273,29 @@ class Stage:
     def _points(
         self, layer: Layer, name: str, points: np.ndarray, colours: UInt8[np.ndarray, "k 3"], size: float
     ) -> None:
-        old = self._nodes[layer].pop(name, None)
         if not len(points):
-            if old is not None:
-                old.remove()
+            self._remove(layer, name)
+            return
+        points = points.astype(np.float32)
+        old = self._nodes[layer].get(name)
+        if isinstance(old, viser.PointCloudHandle) and old.point_size == size:
+            with self._client.atomic():
+                old.points, old.colors = points, colours
             return
         self._nodes[layer][name] = self._client.scene.add_point_cloud(
             f"/{layer}/{name}",
-            points.astype(np.float32),
+            points,
             colours,
             point_size=size,
             point_shape="circle",
             precision="float32",
             visible=self._visible[layer],
         )
+
+    def _remove(self, layer: Layer, name: str) -> None:
+        node = self._nodes[layer].pop(name, None)
+        if node is not None:
+            node.remove()
 
     def _frustum(
         self,

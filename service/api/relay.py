@@ -3,6 +3,7 @@
 The viewer's page finds its WebSocket by its own address: the page /viewer/jobs/ID/ connects to
 /viewer/jobs/ID. What follows /viewer is handed on, so the viewer knows from the path which job a browser
 asks for. All pages are one and the same file, so a path that the viewer has no file for gets that page.
+A browser without a GPU says so in a cookie (`pages/viewer.js`); the viewer hears it as a query.
 """
 
 from __future__ import annotations
@@ -52,9 +53,9 @@ class Relay:
         if answer.status_code == 404:
             answer = await self._ask("")
         content, kind = answer.content, answer.headers.get("content-type", "")
-        if kind.startswith("text/html"):  # with our own script, which knows when the page is too old
-            script = f'<script src="{request.scope.get("root_path", "")}/ui/viewer.js"></script></head>'
-            content = content.replace(b"</head>", script.encode(), 1)
+        if kind.startswith("text/html"):  # with our own script, which must run before viser's opens the socket
+            script = f'<head><script src="{request.scope.get("root_path", "")}/ui/viewer.js"></script>'
+            content = content.replace(b"<head>", script.encode(), 1)
         return Response(content, answer.status_code, media_type=kind)
 
     async def _ask(self, path: str) -> httpx.Response:
@@ -65,7 +66,8 @@ class Relay:
 
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
         offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
-        uri = f"ws://127.0.0.1:{self._upstream.port}/{path}"
+        query = "?gl=software" if browser.cookies.get("splatfix_gl") == "software" else ""
+        uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{query}"
         try:
             # No size limit and no compression: whole scenes pass here, on loopback.
             async with connect(

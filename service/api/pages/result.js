@@ -26,9 +26,16 @@ function verdict({ result, error, state }) {
   const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
   return [
     h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, `${sentence(result.reason)}.`), " ", lead)),
+    ...(result.frames ? [h("p", { class: "lead" }, walk(result.frames))] : []),
     ...(result.alternatives.length ? [alternatives(result)] : []),
     ...result.warnings.map(warning => h("p", { class: "warning" }, warning)),
   ];
+}
+
+function walk(frames) {
+  const found = frames.filter(frame => frame.status === "localized");
+  const last = found.length ? ` Shown here: the last of them, ${found.at(-1).name}.` : "";
+  return `${found.length} of ${frames.length} photos were localized.${last}`;
 }
 
 function alternatives({ alternatives: others }) {

@@ -1,7 +1,21 @@
-// Put into the viewer's page, which is viser's own file: the way back, the title, and a reload after an upgrade.
+// Put into the viewer's page, which is viser's own file, before all else: the way back, the title, a reload after an
+// upgrade, and whether there is a GPU.
 
 const root = new URL("..", document.currentScript.src);
 document.title = "splatfix viewer";
+
+// Without a GPU a picture of the splats takes seconds. The socket that is opened next takes the word along, and the
+// service draws instead.
+function drawsInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return true;
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+const drawn = drawsInSoftware() ? "software" : "gpu";
+document.cookie = `splatfix_gl=${drawn}; path=${new URL("viewer", root).pathname}; SameSite=Strict`;
 
 // Links to our own pages; their address depends on where the service is shown.
 document.addEventListener("click", event => {
