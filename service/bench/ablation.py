@@ -20,7 +20,7 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import Request
-from service.pose import alignment
+from service.pose import alignment, pyramid
 from service.pose.decoupled import MatchedPoints, least_squares_solve
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
@@ -67,8 +67,8 @@ def removals() -> dict[str, Removal]:
         "gain, bias, gamma, blur": Removal(((a, "_solved", _without_look),)),
         "L1 weights": Removal(((a._Level, "residuals", _evenly_weighted),)),
         "cut of large residuals": Removal(((a, "_bisquare", _uncut),)),
-        "cut-off where saturated": Removal(((a, "_cut_off", _as_rendered),)),
-        "depth of the occluder at edges": Removal(((a, "_edge_owner_depth", _own_depth),)),
+        "cut-off where saturated": Removal(((a, "cut_off", _as_rendered),)),
+        "depth of the occluder at edges": Removal(((a, "edge_owner_depth", _own_depth),)),
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
         "PnP again (decoupled instead)": Removal(((v, "_resected", _decoupled),)),
@@ -197,7 +197,7 @@ def _as_rendered(photo: np.ndarray, frame: Any) -> np.ndarray:
 
 
 def _own_depth(frame: Any) -> np.ndarray:
-    return np.where(frame.alpha > alignment.MIN_ALPHA, frame.median_depth, np.float32(0))
+    return np.where(frame.alpha > pyramid.MIN_ALPHA, frame.median_depth, np.float32(0))
 
 
 def _fixed_dilation(camera: Any, info: Any) -> float:

@@ -22,14 +22,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.geometry import moved, se3_exp, se3_log
 from service.interfaces import Frame
 from service.jit import kernel
+from service.pose.covariance import inverse, spread, summed_by_cell
 from service.pose.focal import lens_precision, lens_state, stepped
+from service.pose.pyramid import cut_off, depth_pyramid, edge_owner_depth, luma, pyramid
 from service.types import EXACT, Camera, Intrinsics, Lens, Pose
 
 TWIST, LOOK, LENS = slice(0, 6), slice(6, 10), slice(10, 13)
@@ -38,22 +39,10 @@ DELTA = 0.02
 """Residuals (0..1) below it are noise: they weigh like least squares."""
 CUT = 9.0
 MIN_SPREAD = 0.01
-SATURATED, SATURATED_SHARE = 252, 0.005
-"""Of 0..255; of all values of a photo, from which on the render is cut off as the photo is."""
 MAX_STEPS = 12
-SIGMA_PX = 0.7
-"""Blur of photo and render at each level: renders are softer than photos."""
-MIN_ALPHA = 0.5
-BLOCK_PX = 16
-INFLATION = 2.5
-"""Of standard deviations: a model's own geometry errs beyond what the residuals show."""
-EDGE_PX = 2
-EDGE_JUMP = 0.06
-"""Relative; a surface seen at 80 degrees from its normal changes by 0.02 over two pixels."""
 MAX_PIXELS = 8_000
 """A level with more uses every second, third...: 6000 were as exact as 30000 on the six test scenes."""
 MIN_PIXELS = 200
-FAR = np.float32(1e30)
 SETTLED_PX, SETTLED_COARSE_PX = 0.005, 0.05
 """Of the level, at the finest one and at those that a finer one follows."""
 UNKNOWN = np.float32(-1e4)
@@ -154,11 +143,11 @@ def _levels(
     lens_unknown: bool,
 ) -> Iterator[_Level]:
     """Linearize the levels of the pyramid, coarsest first; each only when it is asked for."""
-    luma = _luma(photo)
+    shown = luma(photo)
     if known is not None:
-        luma[~known] = UNKNOWN
-    photos, renders = _pyramid(luma, levels), _pyramid(_luma(_cut_off(photo, frame)), levels)
-    depths = _depth_pyramid(_edge_owner_depth(frame), levels)
+        shown[~known] = UNKNOWN
+    photos, renders = pyramid(shown, levels), pyramid(luma(cut_off(photo, frame)), levels)
+    depths = depth_pyramid(edge_owner_depth(frame), levels)
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):
         height, width = render.shape
         pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
@@ -214,11 +203,7 @@ def evidence(
     focal_sigma: float,
     known: Bool[np.ndarray, "h w"] | None = None,
 ) -> Evidence | None:
-    """Weigh an answer against the frame, which `camera` rendered nearby; None where too few pixels overlap.
-
-    Residuals of neighbours err together, and some regions err more than others: the covariance is the sandwich
-    estimator, clustered by blocks of the image (White 1980; Liang and Zeger 1986).
-    """
+    """Weigh an answer against the frame, which `camera` rendered nearby; None where the pixels don't determine it."""
     (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1, lens_unknown=True)
     state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0, UNTOUCHED.copy())
     before = state.photo_from_render
@@ -227,48 +212,37 @@ def evidence(
     pull = se3_log(before @ np.linalg.inv(state.photo_from_render))
     residuals, weights, _ = level.residuals(state)
     columns = level.columns * state.slopes[:, None].astype(np.float32)
-    scores = columns * (weights * residuals)
-    width = frame.alpha.shape[1] - 2
-    row, column = np.divmod(level.pixels, width)
-    block = row // BLOCK_PX * (width // BLOCK_PX + 1) + column // BLOCK_PX
-    summed = INFLATION * np.stack([np.bincount(block, weights=score) for score in scores])
-    # The loss is bent only near 0; the weights of the steps would overstate it.
-    hessian = ((columns * (weights * (np.abs(residuals) < DELTA))) @ columns.T).astype(np.float64)
-    covariance = _sandwich(hessian, summed)
-    focal = LENS.start + 1
-    free_focal = _sandwich(hessian[:focal, :focal], summed[:focal])
+    inner = (frame.alpha.shape[0] - 2, frame.alpha.shape[1] - 2)
+    scores, hessians, places = summed_by_cell(columns, weights, residuals, level.pixels, inner, DELTA)
+    size = spread(scores[:, : LENS.start], hessians[:, : LENS.start, : LENS.start], places)
+    hessian, focal = hessians.sum(0), LENS.start + 1
+    covariance = _covariance(hessian, size, focal_sigma)
+    free_focal = inverse(hessian[:focal, :focal])
     if covariance is None or free_focal is None:
         return None
-    focal_pull = float(np.linalg.solve(hessian[:focal, :focal], scores[:focal].sum(1, dtype=np.float64))[-1])
+    focal_pull = float((free_focal @ scores.sum(0)[:focal])[-1])
     if not focal_sigma and abs(focal_pull) > SUSPICIOUS:
         # From a pose that makes up for a wrong focal length one step leads a fifth of the way.
         free = replace(state, focal_sigma=FREE_SIGMA, look=state.look.copy())
         _align_level(level, free)
         focal_pull = float(np.log(free.lens.focal_factor))
-    if focal_sigma:
-        keep = np.r_[TWIST, LENS]
-        information = np.linalg.inv(covariance[np.ix_(keep, keep)])
-        information[range(6, 9), range(6, 9)] += lens_precision(focal_sigma)
-        covariance = np.linalg.inv(information)
-    else:
-        covariance = _sandwich(hessian[: LENS.start, : LENS.start], summed[: LENS.start])
-        if covariance is None:
-            return None
-        covariance = covariance[TWIST, TWIST]
-    return Evidence(pull, covariance, focal_pull, float(np.sqrt(free_focal[-1, -1])))
+    return Evidence(pull, covariance, focal_pull, float(np.sqrt(size * free_focal[-1, -1])))
 
 
-def _sandwich(
-    hessian: Float64[np.ndarray, "k k"], scores: Float64[np.ndarray, "k blocks"]
+def _covariance(
+    hessian: Float64[np.ndarray, "13 13"], size: float, focal_sigma: float
 ) -> Float64[np.ndarray, "k k"] | None:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    try:
-        inverse = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
-    except np.linalg.LinAlgError:
+    """Return the covariance of the twist, with an approximate lens also of that; None if it isn't positive definite."""
+    if not np.isfinite(size):
         return None
-    half = inverse @ scores
-    covariance = half @ half.T
-    return covariance if np.all(np.isfinite(covariance)) and np.all(np.diag(covariance) > 0) else None
+    if not focal_sigma:
+        found = inverse(hessian[: LENS.start, : LENS.start])
+        return None if found is None else size * found[TWIST, TWIST]
+    information = hessian / size
+    information[LENS, LENS] += np.diag(lens_precision(focal_sigma))
+    keep = np.r_[TWIST, LENS]
+    found = inverse(information)
+    return None if found is None else found[np.ix_(keep, keep)]
 
 
 def _parameters(lens: Intrinsics) -> Float64[np.ndarray, "4"]:
@@ -305,65 +279,6 @@ def _solved(
     step = np.zeros(13)
     step[:size] = scale * np.linalg.solve(damped, scale * right)
     return step
-
-
-def _cut_off(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> Float32[np.ndarray, "h w 3"]:
-    """Return the render, and if the photo is saturated, as bright as the photo and cut off at 1.
-
-    The photo's luma doesn't follow from the render's where single channels are cut off.
-    """
-    if cv2.countNonZero(cv2.compare(photo.ravel(), SATURATED, cv2.CMP_GE)) < SATURATED_SHARE * photo.size:
-        return frame.rgb
-    size = (photo.shape[1] // BLOCK_PX, photo.shape[0] // BLOCK_PX)
-    shown, expected = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (photo, frame.rgb))
-    shown = shown / np.float32(255)
-    factors = []
-    for a, b in zip(np.moveaxis(shown, 2, 0), np.moveaxis(expected, 2, 0), strict=True):
-        fair = (a > 0.05) & (a < 0.9) & (b > 0.05)  # a black rim is none of the exposure's
-        factors.append(max(1.0, float(np.median(a[fair] / b[fair]))) if fair.any() else 1.0)
-    return np.asarray(cv2.min(cv2.transform(frame.rgb, np.diag(factors)), (1.0, 1.0, 1.0, 1.0)))
-
-
-def _luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Return the mean of the channels, 0..1."""
-    scale = np.float32(1 / 765 if rgb.dtype == np.uint8 else 1 / 3)
-    return (rgb[..., 0].astype(np.float32) + rgb[..., 1] + rgb[..., 2]) * scale
-
-
-def _pyramid(image: Float32[np.ndarray, "h w"], levels: int) -> list[Float32[np.ndarray, "_ _"]]:
-    """Return the blurred levels, finest first; each has half the size of the one before."""
-    raw = [image]
-    for _ in range(levels - 1):
-        height, width = raw[-1].shape
-        raw.append(np.asarray(cv2.resize(raw[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA)))
-    return [np.asarray(cv2.GaussianBlur(level, (0, 0), SIGMA_PX)) for level in raw]
-
-
-def _edge_owner_depth(frame: Frame) -> Float32[np.ndarray, "h w"]:
-    """Return the depth with which each pixel's gradient moves; 0 where nothing is seen.
-
-    An occluding edge moves with what occludes, on both of its sides: within EDGE_PX of a depth edge, or of the
-    object's outline, the nearer depth holds. Without this a blurred photo of an object pulls the camera away
-    (s1 of 26 blurred photos: 0 without, 16 with; medians of sharp ones gain a fifth).
-    """
-    depth = np.where(frame.alpha > MIN_ALPHA, frame.median_depth, np.float32(0))
-    around = np.ones((2 * EDGE_PX + 1, 2 * EDGE_PX + 1), np.uint8)
-    nearest = cv2.erode(np.where(depth > 0, depth, FAR), around)
-    edge = (nearest < FAR) & ((depth == 0) | (depth > (1 + EDGE_JUMP) * nearest))
-    return np.where(edge, nearest, depth).astype(np.float32)
-
-
-def _depth_pyramid(depth: Float32[np.ndarray, "h w"], levels: int) -> list[Float32[np.ndarray, "_ _"]]:
-    """Average 2x2 depths on smooth surface; 0 where a depth edge runs through them or there is none."""
-    result = [depth]
-    for _ in range(levels - 1):
-        fine = result[-1]
-        height, width = fine.shape[0] // 2 * 2, fine.shape[1] // 2 * 2
-        quads = np.stack([fine[y:height:2, x:width:2] for y in (0, 1) for x in (0, 1)])
-        nearest, farthest = quads.min(0), quads.max(0)
-        smooth = (nearest > 0) & (farthest < 1.1 * nearest)
-        result.append(np.where(smooth, quads.mean(0), np.float32(0)).astype(np.float32))
-    return result
 
 
 @kernel
