@@ -26,7 +26,7 @@ def cut_off(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> Float32[np.ndarr
 
     The photo's luma doesn't follow from the render's where single channels are cut off.
     """
-    if cv2.countNonZero(cv2.compare(photo.ravel(), SATURATED, cv2.CMP_GE)) < SATURATED_SHARE * photo.size:
+    if np.count_nonzero(photo >= SATURATED) < SATURATED_SHARE * photo.size:
         return frame.rgb
     size = (photo.shape[1] // EXPOSURE_PX, photo.shape[0] // EXPOSURE_PX)
     shown, expected = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (photo, frame.rgb))
@@ -35,7 +35,8 @@ def cut_off(photo: UInt8[np.ndarray, "h w 3"], frame: Frame) -> Float32[np.ndarr
     for a, b in zip(np.moveaxis(shown, 2, 0), np.moveaxis(expected, 2, 0), strict=True):
         fair = (a > 0.05) & (a < 0.9) & (b > 0.05)  # a black rim is none of the exposure's
         factors.append(max(1.0, float(np.median(a[fair] / b[fair]))) if fair.any() else 1.0)
-    return np.asarray(cv2.min(cv2.transform(frame.rgb, np.diag(factors)), (1.0, 1.0, 1.0, 1.0)))
+    brighter = np.asarray(cv2.transform(frame.rgb, np.diag(factors)))
+    return np.minimum(brighter, np.float32(1), out=brighter)
 
 
 def luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
