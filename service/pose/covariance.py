@@ -25,9 +25,6 @@ TURNS = 4
 """Of the cross that cuts the image in quarters, within a right angle; each is cut first one way, then the other."""
 REMAINS = 1e-3
 """Share of the hessian that no quarter takes away, so that what is left can be solved."""
-LEAST_SPREAD = 0.09
-"""What half of the photos of chair, materials and studio have: a photo whose quarters happen to agree isn't exacter
-than the model. Each two of the scenes alone have 0.09 to 0.10."""
 
 
 def summed_by_cell(
@@ -54,7 +51,7 @@ def spread(
     hessians: Float64[np.ndarray, "cells k k"],
     places: Float64[np.ndarray, "cells 2"],
 ) -> float:
-    """Return s, at least LEAST_SPREAD; infinite where the hessian is singular."""
+    """Return s; infinite where the hessian is singular."""
     hessian = hessians.sum(0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     hessians, scores, hessian = hessians * np.outer(scale, scale), scores * scale, hessian * np.outer(scale, scale)
@@ -66,7 +63,7 @@ def spread(
     except np.linalg.LinAlgError:
         return np.inf
     found = float(np.einsum("qi,ij,qj->", moves, hessian, moves)) / len(hessian) / (2 * TURNS)
-    return max(found, LEAST_SPREAD) if np.isfinite(found) else np.inf
+    return found if np.isfinite(found) else np.inf
 
 
 def inverse(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k"] | None:
@@ -75,7 +72,6 @@ def inverse(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k"] |
     try:
         half = np.linalg.inv(np.linalg.cholesky(hessian * np.outer(scale, scale))) * scale
         result = half.T @ half
-        np.linalg.cholesky(result)
     except np.linalg.LinAlgError:
         return None
     return result if np.all(np.isfinite(result)) else None
