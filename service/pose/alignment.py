@@ -226,8 +226,10 @@ def evidence(
     hessian, focal = hessians.sum(0), LENS.start + 1
     covariance = _covariance(hessian, SPREAD_SHARE * max(size, LEAST_SPREAD), focal_sigma)
     free_focal = inverse(hessian[:focal, :focal])
-    if covariance is None or free_focal is None:
+    if covariance is None:
         return None
+    if free_focal is None:  # a flat wall seen straight on says nothing of it
+        return Evidence(pull, covariance, 0.0, np.inf)
     focal_pull = float((free_focal @ scores.sum(0)[:focal])[-1])
     if not focal_sigma and abs(focal_pull) > SUSPICIOUS:
         # From a pose that makes up for a wrong focal length one step leads a fifth of the way.
