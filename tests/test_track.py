@@ -18,6 +18,7 @@ from service.errors import SceneNotFound
 from service.geometry import moved, pose_distance
 from service.images import encode_image, query_of, read_query
 from service.localize import Cancelled, LoadedScene, Request
+from service.pose import gate
 from service.pose.gate import verify
 from service.track import SequencePhoto, Tracker, localize_sequence
 from service.types import Camera, Intrinsics, Pose, Query, Status
@@ -147,7 +148,7 @@ def test_the_gate_is_asked_in_doubt_and_now_and_then(room, monkeypatch):
     for i, pose in enumerate(truth):
         tracker.track(query(room, pose, i))
     assert len(asked) == 2  # photos 3 and 6 after the first
-    monkeypatch.setattr(track, "LOCALIZED", 1.1)
+    monkeypatch.setattr(gate, "CLEAR_COLOURS", 1.1)
     asked.clear()
     estimate = tracker.track(query(room, path(8)[7], 7))
     assert asked
