@@ -1,11 +1,13 @@
 """The default estimator: recognise the photo among rendered views, resect, align. Needs no prior.
 
     features of the photo -> views that they vote for -> matches, lifted to 3D -> PnP
-    -> while few agree: render there, match again -> align photometrically on two renders -> verification gate
+    -> while few agree: render there, match again -> align photometrically on a small render, then on larger ones
+    -> verification gate -> do many matches agree elsewhere? Then is that place as good?
 
-Only if the gate doesn't accept the answer the dearer searches are tried: further views, or with the photo turned by
-eighths; then poses sampled near the views. A prior pose is one more candidate view. Sizes and rounds
-are the research's; numbers that were measured stand beside the constants.
+Only if the gate doesn't accept the answer the dearer searches are tried, on the photo in a larger size: further views,
+or with the photo turned by eighths; then poses sampled near the views. From a prior pose alignment is tried at once;
+where that fails it is one more candidate view. Sizes and rounds are the research's; numbers that were measured stand
+beside the constants.
 """
 
 from __future__ import annotations
