@@ -393,7 +393,7 @@ def test_a_step_comes_as_widgets_first_and_only_what_changed(fake: FakeService, 
         browser.wait(lambda: np.allclose(place(), there[2], atol=1e-6), "the camera of the step")
         frames = browser.frames[before:]
         of_3d = [[m for m in frame if "name" in m] for frame in frames]
-        first = next(k for k, messages in enumerate(of_3d) if messages)
+        first = next(k for k, sent in enumerate(of_3d) if any(m["name"] == "/trajectory/current" for m in sent))
         said = [m["updates"] for frame in frames[:first] for m in frame if m["type"] == "GuiUpdateMessage"]
         assert any(">102<" in u.get("content", "") for u in said), "the numbers wait for no 3D"
         assert any("_data" in u for u in said), "nor does the picture"
