@@ -184,8 +184,8 @@ class _Hunt:
         )  # fmt: skip
         for rival in suspected:
             rival, last = replace(rival, lens=self.answer.lens), None
-            glance = next(_aligned(rival, self.query, self.tools), None)
-            if glance is None or (glance.loss or 0.0) > OUT_OF_QUESTION * (self.answer.loss or np.inf):
+            first = next(_aligned(rival, self.query, self.tools), None)
+            if first is None or (first.loss or 0.0) > OUT_OF_QUESTION * (self.answer.loss or np.inf):
                 continue
             for last in _refined(rival, self.query, self.tools):
                 yield self._with_answer(last)

@@ -89,8 +89,8 @@ def align(
     """
     state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma, UNTOUCHED.copy())
     loss = np.inf
-    pyramid = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
-    for finer, level in zip(reversed(range(levels)), pyramid, strict=True):
+    coarse_to_fine = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
+    for finer, level in zip(reversed(range(levels)), coarse_to_fine, strict=True):
         if finer and len(level.pixels) < MIN_PIXELS:
             continue  # so small, what is seen of the scene says nothing
         state.look[3] = 0.0  # another at each level

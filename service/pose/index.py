@@ -21,7 +21,7 @@ from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, view_from
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 3
+VERSION = 4
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 
