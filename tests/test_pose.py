@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.alignment import align
-from service.pose.gate import SCALES, Scale, colour_agreement, gradient_agreement, probability, verify
+from service.pose.gate import SCALES, Scale, clear, colour_agreement, gradient_agreement, probability, verify
 from service.pose.index import built_index, prepared_index
 from service.pose.pnp import reprojection_error_px, resection
 from service.pose.retrieval import top, vote
@@ -411,6 +411,48 @@ def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place()
         assert measure(elsewhere, frame)[0] < 0.5
         nothing = Frame(frame.rgb, 0 * frame.alpha, 0 * frame.depth, 0 * frame.depth)
         assert measure(to_uint8(frame.rgb), nothing) == (0, 0)
+
+
+def test_a_half_of_one_colour_tells_nothing_against_a_pose() -> None:
+    """A photo so bright that most of it is white: the whole's agreement stands for the white half's."""
+    camera = Camera(LENS.resized(384, 320), true_pose())
+    frame = PaintedWalls().render([camera])[0]
+    rgb = frame.rgb.copy()
+    rgb[:, :250] = 1.0
+    bright = Frame(rgb, frame.alpha, frame.depth, frame.median_depth)
+    most, half = colour_agreement(to_uint8(0.97 * rgb), bright)
+    assert half >= most > 0.95
+
+
+def test_pixels_are_enough_only_where_colours_agree_too() -> None:
+    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "drift_px": 0.1}
+    assert clear(signals)
+    assert not clear(signals | {"colours": 0.89, "colours_half": 0.95})  # one sphere of a row too far
+    assert not clear(signals | {"gradients": 0.5, "gradients_half": 0.7})
+
+
+def test_features_of_a_large_render_lie_where_they_are_in_it() -> None:
+    """Where the lens is free renders are large; their features are found in a smaller copy."""
+
+    class BrightBlock(KnownPoints):
+        def extract(self, rgb: np.ndarray, limit: int) -> Features:
+            assert max(rgb.shape) == PHOTO_PX
+            rows, columns = np.nonzero(rgb[..., 0] > 128)
+            point = np.array([[columns.mean() + 0.5, rows.mean() + 0.5]], np.float32)
+            return Features(point, np.ones(1, np.float32), np.eye(1, dtype=np.float32))
+
+    class Block(PaintedWalls):
+        def _render(self, camera: Camera) -> Frame:
+            frame = super()._render(camera)
+            rgb = np.zeros_like(frame.rgb)
+            rgb[100:120, 200:220] = 1.0
+            return Frame(rgb, np.ones_like(frame.alpha), frame.depth, np.full_like(frame.depth, 2.0))
+
+    lens = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, trust="approximate")
+    tools = Tools(a_scene(), Block(), BrightBlock(), np.random.default_rng(0))
+    view, _ = rendered_view(true_pose(), Query(np.zeros((480, 640, 3), np.uint8), lens, "given", lens), tools)
+    assert view.camera.intrinsics.width == 640
+    assert view.features.points_px == pytest.approx(np.array([[210.0, 110.0]]), abs=0.5)
 
 
 @given(st.floats(-10, 1000), st.floats(-10, 1000))

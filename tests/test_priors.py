@@ -11,10 +11,10 @@ from test_estimators import assert_near, photo_at, unseen_pose
 
 from service.errors import InvalidPrior
 from service.estimators.view_index import Options
-from service.geometry import moved
+from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
 from service.pose.region import admits, excess, loosened
-from service.types import Box, Gaussian, Pose, Reason, Region, Status
+from service.types import Box, Gaussian, Pose, PoseEstimate, Reason, Region, Status
 
 TRUTH = unseen_pose()
 FAST = Request(options=Options(effort="fast"))
@@ -57,6 +57,43 @@ def test_an_answer_that_the_prior_excludes_is_no_answer(repeated: LoadedScene) -
     found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated, FAST)
     assert found.verdict.status is Status.UNCERTAIN
     assert found.verdict.reason is Reason.OUTSIDE_PRIOR
+
+
+def stages(found: PoseEstimate) -> set[str]:
+    return {record.stage for record in found.records}
+
+
+def test_from_a_prior_nothing_is_looked_for_elsewhere(repeated: LoadedScene) -> None:
+    """The photo is aligned with what is seen from there; no view of the index is asked."""
+    prior = moved(TRUTH, np.array([0.04, -0.03, 0.02, 0.03, 0.02, -0.03]))
+    known = gaussian_at(prior, 3, 0.1)
+    found = localize(replace(photo_at(repeated, TRUTH), prior=prior, region=known), repeated, FAST)
+    assert found.verdict.status is Status.LOCALIZED
+    assert stages(found) == {"align", "verify"}
+    assert_near(found.pose, TRUTH)
+
+
+def test_a_guess_does_not_decide_between_places_that_look_alike(repeated: LoadedScene) -> None:
+    found = localize(replace(photo_at(repeated, TRUTH), prior=moved(TRUTH, np.full(6, 0.02))), repeated, FAST)
+    assert "retrieve" not in stages(found)
+    assert found.verdict.reason is Reason.AMBIGUOUS
+    assert len(found.alternatives) == 1
+
+
+def test_a_wrong_guess_costs_nothing_but_time(repeated: LoadedScene) -> None:
+    wrong = moved(TRUTH, np.array([0.0, 1.6, 0, 0, 0, 0]))
+    found = localize(replace(photo_at(repeated, TRUTH), prior=wrong), repeated, FAST)
+    assert "retrieve" in stages(found)
+    assert min(pose_distance(found.pose, place)[0] for place in (TRUTH, TWIN)) < 0.2
+
+
+def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(
+    repeated: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("service.pose.gate.MAX_SIGMA_SHARE", 0.0)
+    found = localize(photo_at(repeated, TRUTH), repeated, FAST)
+    assert found.verdict.reason is Reason.PLACE_UNCERTAIN
+    assert not stages(found) & {"further", "turn", "sample"}
 
 
 def test_regions_end_where_they_say() -> None:

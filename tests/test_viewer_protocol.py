@@ -332,6 +332,12 @@ def _rendered_from(fake: FakeService) -> np.ndarray:
     return np.array(fake.renders[-1]["pose"]["world_from_camera"])[:3, 3]
 
 
+def _nothing_more_comes(browser: FakeBrowser) -> bool:
+    count = len(browser.frames)
+    time.sleep(0.3)
+    return len(browser.frames) == count
+
+
 def _background(browser: FakeBrowser) -> str:
     """What lies behind the scene."""
     data = browser.background["rgb_data"]
@@ -388,12 +394,13 @@ def test_a_step_comes_as_widgets_first_and_only_what_changed(fake: FakeService, 
         place = lambda: browser.nodes["/trajectory/current"]["position"]  # noqa: E731
         there = [r.pose.position_in_world for r in records(5)]
         browser.wait(lambda: np.allclose(place(), there[4], atol=1e-6) and _background(browser) == "exact", "the end")
+        browser.wait(lambda: _nothing_more_comes(browser), "the job's own 3D")
         before = len(browser.frames)
         browser.set("step", 2)
         browser.wait(lambda: np.allclose(place(), there[2], atol=1e-6), "the camera of the step")
         frames = browser.frames[before:]
         of_3d = [[m for m in frame if "name" in m] for frame in frames]
-        first = next(k for k, sent in enumerate(of_3d) if any(m["name"] == "/trajectory/current" for m in sent))
+        first = next(k for k, messages in enumerate(of_3d) if messages)
         said = [m["updates"] for frame in frames[:first] for m in frame if m["type"] == "GuiUpdateMessage"]
         assert any(">102<" in u.get("content", "") for u in said), "the numbers wait for no 3D"
         assert any("_data" in u for u in said), "nor does the picture"
