@@ -20,7 +20,7 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import Request
-from service.pose import alignment, pyramid
+from service.pose import alignment, pyramid, sight
 from service.pose.decoupled import MatchedPoints, least_squares_solve
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
@@ -58,8 +58,8 @@ def removals() -> dict[str, Removal]:
         "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
         "all views but the likeliest": Removal(options=view_index.Options(candidates=1)),
         "views' matches pooled": Removal(((Correspondences, "pooled", staticmethod(_first)),)),
-        "photo at the views' scale": Removal(((v, "SAME_SCALE", np.inf),)),
-        "photo turned": Removal(((v, "_turned_sight", _upright),)),
+        "photo at the views' scale": Removal(((sight, "SAME_SCALE", np.inf),)),
+        "photo turned": Removal(((v, "turned_sight", _upright),)),
         "sampled poses (effort fast)": Removal(options=view_index.Options(effort="fast")),
         "rendering and matching again": Removal(((v, "STRONG", 0),)),
         "alignment": Removal(((v, "_aligned", _as_found),)),

@@ -20,11 +20,10 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
-from service.interfaces import Features, Tools
+from service.interfaces import Tools
 from service.pose.alignment import align
 from service.pose.focal import WIDER, focal_resection, refine
 from service.pose.gate import glance, verify
@@ -32,9 +31,10 @@ from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
 from service.pose.pnp import Resection, resection
-from service.pose.region import admits, excess, loosened
+from service.pose.region import admits, loosened
 from service.pose.retrieval import top
 from service.pose.rivals import apart, ranked, rivals
+from service.pose.sight import GLANCE_PX, MATCH_ERROR_PX, SECOND_LOOK, Sight, first_sight, turned_sight
 from service.pose.views import (
     PHOTO_PX,
     Correspondences,
@@ -49,8 +49,6 @@ from service.pose.views import (
 )
 from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Reason, Status
 
-MATCH_ERROR_PX = 4.0
-"""At PHOTO_PX; XFeat's points scatter by 1.5 px."""
 REMATCH_ERROR_PX = 3.0
 GOOD_MATCH = 60
 """Inliers with one view that make further views needless."""
@@ -60,19 +58,6 @@ STRONG = 80
 """Inliers with which alignment needs no further match."""
 FURTHER = 16
 """One view in so many is tried before the search is given up: in a building the likeliest five may all be wrong."""
-SECOND_LOOK = 1.25
-"""A photo that isn't found at once is looked at in a size larger by this."""
-SAME_SCALE = 1.4
-"""Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
-SCALES_PX = (160, 640)
-GLANCE_PX = 256
-"""Of the photo, enough to see whether it could be elsewhere."""
-VOTE_SHARE, CLOSER_LOOKS = 0.5, 2
-"""Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
-TURN_BIAS = 0.77
-"""On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
-ODD_SHRINK = 0.8
-"""A photo turned by an eighth needs twice the canvas."""
 SAMPLE_PX, SAMPLES, SAMPLE_ROUNDS = 256, 8, 4
 MOST_ROUNDS = 100
 """Of an exhaustive search without a budget."""
@@ -90,8 +75,6 @@ MISFIT = 0.1
 """Mean residual (0..1) of an alignment that led nowhere; right ones have 0.005 to 0.06."""
 UNMENDABLE = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
 """Doubts about a pose at which photo and render agree: no other search knows better."""
-NEAREST = 16
-"""Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
 FIRST_ALIGNED_PX = 256
 """Long side of the first render that is aligned: it is as good as the big one at bringing the pose near."""
 REMATCHES, ALIGNMENTS = 3, 4
@@ -133,7 +116,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
             yield from hunt.contest(sight)
             return
     if hunt.accepted and query.region is None:  # a guess doesn't decide between places that look alike
-        yield from hunt.contest(_Sight(GLANCE_PX))
+        yield from hunt.contest(Sight(GLANCE_PX))
 
 
 @dataclass(slots=True)
@@ -169,7 +152,7 @@ class _Hunt:
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
-    def contest(self, sight: _Sight) -> Iterator[IterationRecord]:
+    def contest(self, sight: Sight) -> Iterator[IterationRecord]:
         """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""
         assert self.answer is not None
         answers = [self.answer]
@@ -202,41 +185,15 @@ class _Hunt:
         return replace(record, pose=self.answer.pose, lens=self.answer.lens) if self.answer else record
 
 
-@dataclass(slots=True)
-class _Sight:
-    """How the photo is looked at in a search."""
-
-    long_side: int
-    eighths: int = 0
-    """Of a turn, counter-clockwise, that make it upright."""
-
-    def features(self, query: Query, tools: Tools, share: float = 1.0) -> Features:
-        shrink = ODD_SHRINK if self.eighths % 2 else 1.0
-        return photo_features(query, tools, round(self.long_side * shrink * share), self.eighths)
-
-    def votes(self, query: Query, tools: Tools, share: float = 1.0) -> Float64[np.ndarray, "views"]:
-        """Return how much each view is like the photo, looked at like this; those far from its region are last."""
-        key = ("votes", self.long_side, self.eighths, share)
-        if key not in tools.memo:
-            votes = tools.prepared.votes(self.features(query, tools, share).descriptors)
-            tools.memo[key] = _within_reach(votes, query, tools.prepared)
-        return tools.memo[key]
-
-    @property
-    def max_error_px(self) -> float:
-        """At PHOTO_PX."""
-        return MATCH_ERROR_PX * max(1.0, PHOTO_PX / self.long_side)
-
-
 def _searches(
     query: Query, tools: Tools, options: Options, hunt: _Hunt
-) -> Iterator[tuple[Iterator[IterationRecord], _Sight]]:
+) -> Iterator[tuple[Iterator[IterationRecord], Sight]]:
     """The ways to look for the photo, cheapest first; with each how it looks."""
-    sight = _first_sight(query, tools)
+    sight = first_sight(query, tools)
     votes = sight.votes(query, tools)
     untried = deque(top(votes, options.candidates))
     yield _search("retrieve", sight, untried, query, tools), sight
-    sight = _turned_sight(replace(sight, long_side=round(SECOND_LOOK * sight.long_side)), query, tools)
+    sight = turned_sight(replace(sight, long_side=round(SECOND_LOOK * sight.long_side)), query, tools)
     votes = sight.votes(query, tools)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
     untried.extend(further[: max(options.candidates, len(votes) // FURTHER)])
@@ -248,11 +205,6 @@ def _searches(
         yield _sampled(sight, query, tools), sight
 
 
-def _first_sight(query: Query, tools: Tools) -> _Sight:
-    # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
-    return _Sight(_same_scale_px(query, tools.prepared) if tools.scene.cameras else PHOTO_PX)
-
-
 def _from_prior(query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Align from the prior pose, which may be some ten degrees off; end early where nothing fits."""
     assert query.prior is not None
@@ -262,42 +214,9 @@ def _from_prior(query: Query, tools: Tools) -> Iterator[IterationRecord]:
         yield replace(record, num_inliers=None)
 
 
-def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: ViewIndex) -> Float64[np.ndarray, "views"]:
-    """Return the views' votes, those of views that are far from the photo's region put below all others."""
-    if query.region is None:
-        return votes
-    away = np.array([excess(query.region, view.camera.pose) for view in index.views])
-    reach = np.sort(away)[min(NEAREST, len(away)) - 1]
-    return np.where(away <= reach, votes, min(0.0, float(votes.min())))
-
-
-def _turned_sight(upright: _Sight, query: Query, tools: Tools) -> _Sight:
-    """Return the photo upright, or turned as the views' votes say.
-
-    Votes on a smaller photo choose the turns that are worth a closer look.
-    """
-    turns = [replace(upright, eighths=eighths) for eighths in range(1, 8)]
-    turns.sort(key=lambda turned: -turned.votes(query, tools, VOTE_SHARE).max())
-    best, most = upright, upright.votes(query, tools).max()
-    for turned in turns[:CLOSER_LOOKS]:
-        if (found := TURN_BIAS * turned.votes(query, tools).max()) > most:
-            best, most = turned, found
-    return best
-
-
-def _same_scale_px(query: Query, index: ViewIndex) -> int:
-    """Return the photo's size at which a pixel covers the angle that it covers in the views, if that matters."""
-    lenses = [view.camera.intrinsics for view in index.views]
-    of_views = float(np.median([max(lens.fx, lens.fy) / lens.long_side for lens in lenses]))
-    factor = of_views * query.intrinsics.long_side / max(query.intrinsics.fx, query.intrinsics.fy)
-    if 1 / SAME_SCALE < factor < SAME_SCALE or query.intrinsics_source == "guessed":
-        return PHOTO_PX
-    return int(np.clip(PHOTO_PX * factor, *SCALES_PX))
-
-
 def _search(
     stage: str,
-    sight: _Sight,
+    sight: Sight,
     untried: deque[int],
     query: Query,
     tools: Tools,
@@ -321,7 +240,7 @@ def _search(
         yield from _aligned(found, query, tools)
 
 
-def _sampled(sight: _Sight, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Render at sampled poses and match; go on from the one that most matches agree with."""
     index: ViewIndex = tools.prepared
     votes = sight.votes(query, tools)
@@ -339,7 +258,7 @@ def _sampled(sight: _Sight, query: Query, tools: Tools) -> Iterator[IterationRec
 
 
 def _matched(
-    sight: _Sight, views: Iterable[View], query: Query, tools: Tools
+    sight: Sight, views: Iterable[View], query: Query, tools: Tools
 ) -> Generator[IterationRecord, None, Resection | None]:
     """Match the photo with one view after the other until one explains it; else with all of them together."""
     photo = sight.features(query, tools)
