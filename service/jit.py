@@ -36,6 +36,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)(function)
 
 
+def summing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a kernel whose sums may be taken in any order, several numbers at a time."""
+    freely = {"reassoc", "nsz", "contract"}
+    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=freely)(function)
+
+
 def inline(function: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a function that only kernels call: it is compiled into them."""
     return numba.njit(nogil=True, error_model="numpy", boundscheck=False)(function)

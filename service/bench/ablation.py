@@ -21,12 +21,11 @@ from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import Request
 from service.pose import alignment, pyramid, sight
-from service.pose.decoupled import MatchedPoints, least_squares_solve
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
 from service.pose.views import Correspondences
 from service.render import cpu
-from service.types import IterationRecord, Pose, Query
+from service.types import IterationRecord, Query
 
 EVERY = 3
 CONDITIONS = {
@@ -56,7 +55,9 @@ def removals() -> dict[str, Removal]:
     return {
         "nothing": Removal(),
         "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
+        "pixels enough after many matches": Removal(((v, "glance", _no_glance),)),
         "all views but the likeliest": Removal(options=view_index.Options(candidates=1)),
+        "first look at a smaller photo": Removal(((v, "GLIMPSE_SHARE", 1.0),)),
         "views' matches pooled": Removal(((Correspondences, "pooled", staticmethod(_first)),)),
         "photo at the views' scale": Removal(((sight, "SAME_SCALE", np.inf),)),
         "photo turned": Removal(((v, "turned_sight", _upright),)),
@@ -73,7 +74,7 @@ def removals() -> dict[str, Removal]:
         "depth of the occluder at edges": Removal(((a, "edge_owner_depth", _own_depth),)),
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
-        "PnP again (decoupled instead)": Removal(((v, "_resected", _decoupled),)),
+        "decoupled solver (PnP again instead)": Removal(((v, "_solved_near", _resected_again),)),
     }
 
 
@@ -159,8 +160,7 @@ def _patched(patches: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
 
 # --- what stands in for the parts
 
-_SOLVED, _RESIDUALS, _RESECTED = alignment._solved, alignment._Level.residuals, view_index._resected
-DECOUPLED_STEPS = 8
+_SOLVED, _RESIDUALS, _SOLVED_NEAR = alignment._solved, alignment._Level.residuals, view_index._solved_near
 
 
 def _any_views(index: ViewIndex, descriptors: np.ndarray) -> np.ndarray:
@@ -206,13 +206,12 @@ def _fixed_dilation(camera: Any, info: Any) -> float:
     return cpu.DILATION
 
 
-def _decoupled(
-    matches: Correspondences, query: Query, max_error_px: float, max_trials: int, near: Resection | None = None
-) -> Resection | None:
-    """Solve the matches with the render at a pose from there, where the lens is known."""
-    if near is None or query.focal_sigma or len(matches.photo_px) < 6:
-        return _RESECTED(matches, query, max_error_px, max_trials, near)
-    points = matches.points_in_world.astype(np.float64)
-    given = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, np.median(points, axis=0))
-    solved = least_squares_solve(given, Pose(near.pose.world_from_camera), DECOUPLED_STEPS)
-    return Resection(solved.pose, solved.weights >= 0.5, near.lens)
+def _no_glance(*others: Any) -> None:
+    return None
+
+
+def _resected_again(near: Resection, matches: Correspondences, query: Query) -> Resection | None:
+    """Solve the matches with a render at a pose as if they were with a view, where the lens is known."""
+    if query.focal_sigma:
+        return _SOLVED_NEAR(near, matches, query)
+    return view_index._resected(matches, query, view_index.REMATCH_ERROR_PX, 500)

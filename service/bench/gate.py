@@ -27,13 +27,13 @@ from jaxtyping import Bool, Float32, Float64
 from service.bench.localize import Subject, subject
 from service.bench.metrics import COARSE, errors, nees
 from service.bench.queries import BenchPhoto, sent
-from service.estimators.view_index import Options
+from service.estimators.view_index import GOOD_MATCH, Options
 from service.geometry import moved
 from service.images import encode_image, read_query, resized
 from service.interfaces import Tools
 from service.localize import Request, localize
 from service.pose.alignment import align
-from service.pose.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.gate import BY_PIXELS, CLEAR_COLOURS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
 from service.pose.views import photo_at, rendered_frame
 from service.track import aligned_from, glance
 from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
@@ -80,6 +80,8 @@ class Sample:
     nees: float | None
     glanced: bool | None = None
     """Whether the tracker's glance takes the pose for right; None: that wasn't asked."""
+    matched: bool = False
+    """Whether many matches with a view led there: then the pixels alone may decide."""
 
 
 def run(
@@ -109,7 +111,7 @@ def run(
 
 
 def _line(sample: Sample) -> dict[str, Any]:
-    names = ("scene", "kind", "photo", "right", "doubted", "nees", "glanced")
+    names = ("scene", "kind", "photo", "right", "doubted", "nees", "glanced", "matched")
     return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
 
 
@@ -220,7 +222,9 @@ def _tools(one: Subject) -> Tools:
 def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | None) -> Sample:
     estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
     weighed = nees(estimate, truth) if truth else None
-    return _sample(one, kind, photo, truth, estimate.pose, estimate.verdict, weighed)
+    verdict = replace(estimate.verdict, signals=verify(query, estimate.pose, _tools(one)).signals)
+    matched = any(r.stage == "align" and (r.num_inliers or 0) >= GOOD_MATCH for r in estimate.records)
+    return replace(_sample(one, kind, photo, truth, estimate.pose, verdict, weighed), matched=matched)
 
 
 def _sample(
@@ -243,8 +247,10 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     kinds = np.array([sample.kind for sample in samples])
     doubted = np.array([sample.doubted for sample in samples])
     usual = right & ~np.char.startswith(kinds, "beyond")
+    clear = np.array([sample.matched and sample.signals["colours"] > CLEAR_COLOURS for sample in samples])
     result: dict[str, Any] = {"glance": _glances(glanced)}
-    for name, model in (("with_matches", WITH_MATCHES), ("by_pixels", BY_PIXELS)):
+    by_pixels = np.zeros(len(samples))
+    for name, model in (("by_pixels", BY_PIXELS), ("with_matches", WITH_MATCHES)):
         features = scaled(samples, model)
         tested = np.zeros(len(samples))
         for scene in np.unique(scenes):
@@ -253,6 +259,10 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
             doubtful = (features[here] < floor).any(1)
             tested[here] = probabilities(features[here], weights)
             tested[here] = np.minimum(tested[here], np.where(doubtful, DOUBTFUL, 1.0))
+        if name == "by_pixels":
+            by_pixels = tested
+        else:  # as the estimator asks: matches only where the pixels don't make it clear
+            tested = np.where(clear & (by_pixels >= LOCALIZED), np.maximum(by_pixels, tested), tested)
         ends = [SCALES[n].value_at(f) for n, f in zip(list(model)[1:], floors(features[usual])[1:], strict=True)]
         result[name] = {
             "weights": dict(zip(model, np.round(fitted(features, right), 2).tolist(), strict=True)),

@@ -1,13 +1,14 @@
 """The default estimator: recognise the photo among rendered views, resect, align. Needs no prior.
 
     features of the photo -> views that they vote for -> matches, lifted to 3D -> PnP
-    -> while few agree: render there, match again -> align photometrically on a small render, then on larger ones
+    -> while few agree: render there, match again, solve decoupled
+    -> align photometrically on a small render, then on larger ones
     -> verification gate -> do many matches agree elsewhere? Then is that place as good?
 
-Only if the gate doesn't accept the answer the dearer searches are tried, on the photo in a larger size: further views,
-or with the photo turned by eighths; then poses sampled near the views. From a prior pose alignment is tried at once;
-where that fails it is one more candidate view. Sizes and rounds are the research's; numbers that were measured stand
-beside the constants.
+At first the photo is looked at in a small size. Only if the gate doesn't accept the answer the dearer searches are
+tried: in its full size; larger still, with further views, or turned by eighths; then poses sampled near the views. From
+a prior pose alignment is tried at once; where that fails it is one more candidate view. Sizes and rounds are the
+research's; numbers that were measured stand beside the constants.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Tools
 from service.pose.alignment import align
+from service.pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
 from service.pose.focal import WIDER, focal_resection, refine
 from service.pose.gate import glance, verify
 from service.pose.hypotheses import poses_near_views
@@ -34,7 +36,15 @@ from service.pose.pnp import Resection, resection
 from service.pose.region import admits, loosened
 from service.pose.retrieval import top
 from service.pose.rivals import apart, ranked, rivals
-from service.pose.sight import GLANCE_PX, MATCH_ERROR_PX, SECOND_LOOK, Sight, first_sight, turned_sight
+from service.pose.sight import (
+    GLANCE_PX,
+    GLIMPSE_SHARE,
+    MATCH_ERROR_PX,
+    SECOND_LOOK,
+    Sight,
+    first_sight,
+    turned_sight,
+)
 from service.pose.views import (
     PHOTO_PX,
     Correspondences,
@@ -50,6 +60,8 @@ from service.pose.views import (
 from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Reason, Status
 
 REMATCH_ERROR_PX = 3.0
+GLIMPSES = 2
+"""Views that the small photo is matched with."""
 GOOD_MATCH = 60
 """Inliers with one view that make further views needless."""
 CHANCE = 15
@@ -79,6 +91,7 @@ FIRST_ALIGNED_PX = 256
 """Long side of the first render that is aligned: it is as good as the big one at bringing the pose near."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
+DECOUPLED_STEPS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +148,8 @@ class _Hunt:
     def follow(self, search: Iterator[IterationRecord], expected: bool = False) -> Iterator[IterationRecord]:
         """Yield a search's records, with the best answer so far, and put its end before the gate.
 
-        An answer that was expected need not have matches if the pixels are clear.
+        An answer that was expected, or that many matches with a view led to, needs no more of them if the pixels are
+        clear.
         """
         last: IterationRecord | None = None
         for last in search:
@@ -144,7 +158,9 @@ class _Hunt:
         if last is None or (self.answer and last.stage != "align"):
             return  # the search gave up
         known = self.query.corrected(last.lens)
-        verdict = (glance(known, last.pose, self.tools) if expected else None) or verify(known, last.pose, self.tools)
+        matched = last.num_inliers or 0
+        seen = glance(known, last.pose, self.tools, matched) if expected or matched >= GOOD_MATCH else None
+        verdict = seen or verify(known, last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
             self.answer, self.score = last, verdict.score
         self.accepted = verdict.status is Status.LOCALIZED or verdict.reason in UNMENDABLE
@@ -190,13 +206,15 @@ def _searches(
 ) -> Iterator[tuple[Iterator[IterationRecord], Sight]]:
     """The ways to look for the photo, cheapest first; with each how it looks."""
     sight = first_sight(query, tools)
-    votes = sight.votes(query, tools)
-    untried = deque(top(votes, options.candidates))
-    yield _search("retrieve", sight, untried, query, tools), sight
-    sight = turned_sight(replace(sight, long_side=round(SECOND_LOOK * sight.long_side)), query, tools)
+    glimpse = sight.sized(GLIMPSE_SHARE)
+    likeliest = top(glimpse.votes(query, tools), min(GLIMPSES, options.candidates))
+    yield _search("retrieve", glimpse, deque(likeliest), query, tools), glimpse
+    likeliest = top(sight.votes(query, tools), options.candidates)
+    yield _search("look", sight, deque(likeliest), query, tools), sight
+    sight = turned_sight(sight.sized(SECOND_LOOK), query, tools)
     votes = sight.votes(query, tools)
     further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
-    untried.extend(further[: max(options.candidates, len(votes) // FURTHER)])
+    untried = deque(further[: max(options.candidates, len(votes) // FURTHER)])
     while untried:
         yield _search("turn" if sight.eighths else "further", sight, untried, query, tools), sight
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
@@ -295,7 +313,7 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
     for _ in range(REMATCHES):
         view, _ = rendered_view(found.pose, query.corrected(found.lens), tools)
         matches = correspondences(photo, view, tools.matcher)
-        again = _resected(matches, query, REMATCH_ERROR_PX, 500, near=found)
+        again = _solved_near(found, matches, query)
         if again is None or again.num_inliers < CHANCE:
             return None
         step_deg, step_units = pose_distance(found.pose, again.pose)
@@ -323,7 +341,8 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
         levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
         photo = photo_at(query, tools, size)
         known = known_at(query, tools, size)
-        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known)
+        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px))
+        tools.memo["aligned"] = result  # for the gate
         if not np.isfinite(result.loss):
             return
         step_deg, step_units = pose_distance(pose, result.pose)
@@ -339,20 +358,35 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
         )
 
 
-def _resected(
-    matches: Correspondences, query: Query, max_error_px: float, max_trials: int, near: Resection | None = None
-) -> Resection | None:
-    """Resect with the photo's focal length, or with the best one if that is approximate; `near` saves the search."""
+def _resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> Resection | None:
+    """Resect with the photo's focal length, or with the best one if that is approximate."""
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     given = (matches.photo_px, matches.points_in_world)
-    if not query.focal_sigma:
-        found = resection(*given, query.intrinsics, pixels, max_trials)
-    elif near is None:
+    if query.focal_sigma:
         found = focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
     else:
-        found = resection(*given, query.intrinsics.corrected(near.lens), WIDER * pixels, max_trials)
+        found = resection(*given, query.intrinsics, pixels, max_trials)
+    return found if found and _possible(found.pose, matches, query) else None
+
+
+def _solved_near(near: Resection, matches: Correspondences, query: Query) -> Resection | None:
+    """Solve the matches with a render at a pose: decoupled from there; by PnP, and refined, if the lens is free."""
+    if query.focal_sigma:
+        pixels = REMATCH_ERROR_PX * query.intrinsics.long_side / PHOTO_PX
+        lens = query.intrinsics.corrected(near.lens)
+        found = resection(matches.photo_px, matches.points_in_world, lens, WIDER * pixels, 500)
         if found:
-            found = refine(*given, query.intrinsics, replace(found, lens=near.lens), query.focal_sigma, pixels)
+            found = replace(found, lens=near.lens)
+            given = (matches.photo_px, matches.points_in_world)
+            found = refine(*given, query.intrinsics, found, query.focal_sigma, pixels)
+    elif len(matches.photo_px) < MIN_POINTS:
+        return None
+    else:
+        points = matches.points_in_world.astype(np.float64)
+        centre = np.median(points, axis=0)
+        matched = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, centre)
+        solved = least_squares_solve(matched, near.pose, DECOUPLED_STEPS)
+        found = Resection(solved.pose, solved.weights >= 0.5, near.lens)
     return found if found and _possible(found.pose, matches, query) else None
 
 

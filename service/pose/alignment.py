@@ -20,14 +20,14 @@ halve, and clean photos of poor models gain as much; blurred ones lose a little.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.geometry import moved, se3_exp, se3_log
 from service.interfaces import Frame
-from service.jit import kernel
+from service.jit import inline, kernel, summing
 from service.pose.covariance import inverse, spread, summed_by_cell
 from service.pose.focal import lens_precision, lens_state, stepped
 from service.pose.pyramid import cut_off, depth_pyramid, edge_owner_depth, luma, pyramid
@@ -48,7 +48,7 @@ SPREAD_SHARE = 0.88
 """Of the spread that the quarters tell: what three quarters fit, they don't tell one another; were all quarters alike
 it would be three quarters. With this the mean normalized error squared of those scenes' 42 photos is 6."""
 MAX_STEPS = 12
-MAX_PIXELS = 8_000
+MAX_PIXELS = 10_000
 """A level with more uses every second, third...: 6000 were as exact as 30000 on the six test scenes."""
 MIN_PIXELS = 200
 SETTLED_PX, SETTLED_COARSE_PX = 0.005, 0.05
@@ -70,6 +70,7 @@ class Alignment:
     """Beside the intrinsics that were given."""
     loss: float
     """Mean absolute residual (0..1) at the finest level; infinite where too few pixels overlap."""
+    end: _End | None = field(default=None, repr=False)
 
 
 def align(
@@ -81,24 +82,28 @@ def align(
     lens: Lens = EXACT,
     focal_sigma: float = 0.0,
     known: Bool[np.ndarray, "h w"] | None = None,
+    roughly: bool = False,
 ) -> Alignment:
     """Move `start` until the photo, where it is known, agrees with the frame, which `camera` rendered.
 
     The photo has the frame's size; `start` has the photo's intrinsics, without the `lens` to begin with, and its pose
-    need not be the camera's. The lens is estimated too unless `focal_sigma` (of the logarithm) is 0.
+    need not be the camera's. The lens is estimated too unless `focal_sigma` (of the logarithm) is 0. `roughly` is
+    enough where another alignment follows.
     """
     state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma, UNTOUCHED.copy())
-    loss = np.inf
-    coarse_to_fine = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
+    loss, level = np.inf, None
+    coarse_to_fine = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels)
     for finer, level in zip(reversed(range(levels)), coarse_to_fine, strict=True):
         if finer and len(level.pixels) < MIN_PIXELS:
             continue  # so small, what is seen of the scene says nothing
         state.look[3] = 0.0  # another at each level
-        loss = _align_level(level, state, SETTLED_COARSE_PX if finer else SETTLED_PX)
+        loss = _align_level(level, state, SETTLED_COARSE_PX if finer or roughly else SETTLED_PX)
         if not np.isfinite(loss):
             return Alignment(start.pose, lens, loss)
+    assert level is not None
     render_from_photo = np.linalg.inv(state.photo_from_render)
-    return Alignment(moved(camera.pose, se3_log(render_from_photo)), state.lens, loss)
+    pose = moved(camera.pose, se3_log(render_from_photo))
+    return Alignment(pose, state.lens, loss, _End(frame, level, state.look))
 
 
 @dataclass(slots=True)
@@ -125,7 +130,7 @@ class _Level:
     pixels: Int64[np.ndarray, "n"]
     """Places in the render without its border."""
     points: Float32[np.ndarray, "3 n"]
-    columns: Float32[np.ndarray, "k n"]
+    columns: Float32[np.ndarray, "13 n"]
     photo_lens: Intrinsics
 
     def residuals(self, state: _State) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"], float]:
@@ -141,6 +146,15 @@ class _Level:
         return residuals, weights * _bisquare(residuals, weights), total / count
 
 
+@dataclass(frozen=True, slots=True)
+class _End:
+    """Where an alignment ended: what it takes to weigh the answer."""
+
+    frame: Frame
+    level: _Level
+    look: Float64[np.ndarray, "4"]
+
+
 def _levels(
     photo: UInt8[np.ndarray, "h w 3"],
     known: Bool[np.ndarray, "h w"] | None,
@@ -148,7 +162,6 @@ def _levels(
     render_lens: Intrinsics,
     photo_lens: Intrinsics,
     levels: int,
-    lens_unknown: bool,
 ) -> Iterator[_Level]:
     """Linearize the levels of the pyramid, coarsest first; each only when it is asked for."""
     shown = luma(photo)
@@ -159,9 +172,8 @@ def _levels(
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):
         height, width = render.shape
         pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
-        pixels = np.ascontiguousarray(pixels[:: max(1, len(pixels) // MAX_PIXELS)])  # one layout: one compilation
+        pixels = np.ascontiguousarray(pixels[:: max(1, -(-len(pixels) // MAX_PIXELS))])  # one layout: one compilation
         points, columns = _linearize(render, depth, pixels, _parameters(render_lens.resized(width, height)))
-        columns = columns if lens_unknown else columns[: LENS.start]
         yield _Level(photo_level, pixels, points, columns, photo_lens.resized(width, height))
 
 
@@ -175,7 +187,8 @@ def _align_level(level: _Level, state: _State, settled_px: float = SETTLED_PX) -
         residuals, weights, loss = level.residuals(state)
         if not np.isfinite(loss):
             return np.inf
-        step = _solved(level.columns, residuals, weights, state, loss)
+        columns = level.columns if state.focal_sigma else level.columns[: LENS.start]
+        step = _solved(columns, residuals, weights, state, loss)
         if not np.all(np.isfinite(step)):
             return np.inf
         state.photo_from_render = state.photo_from_render @ se3_exp(-step[TWIST])
@@ -210,12 +223,21 @@ def evidence(
     answer: Camera,
     focal_sigma: float,
     known: Bool[np.ndarray, "h w"] | None = None,
+    aligned: Alignment | None = None,
 ) -> Evidence | None:
-    """Weigh an answer against the frame, which `camera` rendered nearby; None where the pixels don't determine it."""
-    (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1, lens_unknown=True)
-    state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0, UNTOUCHED.copy())
+    """Weigh an answer against the frame, which `camera` rendered nearby; None where the pixels don't determine it.
+
+    If `aligned` is the alignment with this frame that led to the answer, most is known already.
+    """
+    end = aligned.end if aligned and aligned.pose is answer.pose else None
+    if end and end.frame is frame:
+        level, look = replace(end.level, photo_lens=answer.intrinsics), end.look
+    else:
+        (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1)
+        look = UNTOUCHED
+    state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0, look.copy())
     before = state.photo_from_render
-    if not np.isfinite(_align_level(replace(level, columns=level.columns[: LENS.start]), state)):
+    if not np.isfinite(_align_level(level, state)):
         return None
     pull = se3_log(before @ np.linalg.inv(state.photo_from_render))
     residuals, weights, _ = level.residuals(state)
@@ -264,9 +286,11 @@ def _parameters(lens: Intrinsics) -> Float64[np.ndarray, "4"]:
 def _bisquare(residuals: Float32[np.ndarray, "n"], weights: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "n"]:
     """Return Tukey's weights: 1 at no residual, 0 from CUT medians on."""
     some = np.abs(residuals[::4][weights[::4] > 0])
-    spread = max(float(np.median(some)), MIN_SPREAD) if len(some) else MIN_SPREAD
-    ratio = residuals / np.float32(CUT * spread)
-    return np.maximum(1 - ratio * ratio, 0) ** 2
+    middle = len(some) // 2
+    spread = max(float(np.partition(some, middle)[middle]), MIN_SPREAD) if len(some) else MIN_SPREAD
+    ratio = residuals * np.float32(1 / (CUT * spread))
+    kept = np.maximum(1 - ratio * ratio, 0)
+    return kept * kept
 
 
 def _solved(
@@ -278,10 +302,9 @@ def _solved(
 ) -> Float64[np.ndarray, "13"]:
     """Solve the weighted normal equations; each unknown is scaled, for they differ by orders of magnitude."""
     size = len(columns)
-    weighted = columns * weights
     factor = state.slopes[:size]
-    hessian = (weighted @ columns.T).astype(np.float64) * np.outer(factor, factor)
-    right = factor * (weighted @ residuals)
+    hessian, right = _normal_equations(columns, weights, residuals)
+    hessian, right = hessian * np.outer(factor, factor), right * factor
     if state.focal_sigma:
         trust = CORRELATED * loss * lens_precision(state.focal_sigma)
         hessian[range(10, 13), range(10, 13)] += trust
@@ -333,32 +356,73 @@ def _linearize(render, depth, pixels, k):
 
 @kernel
 def _residuals(photo, points, basis, transform, k, look, delta, residuals, weights):
-    """Fill residuals and weights, 0 where the photo doesn't say; return the sum of |r| and how many pixels it has."""
-    t = transform.astype(np.float32)
-    fx, fy, cx, cy = np.float32(k[0]), np.float32(k[1]), np.float32(k[2] - 0.5), np.float32(k[3] - 0.5)
+    """Fill residuals and weights, 0 where the photo doesn't say; return the sum of |r| and how many pixels it has.
+
+    In three passes, so that the first and the last do several pixels at a time:
+    points -> places in the photo -> its values there -> residuals.
+    """
+    n = points.shape[1]
+    right, down = np.empty((2, n), np.float32)
+    _places(points, transform.astype(np.float32), k.astype(np.float32), photo.shape, right, down)
+    width, flat = photo.shape[1], photo.ravel()
+    for i in range(n):
+        if right[i] < 0:
+            residuals[i] = -1.0
+            continue
+        column, row = np.int32(right[i]), np.int32(down[i])
+        a, b = right[i] - np.float32(column), down[i] - np.float32(row)
+        at = np.uint32(row * width + column)
+        below = at + np.uint32(width)
+        upper = flat[at] + a * (flat[at + np.uint32(1)] - flat[at])
+        lower = flat[below] + a * (flat[below + np.uint32(1)] - flat[below])
+        residuals[i] = upper + b * (lower - upper)
     gain, bias, curve, blur = np.float32(look[0]), np.float32(look[1]), np.float32(look[2]), np.float32(look[3])
-    delta = np.float32(delta)
-    right, bottom = np.float32(photo.shape[1] - 1), np.float32(photo.shape[0] - 1)
-    total, count = 0.0, 0
+    delta, total, count = np.float32(delta), 0.0, 0
+    for i in range(n):
+        shown = residuals[i]
+        residual = shown - gain * basis[0, i] - bias - curve * basis[2, i] - blur * basis[3, i]
+        residuals[i] = residual if shown >= 0 else np.float32(0)
+        weights[i] = np.float32(1) / max(abs(residual), delta) if shown >= 0 else np.float32(0)
+    for i in range(n):
+        total += abs(residuals[i])
+        count += weights[i] > 0
+    return total, count
+
+
+@inline
+def _places(points, t, k, shape, right, down):
+    """Fill where the points are seen in the photo, in pixels from the centre of its first one; right: -1 if outside."""
+    fx, fy, cx, cy = k[0], k[1], k[2] - np.float32(0.5), k[3] - np.float32(0.5)
+    last_column, last_row = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
+    t00, t01, t02, t03 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
+    t10, t11, t12, t13 = t[1, 0], t[1, 1], t[1, 2], t[1, 3]
+    t20, t21, t22, t23 = t[2, 0], t[2, 1], t[2, 2], t[2, 3]
     for i in range(points.shape[1]):
         x, y, z = points[0, i], points[1, i], points[2, i]
-        depth = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
-        u = fx * (t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]) / depth + cx
-        v = fy * (t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]) / depth + cy
-        if not (depth > 0 and u >= 0 and v >= 0 and u < right and v < bottom):
-            residuals[i], weights[i] = 0.0, 0.0
-            continue
-        left, above = int(u), int(v)
-        a, b = u - np.float32(left), v - np.float32(above)
-        upper = photo[above, left] + a * (photo[above, left + 1] - photo[above, left])
-        lower = photo[above + 1, left] + a * (photo[above + 1, left + 1] - photo[above + 1, left])
-        shown = upper + b * (lower - upper)
-        if shown < 0:
-            residuals[i], weights[i] = 0.0, 0.0
-            continue
-        residual = shown - gain * basis[0, i] - bias - curve * basis[2, i] - blur * basis[3, i]
-        residuals[i] = residual
-        weights[i] = np.float32(1) / max(abs(residual), delta)
-        total += abs(residual)
-        count += 1
-    return total, count
+        depth = t20 * x + t21 * y + t22 * z + t23
+        nearness = np.float32(1) / depth
+        u = fx * ((t00 * x + t01 * y + t02 * z + t03) * nearness) + cx
+        v = fy * ((t10 * x + t11 * y + t12 * z + t13) * nearness) + cy
+        inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < last_column) & (v < last_row)
+        right[i] = u if inside else np.float32(-1)
+        down[i] = v
+
+
+@summing
+def _normal_equations(columns, weights, residuals):
+    """Return columns . weights . columns^T and columns . weights . residuals."""
+    count, n = columns.shape
+    hessian, right = np.empty((count, count)), np.empty(count)
+    weighted = np.empty(n, np.float32)
+    for a in range(count):
+        total = np.float32(0)
+        for i in range(n):
+            weighted[i] = columns[a, i] * weights[i]
+            total += weighted[i] * residuals[i]
+        right[a] = total
+        for b in range(a + 1):
+            total = np.float32(0)
+            for i in range(n):
+                total += weighted[i] * columns[b, i]
+            hessian[a, b] = hessian[b, a] = total
+    return hessian, right

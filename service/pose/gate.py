@@ -122,16 +122,17 @@ def verify(query: Query, pose: Pose, tools: Tools) -> Verdict:
     return tools.memo[key]
 
 
-def glance(query: Query, pose: Pose, tools: Tools) -> Verdict | None:
+def glance(query: Query, pose: Pose, tools: Tools, inliers: int = 0) -> Verdict | None:
     """Judge a pose by the pixels alone: matches cost most. None where these don't make it clear.
 
-    For poses that something else speaks for: the camera was expected there. `verify` then says the same.
+    For poses that something else speaks for: the camera was expected there, or there are `inliers` with a view, which
+    the verdict then names. `verify` says the same after it.
     """
     frame, camera = rendered_frame(pose, query, tools)
     signals, pixels = _seen(query, pose, frame, camera, tools)
     if not clear(signals):
         return None
-    verdict = _within_region(judged(signals, pixels, query.focal_sigma), query, pose)
+    verdict = _within_region(replace(judged(signals, pixels, query.focal_sigma), inliers=inliers), query, pose)
     tools.memo[_key(query, pose)] = verdict
     return verdict
 
@@ -160,7 +161,7 @@ def _seen(
     size = camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)
     answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
-    pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known)
+    pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known, tools.memo.get("aligned"))
     return pixel_signals(photo, frame, known, size, pixels), pixels
 
 
@@ -361,10 +362,11 @@ def _centred(values: Float32[np.ndarray, "3 n"], kept: Float32[np.ndarray, "n"])
     return values - (values @ kept / kept.sum())[:, None]
 
 
-def _block_sums(image: Float32[np.ndarray, "h w c"]) -> Float64[np.ndarray, "blocks"]:
+def _block_sums(image: Float32[np.ndarray, "h w 2"]) -> Float64[np.ndarray, "blocks"]:
     rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
-    blocks = image[: rows * BLOCK_PX, : columns * BLOCK_PX].reshape(rows, BLOCK_PX, columns, BLOCK_PX, -1)
-    return blocks.sum((1, 3, 4), dtype=np.float64).ravel()
+    whole = image[: rows * BLOCK_PX, : columns * BLOCK_PX]
+    means = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
+    return BLOCK_PX**2 * means.sum(2, dtype=np.float64).ravel()
 
 
 def _gradients(rgb: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _ 2"]:

@@ -15,6 +15,9 @@ from service.types import Query
 
 MATCH_ERROR_PX = 4.0
 """At PHOTO_PX; XFeat's points scatter by 1.5 px."""
+GLIMPSE_SHARE = 0.77
+"""Of the photo's size, enough to recognise a whole, sharp one in half the time: each of the 58 clean test photos has 75
+or more matches that agree with its likeliest view, where foreign ones have 12."""
 SECOND_LOOK = 1.25
 """A photo that isn't found at once is looked at in a size larger by this."""
 SAME_SCALE = 1.4
@@ -39,6 +42,10 @@ class Sight:
     long_side: int
     eighths: int = 0
     """Of a turn, counter-clockwise, that make it upright."""
+
+    def sized(self, share: float) -> Sight:
+        """Return the photo in another size."""
+        return replace(self, long_side=round(share * self.long_side))
 
     def features(self, query: Query, tools: Tools, share: float = 1.0) -> Features:
         """Return the photo's features, looked at like this but smaller by `share`, in pixels of `Query.rgb`."""
