@@ -48,8 +48,8 @@ SPREAD_SHARE = 0.88
 """Of the spread that the quarters tell: what three quarters fit, they don't tell one another; were all quarters alike
 it would be three quarters. With this the mean normalized error squared of those scenes' 42 photos is 6."""
 MAX_STEPS = 12
-MAX_PIXELS = 10_000
-"""A level with more uses every second, third...: 6000 were as exact as 30000 on the six test scenes."""
+MAX_PIXELS, LENS_MAX_PIXELS = 10_000, 20_000
+"""A level with more uses every second, third...: but for the lens 6000 were as exact as 30000 on the test scenes."""
 MIN_PIXELS = 200
 SETTLED_PX, SETTLED_COARSE_PX = 0.005, 0.05
 """Of the level, at the finest one and at those that a finer one follows."""
@@ -92,7 +92,7 @@ def align(
     """
     state = _State(start.pose.camera_from_world @ camera.pose.world_from_camera, lens, focal_sigma, UNTOUCHED.copy())
     loss, level = np.inf, None
-    coarse_to_fine = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels)
+    coarse_to_fine = _levels(photo, known, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma))
     for finer, level in zip(reversed(range(levels)), coarse_to_fine, strict=True):
         if finer and len(level.pixels) < MIN_PIXELS:
             continue  # so small, what is seen of the scene says nothing
@@ -162,6 +162,7 @@ def _levels(
     render_lens: Intrinsics,
     photo_lens: Intrinsics,
     levels: int,
+    lens_free: bool,
 ) -> Iterator[_Level]:
     """Linearize the levels of the pyramid, coarsest first; each only when it is asked for."""
     shown = luma(photo)
@@ -172,7 +173,8 @@ def _levels(
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):
         height, width = render.shape
         pixels = np.flatnonzero(depth[1:-1, 1:-1].ravel() > 0)
-        pixels = np.ascontiguousarray(pixels[:: max(1, -(-len(pixels) // MAX_PIXELS))])  # one layout: one compilation
+        stride = max(1, -(-len(pixels) // (LENS_MAX_PIXELS if lens_free else MAX_PIXELS)))
+        pixels = np.ascontiguousarray(pixels[::stride])  # one layout: one compilation
         points, columns = _linearize(render, depth, pixels, _parameters(render_lens.resized(width, height)))
         yield _Level(photo_level, pixels, points, columns, photo_lens.resized(width, height))
 
@@ -233,7 +235,7 @@ def evidence(
     if end and end.frame is frame:
         level, look = replace(end.level, photo_lens=answer.intrinsics), end.look
     else:
-        (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1)
+        (level,) = _levels(photo, known, frame, camera.intrinsics, answer.intrinsics, 1, bool(focal_sigma))
         look = UNTOUCHED
     state = _State(answer.pose.camera_from_world @ camera.pose.world_from_camera, EXACT, 0.0, look.copy())
     before = state.photo_from_render

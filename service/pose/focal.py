@@ -28,6 +28,8 @@ WIDER = 2.0
 SEARCH_TRIALS = 200
 REFINED = 3
 """Of the steps, those that most of the matches agree with: each refinement costs as much as three resections."""
+WORTH = 30
+"""Inliers, with the wider error, with which a refinement is worth its time: most photos of other scenes have fewer."""
 ROUNDS = 10
 SETTLED = 1e-6
 
@@ -48,6 +50,8 @@ def focal_resection(
         if one := resection(photo_px, points_in_world, camera, WIDER * max_error_px, SEARCH_TRIALS):
             found.append(replace(one, lens=lens))
     found.sort(key=lambda one: -one.num_inliers)
+    if not found or found[0].num_inliers < WORTH:
+        return found[0] if found else None
     refined = [refine(photo_px, points_in_world, intrinsics, one, focal_sigma, max_error_px) for one in found[:REFINED]]
     return max(refined, key=lambda one: one.num_inliers, default=None)
 

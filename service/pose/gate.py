@@ -104,6 +104,10 @@ CLEAR_COLOURS = 0.95
 at most 0.9."""
 HOPELESS = 0.35
 """Mean of the scaled signals of a kind, below which nothing was recognised: foreign photos have 0.0 to 0.3."""
+APPEARANCE, UNLIKE = ("gradients", "gradients_half", "colours", "colours_half"), 0.3
+"""Signals whose scaled mean tells that a render is so unlike the photo that no matches need be looked for: right poses
+of photos spoilt within reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
+NO_MATCHES = {"inliers": 0.0, "inlier_share": 0.0, "inlier_spread": 0.0}
 MIN_COVERAGE = 0.04
 MAX_SIGMA_SHARE = 0.0085
 """Of the place's standard deviation in what is seen: six in seven such places are within the bound of what is right
@@ -142,9 +146,12 @@ def _key(query: Query, pose: Pose) -> tuple[str, bytes, Intrinsics]:
 
 
 def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
-    view, frame = rendered_view(pose, query, tools)
-    photo, size = photo_features(query, tools), view.camera.intrinsics
-    signals, pixels = _seen(query, pose, frame, view.camera, tools)
+    frame, camera = rendered_frame(pose, query, tools)
+    photo, size = photo_features(query, tools), camera.intrinsics
+    signals, pixels = _seen(query, pose, frame, camera, tools)
+    if np.mean([SCALES[name](signals[name]) for name in APPEARANCE]) < UNLIKE:
+        return judged(signals | NO_MATCHES, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
+    view, _ = rendered_view(pose, query, tools)
     known = known_at(query, tools, size)
     found = correspondences(photo, view, tools.matcher)
     signals |= _match_signals(found, _both_known(frame, known), query, size, pose)
