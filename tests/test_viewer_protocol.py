@@ -194,7 +194,7 @@ def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: 
 def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 3, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: browser.widget("step")["max"] == 2, "the job")
+        browser.wait(lambda: browser.widget("step")["value"] == 2 and "agree" in browser.text(), "the job")
         assert not browser.widget("look through this camera")["disabled"]
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "step 1")
@@ -244,7 +244,7 @@ def test_a_camera_is_drawn_with_the_lens_that_its_step_found(fake: FakeService, 
     job.add(replace(records(2)[1], lens=Lens(focal_factor=2.0)))
     job.finish()
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: browser.widget("step")["value"] == 1, "the last step")
+        browser.wait(lambda: browser.widget("step")["value"] == 1 and "agree" in browser.text(), "the last step")
         for index, focal in ((0, 80.0), (1, 160.0)):
             browser.set("step", index)
             seen = 2 * np.arctan(32 / focal)
