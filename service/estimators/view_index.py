@@ -145,6 +145,8 @@ class _Hunt:
     """The one that the gate likes best."""
     score: float = 0.0
     accepted: bool = False
+    glimpsing: bool = False
+    """A doubt that is left after a first glimpse is no reason to stop."""
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance gives: foreign photos never do."""
 
@@ -167,7 +169,8 @@ class _Hunt:
         verdict = seen or verify(known, last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
             self.answer, self.score = last, verdict.score
-        self.accepted = verdict.status is Status.LOCALIZED or verdict.reason in UNMENDABLE
+        unmendable = verdict.reason in UNMENDABLE and not self.glimpsing
+        self.accepted = verdict.status is Status.LOCALIZED or unmendable
         yield self._with_answer(
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
@@ -214,7 +217,9 @@ def _searches(
     if not query.focal_sigma:  # a free lens asks for many matches
         glimpse = sight.sized(GLIMPSE_SHARE)
         likeliest = top(glimpse.votes(query, tools), min(GLIMPSES, options.candidates))
+        hunt.glimpsing = True
         yield _search(stage, glimpse, deque(likeliest), query, tools), glimpse
+        hunt.glimpsing = False
         stage = "look"
     likeliest = top(sight.votes(query, tools), options.candidates)
     yield _search(stage, sight, deque(likeliest), query, tools), sight
