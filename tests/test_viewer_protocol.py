@@ -313,6 +313,7 @@ def test_the_view_at_rest_is_rendered_by_the_service(fake: FakeService, viewer: 
     with _browser(viewer) as browser:
         browser.wait(lambda: _background(browser) == "exact", "the exact picture")
         (client,) = viewer.server.get_clients().values()
+        until(lambda: _nothing_more_comes(browser), "the job's own 3D")
         splats = client.scene._handle_from_node_name["/splats/splats"]
         assert not splats.visible
         asked = fake.renders[-1]
@@ -358,6 +359,7 @@ def test_a_view_that_was_set_from_here_is_rendered_at_once_and_its_echo_changes_
         assert first <= sent
         (client,) = viewer.server.get_clients().values()
         browser.wait(lambda: not client.scene._handle_from_node_name["/splats/splats"].visible, "the view at rest")
+        until(lambda: _nothing_more_comes(browser), "the job's own 3D")
         camera, count = client.camera, len(fake.renders)
         moved = {n: [float(x) for x in getattr(camera, n)] for n in ("wxyz", "position", "look_at", "up_direction")}
         browser.send(**{**CAMERA, **moved, "fov": camera.fov, "near": camera.near, "far": camera.far})
@@ -394,7 +396,7 @@ def test_a_step_comes_as_widgets_first_and_only_what_changed(fake: FakeService, 
         place = lambda: browser.nodes["/trajectory/current"]["position"]  # noqa: E731
         there = [r.pose.position_in_world for r in records(5)]
         browser.wait(lambda: np.allclose(place(), there[4], atol=1e-6) and _background(browser) == "exact", "the end")
-        browser.wait(lambda: _nothing_more_comes(browser), "the job's own 3D")
+        until(lambda: _nothing_more_comes(browser), "the job's own 3D")
         before = len(browser.frames)
         browser.set("step", 2)
         browser.wait(lambda: np.allclose(place(), there[2], atol=1e-6), "the camera of the step")
