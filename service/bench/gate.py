@@ -56,7 +56,7 @@ OCCLUDERS = 2
 """Photos of each other scene that rectangles are cut from."""
 PENALTY = 0.02
 """On the squared weights, against certainty that few samples don't give."""
-BELOW_FLOOR = 0.003
+BELOW_FLOOR = 0.004
 """Share of right poses, for each signal."""
 BINS = 10
 OTHER_DOUBTS = (
