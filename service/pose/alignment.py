@@ -46,7 +46,7 @@ LEAST_SPREAD = 0.09
 than the model. Each two of the scenes alone have 0.09 to 0.10."""
 SPREAD_SHARE = 0.88
 """Of the spread that the quarters tell: what three quarters fit, they don't tell one another; were all quarters alike
-it would be three quarters. With this the mean normalized error squared of those scenes' 42 photos was 6 when it was set."""
+it would be three quarters. When it was set, the mean normalized error squared of those scenes' 42 photos was 6."""
 MAX_STEPS = 12
 MAX_PIXELS, LENS_MAX_PIXELS = 10_000, 20_000
 """A level with more uses every second, third...: but for the lens 6000 were as exact as 30000 on the test scenes."""
