@@ -67,8 +67,8 @@ GOOD_MATCH = 60
 CHANCE = 15
 """Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
 WORTH, WORTH_SHARE = 12, 0.055
-"""Inliers, and their share of the matches, from which on it is worth to render there: of 168 searches with fewer, 119 of
-them for photos of other scenes, none led anywhere; with 12 to 30 those photos' share is 0.04 to 0.05 in the median."""
+"""Inliers, and their share of the matches, from which on it is worth to render there: of 168 searches with fewer, 119
+of them for photos of other scenes, none led anywhere; with 12 to 30 those have a median share of 0.04 to 0.05."""
 STRONG = 80
 """Inliers with which alignment needs no further match."""
 FURTHER = 16
