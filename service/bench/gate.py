@@ -11,7 +11,8 @@ bound. Wrong ones are made by stress:
     followed    the same, as the tracker does it: judged by its glance alone, with the weights that are in use
 
 Weights and floors are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a
-result is of those tests. Those in `service/pose/gate.py` were fitted on all, from such a run. Floors are of right poses within reason.
+result is of those tests. Those in `service/pose/gate.py` were fitted on all, from such a run. Floors are of right poses
+within reason.
 """
 
 from __future__ import annotations
