@@ -150,10 +150,14 @@ def test_nothing_grows_however_long_a_job_is(fake: FakeService, viewer: Viewer) 
         browser.wait(lambda: browser.widget("step")["max"] == 4 and "agree" in browser.text(), "the start")
         (client,) = viewer.server.get_clients().values()
         count = lambda: (len(client.scene._handle_from_node_name), len(browser.widgets))  # noqa: E731
+        last = {"/splats/splats", "/candidates/cloud", "/match vectors/points"}  # what is drawn when nothing else waits
+        browser.wait(lambda: last <= set(browser.nodes), "the 3D")
+        until(lambda: _nothing_more_comes(browser), "the end of the start")
         before = count()
         for record in records(80)[5:]:
             job.add(record)
-        browser.wait(lambda: browser.widget("step")["value"] == 79, "80 steps")
+        browser.wait(lambda: browser.widget("step")["value"] == 79 and ">179<" in browser.text(), "80 steps")
+        until(lambda: _nothing_more_comes(browser), "the end of the last step")
         assert count() == before
 
 

@@ -6,6 +6,10 @@ One page has the viewer open and follows the newest job all the time. The other 
 reads the verdict, opens the job in the viewer, steps back and forth, and returns. Measures the memory of the service,
 of its viewer and of both pages after each round; prints the medians of each quarter of the run as JSON; exits with 1
 if anything is larger in the last quarter than in the second one by more than `MAY_GROW` and `BUT_AT_LEAST`.
+
+Of a page its objects are judged, its DOM nodes and its listeners: every few rounds a heap snapshot tells what the heap
+holds by kind. The heap as a whole is printed too, but Chromium goes on compiling a page's functions as they are used
+more often, which has an end but takes longer than half an hour.
 """
 
 from __future__ import annotations
@@ -32,6 +36,10 @@ HERE = Path(__file__).parent
 MAY_GROW = 1.05
 BUT_AT_LEAST = 1.0
 """A megabyte, a file: less than that comes and goes (a page of 18 MB has a list of 110 jobs instead of 50)."""
+
+SNAPSHOT_EVERY = 5
+"""Rounds."""
+NOT_JUDGED = {"heap MB", "code MB"}
 
 
 @contextmanager
@@ -83,7 +91,24 @@ def of_page(session: CDPSession) -> dict[str, float]:
     """After a collection: else it is a sawtooth."""
     session.send("HeapProfiler.collectGarbage")
     found = {m["name"]: m["value"] for m in session.send("Performance.getMetrics")["metrics"]}
-    return {"MB": found["JSHeapUsedSize"] / 1e6, "nodes": found["Nodes"], "listeners": found["JSEventListeners"]}
+    return {"heap MB": found["JSHeapUsedSize"] / 1e6, "nodes": found["Nodes"], "listeners": found["JSEventListeners"]}
+
+
+def by_kind(session: CDPSession) -> dict[str, float]:
+    """Return what the page's heap holds, in MB: of objects, and of code that the browser compiled."""
+    chunks: list[str] = []
+    take = lambda event: chunks.append(event["chunk"])  # noqa: E731
+    session.on("HeapProfiler.addHeapSnapshotChunk", take)
+    session.send("HeapProfiler.takeHeapSnapshot", {"reportProgress": False})
+    session.remove_listener("HeapProfiler.addHeapSnapshotChunk", take)
+    snapshot = json.loads("".join(chunks))
+    meta = snapshot["snapshot"]["meta"]
+    nodes = np.array(snapshot["nodes"]).reshape(-1, len(meta["node_fields"]))
+    kind, size = (nodes[:, meta["node_fields"].index(field)] for field in ("type", "self_size"))
+    kinds = meta["node_types"][meta["node_fields"].index("type")]
+    found = {name: float(size[kind == k].sum()) / 1e6 for k, name in enumerate(kinds)}
+    print(json.dumps(found), file=sys.stderr, flush=True)
+    return {"objects MB": sum(found.values()) - found["code"], "code MB": found["code"]}
 
 
 def watched(page: Page) -> CDPSession:
@@ -131,6 +156,9 @@ def samples(minutes: float, every: float) -> dict[str, list[dict[str, float]]]:
             one_round(visitor, url, float(np.random.default_rng(k).uniform(0, 6.28)))
             measured = {"service": of_process(pid), "viewer": of_process(viewer)}
             measured |= {name: of_page(session) for name, session in sessions.items()}
+            if k % SNAPSHOT_EVERY == 0:
+                for name, session in sessions.items():
+                    measured[name] |= by_kind(session)
             print(json.dumps({"round": k, **measured}), file=sys.stderr, flush=True)
             for name, figures in measured.items():
                 taken.setdefault(name, []).append(figures)
@@ -148,15 +176,18 @@ def main() -> int:
     parser.add_argument("--every", type=float, default=10, help="seconds from one job to the next (default: 10)")
     arguments = parser.parse_args()
     taken = samples(arguments.minutes, arguments.every)
-    if len(taken["service"]) < 8:
+    if len(taken["service"]) < 8 * SNAPSHOT_EVERY:
         print(f"only {len(taken['service'])} rounds: too few to say anything")
         return 1
-    table = {who: {what: quarters([s[what] for s in series]) for what in series[0]} for who, series in taken.items()}
+    table = {
+        who: {what: quarters([s[what] for s in series if what in s]) for what in series[0]}
+        for who, series in taken.items()
+    }
     grown = [
         f"{who}: {what} {second:g} -> {last:g}"
         for who, figures in table.items()
         for what, (_, second, _, last) in figures.items()
-        if last > second * MAY_GROW and last > second + BUT_AT_LEAST
+        if what not in NOT_JUDGED and last > second * MAY_GROW and last > second + BUT_AT_LEAST
     ]
     print(json.dumps({"jobs": len(taken["service"]), "quarters": table, "grown": grown}, indent=2))
     return 1 if grown else 0

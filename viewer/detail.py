@@ -87,9 +87,9 @@ class Detail:
         record, view = feed.records[index], None
         try:
             view = self._view(feed, record)
-            self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
             self._picture(feed, record, view)
             self._panel.flush()
+            self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
             self._flow(feed, record, view)
         except (ServiceTrouble, ValueError) as error:
             self._panel.caption.content = small_html(f"There is no picture of this step: {error}")

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int32, UInt8
 
 from viewer.measure import MatchView
 
@@ -130,17 +130,19 @@ def beside(
     within = np.all((view.render_px >= 0) & (view.render_px < [k.width, k.height]), axis=1)
     starts = view.photo_px * [a.shape[1] / photo.shape[1], a.shape[0] / photo.shape[0]] + corners[0]
     ends = view.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
-    order = [i for i in np.argsort(view.inlier, kind="stable") if within[i]]
-    inks = [tuple(map(int, colour)) for colour in colours]
+    order = np.argsort(view.inlier, kind="stable")
+    order = order[within[order]]
+    inks = colours[order].tolist()
+    pairs = _fixed(np.stack([starts[order], ends[order]], axis=1))
     lines = pair.copy()
-    for i in order:
-        cv2.line(lines, _fixed(starts[i]), _fixed(ends[i]), inks[i], 2, cv2.LINE_AA, _SHIFT)
+    for line, ink in zip(pairs, inks, strict=True):
+        cv2.polylines(lines, [line], False, ink, 2, cv2.LINE_AA, _SHIFT)
     # Lines translucent, the more the denser: three hundred must not hide what they connect. The ends are plain.
     opacity = 0.3 + 0.4 / (1 + len(order) / 50)
     picture = cv2.addWeighted(pair, 1 - opacity, lines, opacity, 0)
-    for i in order:
-        for end in (starts[i], ends[i]):
-            cv2.circle(picture, _fixed(end), 3 << _SHIFT, inks[i], -1, cv2.LINE_AA, _SHIFT)
+    for line, ink in zip(pairs.tolist(), inks, strict=True):
+        for end in line:
+            cv2.circle(picture, end, 3 << _SHIFT, ink, -1, cv2.LINE_AA, _SHIFT)
     return picture
 
 
@@ -156,13 +158,14 @@ def flow(
     picture = cv2.cvtColor((0.45 * cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)).astype(np.uint8), cv2.COLOR_GRAY2RGB)
     scale = np.array([picture.shape[1] / k.width, picture.shape[0] / k.height])
     starts, ends = (view.photo_px - view.vectors_px) * scale, view.photo_px * scale
-    lengths = np.linalg.norm(ends - starts, axis=1)
+    lengths, inks = np.linalg.norm(ends - starts, axis=1), colours.tolist()
+    drawn = (lengths > 3) & (lengths < 10 * _WIDTH_PX)
+    pairs = _fixed(np.where(drawn[:, None, None], np.stack([starts, ends], axis=1), ends[:, None])).tolist()
     for i in np.argsort(view.inlier, kind="stable"):
-        ink = tuple(map(int, colours[i]))
-        if 3 < lengths[i] < 10 * _WIDTH_PX:
+        if drawn[i]:
             tip = min(0.5, _TIP_PX / lengths[i])
-            cv2.arrowedLine(picture, _fixed(starts[i]), _fixed(ends[i]), ink, 2, cv2.LINE_AA, _SHIFT, tip)
-        cv2.circle(picture, _fixed(ends[i]), 3 << _SHIFT, ink, -1, cv2.LINE_AA, _SHIFT)
+            cv2.arrowedLine(picture, *pairs[i], inks[i], 2, cv2.LINE_AA, _SHIFT, tip)
+        cv2.circle(picture, pairs[i][1], 3 << _SHIFT, inks[i], -1, cv2.LINE_AA, _SHIFT)
     return _pasted((picture, ((_WIDTH_PX - picture.shape[1]) // 2, 0)))
 
 
@@ -182,10 +185,9 @@ _SHIFT = 4
 """Fractional bits of OpenCV's drawing coordinates."""
 
 
-def _fixed(point: Float[np.ndarray, "2"]) -> tuple[int, int]:
+def _fixed(points: Float[np.ndarray, "*k 2"]) -> Int32[np.ndarray, "*k 2"]:
     """To OpenCV's fixed point, whose top-left pixel centre is (0, 0)."""
-    x, y = (np.asarray(point) - 0.5) * (1 << _SHIFT)
-    return round(float(x)), round(float(y))
+    return ((points - 0.5) * (1 << _SHIFT)).round().astype(np.int32)
 
 
 def _pasted(*parts: tuple[np.ndarray, tuple[int, int]]) -> UInt8[np.ndarray, "c d 3"]:
