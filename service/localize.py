@@ -33,7 +33,6 @@ from service.render.counted import Counted
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
 from service.types import (
-    Candidates,
     GaussianScene,
     IterationRecord,
     PoseEstimate,
@@ -201,7 +200,7 @@ def localize(
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
     renders = tally.count
     query = query.corrected(records[-1].lens)
-    verdict = _qualified(verify(query, records[-1].pose, tools), records[-1].rivals, exhausted)
+    verdict = _qualified(verify(query, records[-1].pose, tools), records[-1], exhausted)
     return estimate_of(
         query, loaded, request, verdict, records, timings=_timings(records, clock), renders=renders, exhausted=exhausted
     )
@@ -283,9 +282,11 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
     return late or (request.budget_renders is not None and tally.count >= request.budget_renders)
 
 
-def _qualified(verdict: Verdict, rivals: Candidates | None, exhausted: bool) -> Verdict:
-    """Put on record what the gate can't see in the render: other answers, a budget that cut the search short."""
-    share = 1.0 if rivals is None else 1.0 - float(rivals.scores.sum())
+def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verdict:
+    """Put on record what the gate can't see in the render: a mirrored photo, other answers, too small a budget."""
+    if last.mirrored:
+        return doubted(verdict, Reason.MIRRORED)
+    share = 1.0 if last.rivals is None else 1.0 - float(last.rivals.scores.sum())
     if share < LOCALIZED:
         return doubted(verdict, Reason.AMBIGUOUS, share * verdict.score)
     if exhausted and verdict.status is not Status.LOCALIZED:

@@ -394,6 +394,8 @@ class IterationRecord:
     candidates: Candidates | None = None
     rivals: Candidates | None = None
     """Other answers that the gate accepts too, most probable first; scores are probabilities, the pose has the rest."""
+    mirrored: bool = False
+    """The photo's mirror image fits the scene better."""
     index: int = 0
     """Number of the record in the trace; stamped by the driver, like the times."""
     elapsed_s: float = 0.0
@@ -422,6 +424,7 @@ class Reason(StrEnum):
     PLACE_UNCERTAIN = "place_uncertain"
     OUTSIDE_PRIOR = "outside_prior"
     AMBIGUOUS = "ambiguous"
+    MIRRORED = "mirrored"
     BUDGET_EXHAUSTED = "budget_exhausted"
 
 
@@ -454,6 +457,9 @@ HINTS: dict[Reason, str] = {
     Reason.AMBIGUOUS: (
         "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
         "or a Gaussian."
+    ),
+    Reason.MIRRORED: (
+        "The photo's mirror image fits the scene better: send it as it was taken; front cameras often mirror."
     ),
     Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
 }

@@ -17,12 +17,14 @@ INTRINSICS = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": 
 
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+MIRROR_NOISE = 0.1
 
 
-def write_room(folder: Path, cameras: int = 24, repeated: bool = False) -> Path:
+def write_room(folder: Path, cameras: int = 24, *, repeated: bool = False, symmetric: bool = False) -> Path:
     """Write `scene.ply` (Inria's layout, degree 0) and `transforms.json`; return the folder.
 
-    A `repeated` room is the same after HALF_TURN: every photo has two places where it may have been taken.
+    A `repeated` room is the same after HALF_TURN: every photo has two places where it may have been taken. One
+    half of a `symmetric` room is nearly the mirror image of the other: MIRROR_NOISE sets its colours apart.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(3)
@@ -32,6 +34,11 @@ def write_room(folder: Path, cameras: int = 24, repeated: bool = False) -> Path:
         one = means[:, 0] > 0
         means = np.concatenate([means[one], means[one] * [-1, -1, 1]])
         quats, colours = (np.concatenate([part[one]] * 2) for part in (quats, colours))
+    if symmetric:
+        one = means[:, 0] > 0
+        means = np.concatenate([means[one], means[one] * [-1, 1, 1]])
+        noise = rng.normal(0, MIRROR_NOISE, (one.sum(), 3))
+        quats, colours = np.concatenate([quats[one]] * 2), np.concatenate([colours[one], colours[one] + noise])
     scales = np.tile(np.log([0.5 * SPACING, 0.5 * SPACING, 0.003]), (len(means), 1))
     columns = {
         **dict(zip("xyz", means.T, strict=True)),

@@ -17,6 +17,7 @@ from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
 from service.pose.alignment import align
 from service.pose.gate import verify
+from service.pose.mirror import mirrored
 from service.types import HINTS, Box, Camera, Pose, Query, Reason, Status, Verdict
 
 TRUTH = unseen_pose()
@@ -25,14 +26,14 @@ BEFORE_A_WALL = look_at(np.array([0.7, 0.1, 0.0]), np.array([2.0, 0.1, 0.0]), UP
 FAR_OUTSIDE = look_at(np.array([25.0, 3.0, 4.0]), np.zeros(3), UP)
 FAST = Request(options=Options(effort="fast"))
 
+Rooms = dict[str, LoadedScene]
+
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> dict[bool, LoadedScene]:
-    """An ordinary room, and (True) one that repeats itself."""
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
     folder = tmp_path_factory.mktemp("rooms")
-    return {
-        r: LoadedScene.load(write_room(folder / str(r), repeated=r), cache_dir=folder / "cache") for r in (False, True)
-    }
+    kinds = {"ordinary": {}, "repeated": {"repeated": True}, "symmetric": {"symmetric": True}}
+    return {k: LoadedScene.load(write_room(folder / k, **how), cache_dir=folder / "cache") for k, how in kinds.items()}
 
 
 def judged(room: LoadedScene, query: Query, pose: Pose = TRUTH) -> Verdict:
@@ -47,7 +48,7 @@ def grey(query: Query) -> Query:
     return replace(query, rgb=np.full_like(query.rgb, 127))
 
 
-PROVOKED: dict[Reason, Callable[[LoadedScene, LoadedScene], Verdict]] = {
+PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
     Reason.AGREES: lambda room, _: judged(room, photo_at(room, TRUTH)),
     Reason.FEW_FEATURES: lambda room, _: localize(grey(photo_at(room, TRUTH)), room, FAST).verdict,
     Reason.NO_MATCHING_VIEW: lambda room, _: judged(room, photo_at(room, TRUTH), unseen_pose(4)),
@@ -58,7 +59,10 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, LoadedScene], Verdict]] = {
     Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
     Reason.PLACE_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
-    Reason.AMBIGUOUS: lambda _, repeated: localize(photo_at(repeated, TRUTH), repeated, FAST).verdict,
+    Reason.AMBIGUOUS: lambda _, rooms: localize(photo_at(rooms["repeated"], TRUTH), rooms["repeated"], FAST).verdict,
+    Reason.MIRRORED: lambda _, rooms: (
+        localize(mirrored(photo_at(rooms["symmetric"], TRUTH)), rooms["symmetric"], FAST).verdict
+    ),
     Reason.BUDGET_EXHAUSTED: lambda room, _: (
         localize(photo_at(room, TRUTH), room, replace(FAST, budget_s=1e-9)).verdict
     ),
@@ -94,8 +98,8 @@ def middle_of_a_wall(room: LoadedScene) -> Query:
 
 
 @pytest.mark.parametrize("reason", list(Reason))
-def test_every_reason_is_given_where_it_is_due(reason: Reason, rooms: dict[bool, LoadedScene]) -> None:
-    verdict = PROVOKED[reason](rooms[False], rooms[True])
+def test_every_reason_is_given_where_it_is_due(reason: Reason, rooms: Rooms) -> None:
+    verdict = PROVOKED[reason](rooms["ordinary"], rooms)
     assert verdict.reason is reason, (verdict.score, dict(verdict.signals))
     assert (verdict.status is Status.LOCALIZED) == (reason is Reason.AGREES)
     assert bool(HINTS[reason]) == (reason is not Reason.AGREES)

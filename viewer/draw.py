@@ -164,7 +164,8 @@ def flow(
     for i in np.argsort(view.inlier, kind="stable"):
         if drawn[i]:
             tip = min(0.5, _TIP_PX / lengths[i])
-            cv2.arrowedLine(picture, *pairs[i], inks[i], 2, cv2.LINE_AA, _SHIFT, tip)
+            start, end = pairs[i]
+            cv2.arrowedLine(picture, start, end, inks[i], 2, cv2.LINE_AA, _SHIFT, tip)
         cv2.circle(picture, pairs[i][1], 3 << _SHIFT, inks[i], -1, cv2.LINE_AA, _SHIFT)
     return _pasted((picture, ((_WIDTH_PX - picture.shape[1]) // 2, 0)))
 

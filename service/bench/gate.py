@@ -35,6 +35,7 @@ from service.interfaces import Tools
 from service.localize import Request, localize
 from service.pose.alignment import align
 from service.pose.gate import BY_PIXELS, CLEAR_COLOURS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.mirror import mirrored
 from service.pose.views import photo_at, rendered_frame
 from service.track import aligned_from, glance
 from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
@@ -66,6 +67,7 @@ OTHER_DOUBTS = (
     Reason.LITTLE_SCENE_IN_VIEW,
     Reason.PLACE_UNCERTAIN,
     Reason.AMBIGUOUS,
+    Reason.MIRRORED,
 )
 
 
@@ -131,7 +133,7 @@ def _of_photo(
         yield _localized(one, kind, photo.name, query, file.truth.pose)
     data = photo.path.read_bytes()
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=one.background_rgb)
-    yield _localized(one, "mirrored", photo.name, _mirrored(query), None)
+    yield _localized(one, "mirrored", photo.name, mirrored(query), None)
     for _ in range(MOVES):
         pose = _moved(photo.camera.pose, one, *NEAR, rng)
         yield _sample(one, "near", photo.name, photo.camera.pose, pose, verify(query, pose, _tools(one)))
@@ -198,11 +200,6 @@ def garbage(number: int) -> np.ndarray:
         case 7:
             picture = resized(rng.uniform(size=(120, 160, 3)).astype(np.float32), width, height)
     return np.clip(picture, 0, 1).astype(np.float32)
-
-
-def _mirrored(query: Query) -> Query:
-    lens = replace(query.intrinsics, cx=query.intrinsics.width - query.intrinsics.cx)
-    return replace(query, rgb=np.ascontiguousarray(query.rgb[:, ::-1]), intrinsics=lens)
 
 
 def _moved(pose: Pose, one: Subject, between: tuple[float, float], most_deg: float, rng: np.random.Generator) -> Pose:

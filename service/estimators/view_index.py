@@ -3,7 +3,7 @@
     features of the photo -> views that they vote for -> matches, lifted to 3D -> PnP
     -> while few agree: render there, match again, solve decoupled
     -> align photometrically on a small render, then on larger ones
-    -> verification gate -> do many matches agree elsewhere? Then is that place as good?
+    -> verification gate -> does the mirror image fit better? Do many matches agree elsewhere, and is that as good?
 
 At first the photo is looked at in a small size. Only if the gate doesn't accept the answer the dearer searches are
 tried: in its full size; larger still, with further views, or turned by eighths; then poses sampled near the views. From
@@ -32,6 +32,7 @@ from service.pose.gate import glance, verify
 from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
+from service.pose.mirror import BEYOND_DOUBT, mirrored, unlikeness
 from service.pose.pnp import Resection, resection
 from service.pose.region import admits, loosened
 from service.pose.retrieval import top
@@ -129,7 +130,9 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     for search, sight in () if hunt.accepted else _searches(query, tools, options, hunt):
         yield from hunt.follow(search)
         if hunt.accepted:
-            yield from hunt.contest(sight)
+            yield from hunt.reflect(sight, options)
+            if not hunt.mirrored:
+                yield from hunt.contest(sight)
             return
     if hunt.accepted and query.region is None:  # a guess doesn't decide between places that look alike
         yield from hunt.contest(Sight(GLANCE_PX))
@@ -147,6 +150,8 @@ class _Hunt:
     accepted: bool = False
     glimpsing: bool = False
     """A doubt that is left after a first glimpse is no reason to stop."""
+    mirrored: bool = False
+    """Whether the photo's mirror image fits better."""
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance gives: foreign photos never do."""
 
@@ -174,6 +179,25 @@ class _Hunt:
         yield self._with_answer(
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
+
+    def reflect(self, sight: Sight, options: Options) -> Iterator[IterationRecord]:
+        """Where the scene is much like its mirror image, look whether the photo's mirror image fits better."""
+        assert self.answer is not None
+        known = self.query.corrected(self.answer.lens)
+        own = verify(known, self.answer.pose, self.tools).signals
+        if not self.tools.prepared.like_its_mirror_image or own["gradients"] > BEYOND_DOUBT:
+            return
+        elsewhere = replace(mirrored(known), prior=None, region=None)  # those are of the photo as it was sent
+        other = _Hunt(elsewhere, replace(self.tools, memo={}))
+        sight = replace(sight, eighths=-sight.eighths % 8)
+        likeliest = top(sight.votes(other.query, other.tools), options.candidates)
+        for record in other.follow(_search("mirror", sight, deque(likeliest), other.query, other.tools)):
+            yield replace(record, pose=self.answer.pose, lens=self.answer.lens, candidates=None, matches=None)
+        if other.answer is None:
+            return
+        there = verify(other.query.corrected(other.answer.lens), other.answer.pose, other.tools).signals
+        self.mirrored = unlikeness(there) < unlikeness(own)
+        yield replace(self.answer, stage="mirror", mirrored=self.mirrored)
 
     def contest(self, sight: Sight) -> Iterator[IterationRecord]:
         """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""

@@ -9,19 +9,20 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from service.interfaces import Features, Tools
+from service.pose.mirror import like_its_mirror_image
 from service.pose.retrieval import vote
 from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, view_from
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 4
+VERSION = 5
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class ViewIndex:
     views: tuple[View, ...]
+    like_its_mirror_image: bool = False
+    """Whether a mirrored photo of the scene may pass for one of the scene; see pose/mirror.py."""
 
     def votes(self, descriptors: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "views"]:
         """Return how much each view is like a photo with these features."""
@@ -44,6 +47,7 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
     index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
+    index = replace(index, like_its_mirror_image=like_its_mirror_image(index.views, tools))
     if path:
         _write(index, path)
     return index
@@ -78,6 +82,7 @@ def _write(index: ViewIndex, path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     cameras = [view.camera for view in index.views]
     arrays = {
+        "like_its_mirror_image": np.array(index.like_its_mirror_image),
         "counts": np.array([len(view.points_in_world) for view in index.views]),
         "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
         "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
@@ -107,4 +112,4 @@ def _read(path: Path) -> ViewIndex:
         features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
         camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
         views.append(View(camera, features, stored["points_in_world"][start:stop]))
-    return ViewIndex(tuple(views))
+    return ViewIndex(tuple(views), bool(stored["like_its_mirror_image"]))

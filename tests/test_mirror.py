@@ -1,0 +1,84 @@
+"""A mirrored photo is told from one that isn't, also where the scene is nearly its own mirror image."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_room import write_room
+from test_estimators import LENS, assert_near, photo_at, unseen_pose
+
+from service.geometry import project, transformed
+from service.localize import LoadedScene, localize
+from service.pose.mirror import mirrored
+from service.types import Box, Pose, Query, Reason, Status
+
+MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def symmetric(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    folder = tmp_path_factory.mktemp("symmetric")
+    return LoadedScene.load(write_room(folder / "room", symmetric=True), cache_dir=folder / "cache")
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_mirrored_photo_of_a_symmetric_room_is_not_localized(seed: int, symmetric: LoadedScene) -> None:
+    truth = unseen_pose(seed)
+    photo = photo_at(symmetric, truth)
+    found = localize(photo, symmetric)
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+    found = localize(mirrored(photo), symmetric)
+    assert found.verdict.status is Status.UNCERTAIN
+    assert found.verdict.reason is Reason.MIRRORED
+    assert "mirror" in [record.stage for record in found.records]
+
+
+def test_a_noisy_photo_is_looked_for_both_ways_and_found(symmetric: LoadedScene) -> None:
+    truth = unseen_pose()
+    photo = photo_at(symmetric, truth)
+    noise = np.random.default_rng(0).normal(0, 25, photo.rgb.shape)
+    found = localize(replace(photo, rgb=np.clip(photo.rgb + noise, 0, 255).astype(np.uint8)), symmetric)
+    assert found.verdict.status is Status.LOCALIZED
+    assert "mirror" in [record.stage for record in found.records]
+    assert_near(found.pose, truth)
+
+
+def test_a_region_that_excludes_the_mirrored_place_changes_nothing(symmetric: LoadedScene) -> None:
+    """It is of the photo as it was sent."""
+    truth = unseen_pose()
+    there = (MIRROR @ truth.world_from_camera @ MIRROR)[:3, 3]
+    query = replace(mirrored(photo_at(symmetric, truth)), region=Box(there - 0.2, there + 0.2))
+    assert localize(query, symmetric).verdict.reason is Reason.MIRRORED
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_only_symmetric_scenes_are_like_their_mirror_image(symmetric: bool, tmp_path: Path) -> None:
+    room = write_room(tmp_path / "room", symmetric=symmetric)
+    for _ in range(2):  # the second reads what the first has stored
+        loaded = LoadedScene.load(room, cache_dir=tmp_path / "cache")
+        assert loaded.prepare("view_index").like_its_mirror_image == symmetric
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 1000), st.floats(0.3, 0.7))
+def test_mirroring_moves_what_is_seen_to_the_other_side(seed: int, centre: float) -> None:
+    """Seen by the mirrored camera, mirrored points are where the mirrored photo has them."""
+    rng = np.random.default_rng(seed)
+    lens = replace(LENS, cx=centre * LENS.width)
+    photo = Query(rng.integers(0, 255, (LENS.height, LENS.width, 3)).astype(np.uint8), lens, "given", lens)
+    other = mirrored(photo)
+    points = rng.uniform([-1, -1, 2], [1, 1, 4], (5, 3))
+    camera_from_world = Pose(np.eye(4)).camera_from_world
+    seen = project(transformed(camera_from_world, points), lens)
+    there = project(transformed(MIRROR @ camera_from_world, points), other.intrinsics)
+    assert np.allclose(there[:, 0], lens.width - seen[:, 0])
+    assert np.allclose(there[:, 1], seen[:, 1])
+    assert np.array_equal(other.rgb[:, 0], photo.rgb[:, -1])
+    assert np.array_equal(mirrored(other).rgb, photo.rgb)
+    assert mirrored(other).intrinsics.cx == pytest.approx(lens.cx)
