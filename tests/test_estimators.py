@@ -213,6 +213,18 @@ def test_a_turned_photo_is_found_by_turning_it(degrees: int, room: LoadedScene) 
     assert degrees == 45 or "turn" in {record.stage for record in found.records}  # features stand an eighth here
 
 
+def test_what_a_small_photo_does_not_show_is_looked_for_in_its_full_size(room: LoadedScene) -> None:
+    """Of two photos with four times the focal length: each shows a few patches of one wall."""
+    zoomed = replace(LENS, fx=4 * FOCAL, fy=4 * FOCAL)
+    stages: set[str] = set()
+    for seed in (4, 5):
+        found = localize(photo_at(room, unseen_pose(seed), zoomed), room)
+        assert_near(found.pose, unseen_pose(seed))
+        stages |= {record.stage for record in found.records}
+    assert "look" in stages
+    assert not stages & {"further", "turn", "sample"}
+
+
 def test_a_photo_half_hidden_is_found_or_refused_but_never_wrong(room: LoadedScene) -> None:
     truth = unseen_pose(5)
     query = photo_at(room, truth)
