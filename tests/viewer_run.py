@@ -7,8 +7,8 @@ reads the verdict, opens the job in the viewer, steps back and forth, and return
 of its viewer and of both pages after each round; prints the medians of each quarter of the run as JSON; exits with 1
 if anything is larger in the last quarter than in the second one by more than `MAY_GROW` and `BUT_AT_LEAST`.
 
-Of a page its objects are judged, its DOM nodes and its listeners: every few rounds a heap snapshot tells what the heap
-holds by kind. The heap as a whole is printed too, but Chromium goes on compiling a page's functions as they are used
+Of a page its objects are judged, what they have outside the heap (pictures, buffers), its DOM nodes and its listeners:
+every few rounds a heap snapshot tells what there is by kind. The heap as a whole is printed too, but Chromium goes on compiling a page's functions as they are used
 more often, which has an end but takes longer than half an hour.
 """
 
@@ -95,7 +95,7 @@ def of_page(session: CDPSession) -> dict[str, float]:
 
 
 def by_kind(session: CDPSession) -> dict[str, float]:
-    """Return what the page's heap holds, in MB: of objects, and of code that the browser compiled."""
+    """Return what the page holds, in MB: its objects, what these have outside the heap, and what the browser compiled."""
     chunks: list[str] = []
     take = lambda event: chunks.append(event["chunk"])  # noqa: E731
     session.on("HeapProfiler.addHeapSnapshotChunk", take)
@@ -108,7 +108,8 @@ def by_kind(session: CDPSession) -> dict[str, float]:
     kinds = meta["node_types"][meta["node_fields"].index("type")]
     found = {name: float(size[kind == k].sum()) / 1e6 for k, name in enumerate(kinds)}
     print(json.dumps(found), file=sys.stderr, flush=True)
-    return {"objects MB": sum(found.values()) - found["code"], "code MB": found["code"]}
+    code, native = found["code"], found["native"]
+    return {"objects MB": sum(found.values()) - code - native, "native MB": native, "code MB": code}
 
 
 def watched(page: Page) -> CDPSession:
