@@ -8,8 +8,8 @@ of its viewer and of both pages after each round; prints the medians of each qua
 if anything is larger in the last quarter than in the second one by more than `MAY_GROW` and `BUT_AT_LEAST`.
 
 Of a page its objects are judged, what they have outside the heap (pictures, buffers), its DOM nodes and its listeners:
-every few rounds a heap snapshot tells what there is by kind. The heap as a whole is printed too, but Chromium goes on compiling a page's functions as they are used
-more often, which has an end but takes longer than half an hour.
+every few rounds a heap snapshot tells what there is by kind. The heap as a whole is printed too, but Chromium goes on
+compiling a page's functions as they are used more often, which has an end but takes longer than half an hour.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def of_page(session: CDPSession) -> dict[str, float]:
 
 
 def by_kind(session: CDPSession) -> dict[str, float]:
-    """Return what the page holds, in MB: its objects, what these have outside the heap, and what the browser compiled."""
+    """Return what the page holds, in MB: objects, what these have outside the heap, and what the browser compiled."""
     chunks: list[str] = []
     take = lambda event: chunks.append(event["chunk"])  # noqa: E731
     session.on("HeapProfiler.addHeapSnapshotChunk", take)
