@@ -132,17 +132,14 @@ def beside(
     ends = view.render_px * [b.shape[1] / k.width, b.shape[0] / k.height] + corners[1]
     order = np.argsort(view.inlier, kind="stable")
     order = order[within[order]]
-    inks = colours[order].tolist()
-    pairs = _fixed(np.stack([starts[order], ends[order]], axis=1))
+    both = np.stack([starts[order], ends[order]], axis=1)
     lines = pair.copy()
-    for line, ink in zip(pairs, inks, strict=True):
+    for line, ink in zip(_fixed(both), colours[order].tolist(), strict=True):
         cv2.polylines(lines, [line], False, ink, 2, cv2.LINE_AA, _SHIFT)
     # Lines translucent, the more the denser: three hundred must not hide what they connect. The ends are plain.
     opacity = 0.3 + 0.4 / (1 + len(order) / 50)
     picture = cv2.addWeighted(pair, 1 - opacity, lines, opacity, 0)
-    for line, ink in zip(pairs.tolist(), inks, strict=True):
-        for end in line:
-            cv2.circle(picture, end, 3 << _SHIFT, ink, -1, cv2.LINE_AA, _SHIFT)
+    _dot(picture, both.reshape(-1, 2), np.repeat(colours[order], 2, axis=0))
     return picture
 
 
@@ -182,6 +179,8 @@ def _interpolated(ramp: Float[np.ndarray, "s 3"], share: Float[np.ndarray, "k"])
     return np.stack([np.interp(share, stops, channel) for channel in ramp.T], -1).round().astype(np.uint8)
 
 
+_DOT = np.argwhere(np.hypot(*np.mgrid[-3:4, -3:4]) < 3.3) - 3
+"""Rows and columns of a dot's pixels from its middle."""
 _SHIFT = 4
 """Fractional bits of OpenCV's drawing coordinates."""
 
@@ -189,6 +188,16 @@ _SHIFT = 4
 def _fixed(points: Float[np.ndarray, "*k 2"]) -> Int32[np.ndarray, "*k 2"]:
     """To OpenCV's fixed point, whose top-left pixel centre is (0, 0)."""
     return ((points - 0.5) * (1 << _SHIFT)).round().astype(np.int32)
+
+
+def _dot(
+    picture: UInt8[np.ndarray, "h w 3"], centres: Float[np.ndarray, "k 2"], colours: UInt8[np.ndarray, "k 3"]
+) -> None:
+    """Put a dot on each centre, the last one on top. Of hundreds, OpenCV draws one at a time."""
+    places = np.floor(centres).astype(int)[:, None, ::-1] + _DOT
+    within = np.all((places >= 0) & (places < picture.shape[:2]), axis=2)
+    row, column = places[within].T
+    picture[row, column] = np.repeat(colours, within.sum(1), axis=0)
 
 
 def _pasted(*parts: tuple[np.ndarray, tuple[int, int]]) -> UInt8[np.ndarray, "c d 3"]:
