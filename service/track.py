@@ -24,7 +24,7 @@ from service.geometry import moved, pose_distance, se3_log
 from service.interfaces import Frame, RenderTally, Tools
 from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
 from service.pose.alignment import Evidence, align, evidence
-from service.pose.gate import clear, judged, pixel_signals, verify
+from service.pose.gate import appearance, clear, geometry_signals, judged, verify
 from service.pose.views import known_at, photo_at, sized
 from service.render.counted import Counted
 from service.types import (
@@ -257,7 +257,7 @@ def glance(query: Query, found: _Aligned, tools: Tools) -> Verdict | None:
     """Judge a pose as the gate does, by the pixels alone: matches cost most; None where these don't make it clear."""
     size = found.seen.camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)
-    signals = pixel_signals(photo, found.seen.frame, known, size, found.evidence)
+    signals = appearance(photo, found.seen.frame, known) | geometry_signals(found.seen.frame, size, found.evidence)
     if not clear(signals):
         return None
     # The last pull is in the pose already. A shared lens is not one photo's to doubt.

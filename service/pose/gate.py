@@ -105,7 +105,7 @@ at most 0.9."""
 HOPELESS = 0.35
 """Mean of the scaled signals of a kind, below which nothing was recognised: foreign photos have 0.0 to 0.3."""
 APPEARANCE, UNLIKE = ("gradients", "gradients_half", "colours", "colours_half"), 0.3
-"""Signals whose scaled mean tells that a render is so unlike the photo that no matches need be looked for: right poses
+"""Signals whose scaled mean tells that a render is so unlike the photo that nothing else need be looked at: right poses
 of photos spoilt within reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
 NO_MATCHES = {"inliers": 0.0, "inlier_share": 0.0, "inlier_spread": 0.0}
 MIN_COVERAGE = 0.04
@@ -151,7 +151,7 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     frame, camera = rendered_frame(pose, query, tools)
     photo, size = photo_features(query, tools), camera.intrinsics
     signals, pixels = _seen(query, pose, frame, camera, tools)
-    if np.mean([SCALES[name](signals[name]) for name in APPEARANCE]) < UNLIKE:
+    if _unlike(signals):
         return judged(signals | NO_MATCHES, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
     view, _ = rendered_view(pose, query, tools)
     known = known_at(query, tools, size)
@@ -169,9 +169,16 @@ def _seen(
     """Return the signals and the evidence of the pixels; `camera` rendered the frame at the pose or nearby."""
     size = camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)
-    answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
-    pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known, tools.memo.get("aligned"))
-    return pixel_signals(photo, frame, known, size, pixels), pixels
+    looks = appearance(photo, frame, known)
+    pixels = None
+    if not _unlike(looks):
+        answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
+        pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known, tools.memo.get("aligned"))
+    return looks | geometry_signals(frame, size, pixels), pixels
+
+
+def _unlike(signals: Mapping[str, float]) -> bool:
+    return bool(np.mean([SCALES[name](signals[name]) for name in APPEARANCE]) < UNLIKE)
 
 
 def _within_region(verdict: Verdict, query: Query, pose: Pose) -> Verdict:
@@ -185,16 +192,16 @@ def doubted(verdict: Verdict, reason: Reason, score: float = DOUBTFUL) -> Verdic
     return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
 
 
-def pixel_signals(
-    photo: UInt8[np.ndarray, "h w 3"],
-    frame: Frame,
-    known: Bool[np.ndarray, "h w"] | None,
-    size: Intrinsics,
-    pixels: Evidence | None,
+def appearance(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
 ) -> dict[str, float]:
-    """Return the signals that need no matches; `pixels` is the evidence for the pose on this frame."""
-    gradients, gradients_half = gradient_agreement(photo, frame, known)
-    colours, colours_half = colour_agreement(photo, frame, known)
+    """Return the signals of how alike photo and frame look."""
+    agreements = gradient_agreement(photo, frame, known) + colour_agreement(photo, frame, known)
+    return dict(zip(APPEARANCE, agreements, strict=True))
+
+
+def geometry_signals(frame: Frame, size: Intrinsics, pixels: Evidence | None) -> dict[str, float]:
+    """Return the signals of what is seen and how well it fixes the pose; `pixels` is the evidence on this frame."""
     depth = frame.median_depth[::4, ::4]
     typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     drift = spread = np.inf
@@ -203,10 +210,6 @@ def pixel_signals(
         if spread < UNDETERMINED:
             drift = size.fx * float(np.linalg.norm(pixels.pull[:3]) + np.linalg.norm(pixels.pull[3:]) / typical_depth)
     return {
-        "gradients": gradients,
-        "gradients_half": gradients_half,
-        "colours": colours,
-        "colours_half": colours_half,
         "coverage": float((frame.alpha > MIN_ALPHA).mean()),
         "drift_px": min(drift, 1e3),
         "sigma_share": min(spread, 1e3),
