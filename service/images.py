@@ -41,8 +41,9 @@ MAX_PIXELS_WHOLE = 25 * 1024 * 1024
 """Of WebP: it can't be decoded at a reduced size, and 64 megapixels, which 120 kB may hold, would take 1.9 GB."""
 MAX_SCANS = 24
 """Of a progressive JPEG. Each is a walk over all pixels, for which an attacker needs 100 bytes; encoders make 10."""
-LONG_SIDE = 1600
-"""Of `Query.rgb`; matching uses 512 and alignment 400 pixels, the rest is for close looks."""
+LONG_SIDE, NEARLY = 1000, 1.3
+"""Of `Query.rgb`, and how much more it may have where resampling would cost more time than it saves. Features are
+looked for at 800 pixels at most; a JPEG of 12 megapixels is decoded at a quarter of its size."""
 OPAQUE = 128
 """Of 255: what is more transparent is unknown."""
 MIN_SIDE = 32
@@ -60,7 +61,7 @@ _DECODERS = (
 )
 _HEIC_S = 30
 """Wall time; 64 megapixels take two seconds."""
-_JPEG_MARKER = re.compile(rb"\xff+[^\x00\xff\xd0-\xd7]")
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
 """Not a stuffed byte, nor a restart within a scan."""
 _BAND_PX = 1 << 21
 """Converted at once: the whole photo is in memory once as it was decoded, and once as RGB."""
@@ -90,8 +91,7 @@ def read_query(
 
     `intrinsics` refer to the upright photo in its full size. Transparent parts are unknown: nothing is expected
     there. They are filled with `background_rgb` (0..1): pass the scene's, then a cut-out object has the edges that
-    it has in a render. `long_side` is the most that the
-    query's picture may have.
+    it has in a render. `long_side` is about the most that the query's picture has.
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
@@ -109,7 +109,9 @@ def query_of(
     """Return the query of an upright photo that is decoded already. Raises InvalidImage, InvalidIntrinsics."""
     height, width = rgb.shape[:2]
     target = _target((width, height), long_side)
-    if target != (width, height):
+    if max(width, height) <= NEARLY * max(target):
+        target = width, height
+    else:
         rgb = np.asarray(cv2.resize(rgb, target, interpolation=cv2.INTER_AREA))
     scale = (target[0] / width, target[1] / height)
     return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, prior)
@@ -303,7 +305,9 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
     layers = [pixels] if alpha is None else [pixels, alpha]
-    if pixels.shape[:2] != target[::-1]:
+    if max(pixels.shape[:2]) <= NEARLY * max(target):
+        target = pixels.shape[1], pixels.shape[0]
+    else:
         layers = [cv2.resize(layer, target, interpolation=cv2.INTER_AREA) for layer in layers]
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]

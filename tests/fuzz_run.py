@@ -272,7 +272,7 @@ def photo_target(kind: str) -> Target:
         height, width, channels = query.rgb.shape
         assert channels == 3
         assert (query.intrinsics.width, query.intrinsics.height) == (width, height)
-        assert max(width, height) <= 1600
+        assert max(width, height) <= 1300
 
     words = ("Exif\\x00\\x00", "MM\\x00*", "II*\\x00", "IHDR", "IDAT", "eXIf", "iCCP", "acTL", "tRNS", "PLTE")
     # A WebP of `MAX_PIXELS_WHOLE` takes 433 MB.

@@ -169,7 +169,7 @@ class TestGeometry:
         photo = Image.fromarray(spots(camera, RAYS, pinhole, size))
         options = {"quality": 95} if kind == "JPEG" else {"compress_level": 1}
         query = read_query(encoded(photo, kind, **options), intrinsics=camera, long_side=SMALL)
-        assert max(query.rgb.shape) == min(SMALL, width)
+        assert min(SMALL, width) <= max(query.rgb.shape) <= min(images.NEARLY * SMALL, width)
         for ray, expected in zip(RAYS, pinhole(RAYS, query.intrinsics), strict=True):
             found = centroid(query.rgb, expected, int(0.04 * query.rgb.shape[1]))
             # Seen: 0.027; 0.46 if the reduced width were taken for the exact half of an odd one.
@@ -380,7 +380,7 @@ class TestBrokenPhotos:
 
     def test_64_megapixels_of_a_phone_are_allowed(self):
         data = encoded(Image.new("L", (9248, 6936), 100), "JPEG", quality=30)
-        assert read_query(data).rgb.shape == (1200, 1600, 3)
+        assert read_query(data).rgb.shape == (867, 1156, 3)  # an eighth
 
     def test_text_bomb(self):
         text = b"Comment\0\0" + zlib.compress(bytes(80_000_000))
