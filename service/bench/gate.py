@@ -58,8 +58,8 @@ OCCLUDERS = 2
 """Photos of each other scene that rectangles are cut from."""
 PENALTY = 0.02
 """On the squared weights, against certainty that few samples don't give."""
-BELOW_FLOOR = 0.004
-"""Share of right poses, for each signal."""
+BELOW_FLOOR = 0.003
+"""Share of right poses, for each signal: at most 3 % may be refused, and there are eight floors."""
 BINS = 10
 OTHER_DOUBTS = (
     Reason.FOCAL_UNCERTAIN,
@@ -253,7 +253,8 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
         tested = np.zeros(len(samples))
         for scene in np.unique(scenes):
             here = scenes == scene
-            weights, floor = fitted(features[~here], right[~here]), floors(features[~here & usual])
+            elsewhere = ~here & ~doubted  # what is refused for another reason is not for the signals to tell
+            weights, floor = fitted(features[elsewhere], right[elsewhere]), floors(features[~here & usual])
             doubtful = (features[here] < floor).any(1)
             tested[here] = probabilities(features[here], weights)
             tested[here] = np.minimum(tested[here], np.where(doubtful, DOUBTFUL, 1.0))
@@ -263,7 +264,7 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
             tested = np.where(clear & (by_pixels >= LOCALIZED), np.maximum(by_pixels, tested), tested)
         ends = [SCALES[n].value_at(f) for n, f in zip(list(model)[1:], floors(features[usual])[1:], strict=True)]
         result[name] = {
-            "weights": dict(zip(model, np.round(fitted(features, right), 2).tolist(), strict=True)),
+            "weights": dict(zip(model, np.round(fitted(features[~doubted], right[~doubted]), 2).tolist(), strict=True)),
             "floors": dict(zip(list(model)[1:], np.round(ends, 3).tolist(), strict=True)),
             **_counts(tested, right, kinds, doubted),
             "reliability": _reliability(tested, right),
