@@ -28,11 +28,11 @@ from service.interfaces import Tools
 from service.pose.alignment import align
 from service.pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
 from service.pose.focal import WIDER, focal_resection, refine
-from service.pose.gate import glance, verify
+from service.pose.gate import appearance, glance, verify
 from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
-from service.pose.mirror import BEYOND_DOUBT, mirrored, unlikeness
+from service.pose.mirror import BEYOND_DOUBT, OUT_OF_REACH, mirrored, unlikeness
 from service.pose.pnp import Resection, resection
 from service.pose.region import admits, loosened
 from service.pose.retrieval import top
@@ -130,7 +130,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     for search, sight in () if hunt.accepted else _searches(query, tools, options, hunt):
         yield from hunt.follow(search)
         if hunt.accepted:
-            yield from hunt.reflect(sight, options)
+            yield from hunt.reflect(sight)
             if not hunt.mirrored:
                 yield from hunt.contest(sight)
             return
@@ -180,22 +180,23 @@ class _Hunt:
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
-    def reflect(self, sight: Sight, options: Options) -> Iterator[IterationRecord]:
+    def reflect(self, sight: Sight) -> Iterator[IterationRecord]:
         """Where the scene is much like its mirror image, look whether the photo's mirror image fits better."""
         assert self.answer is not None
         known = self.query.corrected(self.answer.lens)
         own = verify(known, self.answer.pose, self.tools).signals
         if not self.tools.prepared.like_its_mirror_image or own["gradients"] > BEYOND_DOUBT:
             return
-        elsewhere = replace(mirrored(known), prior=None, region=None)  # those are of the photo as it was sent
-        other = _Hunt(elsewhere, replace(self.tools, memo={}))
-        sight = replace(sight, eighths=-sight.eighths % 8)
-        likeliest = top(sight.votes(other.query, other.tools), options.candidates)
-        for record in other.follow(_search("mirror", sight, deque(likeliest), other.query, other.tools)):
-            yield replace(record, pose=self.answer.pose, lens=self.answer.lens, candidates=None, matches=None)
-        if other.answer is None:
+        query = replace(mirrored(known), prior=None, region=None)  # those are of the photo as it was sent
+        tools = replace(self.tools, memo={})
+        worst, last = OUT_OF_REACH * (self.answer.loss or np.inf), None
+        for last in _reflected(replace(sight, eighths=-sight.eighths % 8), query, tools, worst):
+            yield self._with_answer(replace(last, stage="mirror", matches=None))
+        if last is None or last.stage != "align":
             return
-        there = verify(other.query.corrected(other.answer.lens), other.answer.pose, other.tools).signals
+        frame, camera = rendered_frame(last.pose, query.corrected(last.lens), tools)
+        size = camera.intrinsics
+        there = appearance(photo_at(query, tools, size), frame, known_at(query, tools, size))
         self.mirrored = unlikeness(there) < unlikeness(own)
         yield replace(self.answer, stage="mirror", mirrored=self.mirrored)
 
@@ -294,6 +295,18 @@ def _search(
         found = yield from _rematched(found, query, tools)
     if found:
         yield from _aligned(found, query, tools)
+
+
+def _reflected(sight: Sight, query: Query, tools: Tools, worst: float) -> Iterator[IterationRecord]:
+    """Match a mirrored photo and align it; end early where the first alignment's residual is worse than this."""
+    views = (tools.prepared.views[i] for i in top(sight.votes(query, tools), GLIMPSES))
+    found = yield from _matched(sight, views, query, tools)
+    if found is None or found.num_inliers < WORTH:
+        return
+    for record in _aligned(found, query, tools):
+        if (record.loss or 0.0) > worst:
+            return
+        yield record
 
 
 def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationRecord]:

@@ -28,6 +28,9 @@ MAX_ERROR_PX, TRIALS = 4.0, 500
 """The first at PHOTO_PX."""
 BEYOND_DOUBT = 0.99
 """Agreement of gradients that no mirrored photo reaches (0.985 seen), but three in four of the others do."""
+OUT_OF_REACH = 2.0
+"""Times the answer's residual, after one alignment: of mirrored photos the mirror image has 0.6 to 1.6, of half of the
+others more than 3."""
 
 
 def mirrored(query: Query) -> Query:
