@@ -36,7 +36,7 @@ from service.pose.mirror import BEYOND_DOUBT, OUT_OF_REACH, mirrored, unlikeness
 from service.pose.pnp import Resection, resection
 from service.pose.region import admits, loosened
 from service.pose.retrieval import top
-from service.pose.rivals import apart, ranked, rivals
+from service.pose.rivals import apart, ranked, rivals, whole
 from service.pose.sight import (
     GLANCE_PX,
     GLIMPSE_SHARE,
@@ -201,14 +201,20 @@ class _Hunt:
         yield replace(self.answer, stage="mirror", mirrored=self.mirrored)
 
     def contest(self, sight: Sight) -> Iterator[IterationRecord]:
-        """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all."""
+        """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all.
+
+        A pose that explains the whole photo has none in a scene whose views are all different.
+        """
         assert self.answer is not None
         answers = [self.answer]
         known = self.query.corrected(self.answer.lens)
+        signals = verify(known, self.answer.pose, self.tools).signals
+        if whole(signals) and not self.tools.prepared.repeats_itself:
+            return
         frame, _ = rendered_frame(self.answer.pose, known, self.tools)
         distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
         pixels = sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
-        judged = (self.answer.pose, distance, verify(known, self.answer.pose, self.tools).signals)
+        judged = (self.answer.pose, distance, signals)
         suspected = rivals(
             sight.features(self.query, self.tools), known.intrinsics, *judged,
             self.tools.prepared.views, sight.votes(self.query, self.tools), self.tools.matcher, pixels,

@@ -9,7 +9,7 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +18,12 @@ from jaxtyping import Float32, Float64
 from service.interfaces import Features, Tools
 from service.pose.mirror import like_its_mirror_image
 from service.pose.retrieval import vote
+from service.pose.rivals import repeats_itself
 from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, view_from
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 5
+VERSION = 6
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 
@@ -32,6 +33,8 @@ class ViewIndex:
     views: tuple[View, ...]
     like_its_mirror_image: bool = False
     """Whether a mirrored photo of the scene may pass for one of the scene; see pose/mirror.py."""
+    repeats_itself: bool = True
+    """Whether a photo that fits one place may fit another one; see pose/rivals.py."""
 
     def votes(self, descriptors: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "views"]:
         """Return how much each view is like a photo with these features."""
@@ -47,7 +50,6 @@ def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
     index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
-    index = replace(index, like_its_mirror_image=like_its_mirror_image(index.views, tools))
     if path:
         _write(index, path)
     return index
@@ -59,9 +61,10 @@ def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
-        views = list(pool.map(lambda camera: view_from(camera, tools.rasterizer, tools.matcher), cameras))
+        views = tuple(pool.map(lambda camera: view_from(camera, tools.rasterizer, tools.matcher), cameras))
+        mirrored, repeated = like_its_mirror_image(views, tools, pool), repeats_itself(views, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
-    return ViewIndex(tuple(views))
+    return ViewIndex(views, mirrored, repeated)
 
 
 def _key(tools: Tools) -> str:
@@ -83,6 +86,7 @@ def _write(index: ViewIndex, path: Path) -> None:
     cameras = [view.camera for view in index.views]
     arrays = {
         "like_its_mirror_image": np.array(index.like_its_mirror_image),
+        "repeats_itself": np.array(index.repeats_itself),
         "counts": np.array([len(view.points_in_world) for view in index.views]),
         "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
         "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
@@ -112,4 +116,4 @@ def _read(path: Path) -> ViewIndex:
         features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
         camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
         views.append(View(camera, features, stored["points_in_world"][start:stop]))
-    return ViewIndex(tuple(views), bool(stored["like_its_mirror_image"]))
+    return ViewIndex(tuple(views), bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"]))

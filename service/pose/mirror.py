@@ -8,6 +8,7 @@ found out once with the index, the photo is looked for both ways, unless it fits
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from service.pose.retrieval import top, vote
 from service.pose.views import PHOTO_PX, VIEW_FEATURES, View, correspondences, to_uint8
 from service.types import Intrinsics, Query
 
-PROBES, TRIES = 6, 3
+PROBES, TRIES = 4, 2
 """Views whose mirror images are looked for, and the views each is matched with."""
 LIKE = 60
 """Matches on which a mirrored view's median must agree: of the test scenes chair, materials and fountain have 130 to
@@ -40,12 +41,12 @@ def mirrored(query: Query) -> Query:
     return replace(query, rgb=query.rgb[:, ::-1], known=known, intrinsics=lens, photo_intrinsics=whole)
 
 
-def like_its_mirror_image(views: Sequence[View], tools: Tools) -> bool:
+def like_its_mirror_image(views: Sequence[View], tools: Tools, pool: Executor) -> bool:
     """Tell whether mirrored views of the scene are recognised in it."""
     if not views:
         return False
     probes = np.unique(np.linspace(0, len(views) - 1, PROBES).astype(int))
-    return float(np.median([_recognised(views[i], views, tools) for i in probes])) >= LIKE
+    return float(np.median(list(pool.map(lambda i: _recognised(views[i], views, tools), probes)))) >= LIKE
 
 
 def unlikeness(signals: Mapping[str, float]) -> float:

@@ -10,6 +10,7 @@ suspicions: whoever asks aligns them, has the gate judge them, and compares what
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from itertools import islice
 
 import numpy as np
@@ -17,8 +18,8 @@ import numpy as np
 from service.geometry import pose_distance
 from service.interfaces import Features, Matcher
 from service.pose.pnp import Resection, reprojection_error_px, resection
-from service.pose.retrieval import top
-from service.pose.views import Correspondences, View, correspondences
+from service.pose.retrieval import top, vote
+from service.pose.views import PHOTO_PX, Correspondences, View, correspondences
 from service.types import Candidates, Intrinsics, IterationRecord, Pose
 
 VIEWS = 6
@@ -32,6 +33,11 @@ MOST = 3
 LEAST, MANY = 15, 40
 """Matches on which a suspicion rests: by chance up to 9 agree. A pose that explains the whole photo has no rival with
 less than many."""
+REPEATED, MAX_ERROR_PX = 30, 4.0
+"""Matches of a view that agree on another pose, in a scene that repeats itself; where they are, at PHOTO_PX. Chair,
+materials, templeRing and fountain have views with 35 to 124, studio, fox and fern none with more than 24."""
+MOST_VIEWS, EVERY = 128, 2
+"""Views of a scene that are looked through for that, every second one: 10 ms each, and more the more there are."""
 WHOLE = {"gradients": 0.95, "colours": 0.98}
 """Signals of a pose that explains the whole photo; of clean photos some have less gradients."""
 TRIALS = 200
@@ -66,7 +72,7 @@ def rivals(
     strong = _strongest(photo)
     found = [correspondences(strong, _with_strongest(views[i]), matcher) for i in chosen]
     left = _unexplained(Correspondences.pooled(found), intrinsics, answer, EXPLAINED * max_error_px)
-    least = MANY if all(signals[name] > value for name, value in WHOLE.items()) else LEAST
+    least = MANY if whole(signals) else LEAST
     for _ in range(MOST):
         rival = resection(left.photo_px, left.points_in_world, intrinsics, max_error_px, TRIALS)
         if rival is None or rival.num_inliers < least:
@@ -74,6 +80,30 @@ def rivals(
         if apart(rival.pose, answer, distance):
             yield rival
         left = _unexplained(left, intrinsics, rival.pose, EXPLAINED * max_error_px)
+
+
+def whole(signals: Mapping[str, float]) -> bool:
+    """Tell whether a pose with these signals of the gate explains the whole photo."""
+    return all(signals[name] > value for name, value in WHOLE.items())
+
+
+def repeats_itself(views: Sequence[View], matcher: Matcher, pool: Executor) -> bool:
+    """Tell whether what a view of the scene shows is seen elsewhere; of a large scene that is taken for granted."""
+    if len(views) > MOST_VIEWS:
+        return True
+    return any(pool.map(lambda view: _is_seen_elsewhere(view, views, matcher), views[::EVERY]))
+
+
+def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher) -> bool:
+    if len(view.points_in_world) == 0:
+        return False
+    lens, pose = view.camera.intrinsics, view.camera.pose
+    distance = float(np.median(np.linalg.norm(view.points_in_world - pose.position_in_world, axis=1)))
+    votes = vote(view.features.descriptors, [other.features.descriptors for other in views])
+    error_px = MAX_ERROR_PX * lens.long_side / PHOTO_PX
+    suspicious = dict.fromkeys(WHOLE, 0.0)  # then few matches are enough
+    found = rivals(view.features, lens, pose, distance, suspicious, views, votes, matcher, error_px)
+    return any(rival.num_inliers >= REPEATED for rival in found)
 
 
 def apart(one: Pose, other: Pose, distance: float) -> bool:
