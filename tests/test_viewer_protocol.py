@@ -310,7 +310,7 @@ def test_without_the_photo_the_render_is_shown(fake: FakeService, viewer: Viewer
         shown = draw.decode(bytes(image["_data"])).mean((0, 1))
         assert np.abs(shown - render_rgb(2, matched=False)).max() < 6
         assert "agrees" in browser.text()
-        assert "between two, on average" in browser.text()
+        browser.wait(lambda: "between two, on average" in browser.text(), "the angles")
 
 
 def test_the_view_at_rest_is_rendered_by_the_service(fake: FakeService, viewer: Viewer) -> None:
