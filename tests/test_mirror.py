@@ -57,12 +57,14 @@ def test_a_region_that_excludes_the_mirrored_place_changes_nothing(symmetric: Lo
     assert localize(query, symmetric).verdict.reason is Reason.MIRRORED
 
 
-@pytest.mark.parametrize("symmetric", [False, True])
-def test_only_symmetric_scenes_are_like_their_mirror_image(symmetric: bool, tmp_path: Path) -> None:
-    room = write_room(tmp_path / "room", symmetric=symmetric)
+@pytest.mark.parametrize("kind", ["ordinary", "repeated", "symmetric"])
+def test_the_index_knows_what_a_scene_is_like(kind: str, tmp_path: Path) -> None:
+    """Turned by a half a repeated room is the same, but not in a mirror; a symmetric one the other way round."""
+    room = write_room(tmp_path / "room", repeated=kind == "repeated", symmetric=kind == "symmetric")
     for _ in range(2):  # the second reads what the first has stored
-        loaded = LoadedScene.load(room, cache_dir=tmp_path / "cache")
-        assert loaded.prepare("view_index").like_its_mirror_image == symmetric
+        index = LoadedScene.load(room, cache_dir=tmp_path / "cache").prepare("view_index")
+        assert index.repeats_itself == (kind == "repeated")
+        assert index.like_its_mirror_image == (kind == "symmetric")
 
 
 @settings(max_examples=50, deadline=None)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,14 +39,6 @@ def test_a_room_that_repeats_itself_has_two_answers(seed: int, repeated: LoadedS
     (told,) = result_out(found, Timing(stage="decode", wall_s=0.0, cpu_s=0.0), {}).alternatives
     assert told.probability == probability
     assert told.pose.position == other.position_in_world.tolist()
-
-
-@pytest.mark.parametrize("twice", [False, True])
-def test_the_index_knows_whether_a_scene_repeats_itself(twice: bool, tmp_path: Path) -> None:
-    room = write_room(tmp_path / "room", repeated=twice)
-    for _ in range(2):  # the second reads what the first has stored
-        loaded = LoadedScene.load(room, cache_dir=tmp_path / "cache")
-        assert loaded.prepare("view_index").repeats_itself == twice
 
 
 def test_with_an_approximate_lens_too(repeated: LoadedScene) -> None:

@@ -40,13 +40,13 @@ from service.pose.rivals import apart, ranked, rivals, whole
 from service.pose.sight import (
     GLANCE_PX,
     GLIMPSE_SHARE,
-    MATCH_ERROR_PX,
     SECOND_LOOK,
     Sight,
     first_sight,
     turned_sight,
 )
 from service.pose.views import (
+    MATCH_ERROR_PX,
     PHOTO_PX,
     Correspondences,
     View,

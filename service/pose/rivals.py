@@ -19,7 +19,7 @@ from service.geometry import pose_distance
 from service.interfaces import Features, Matcher
 from service.pose.pnp import Resection, reprojection_error_px, resection
 from service.pose.retrieval import top, vote
-from service.pose.views import PHOTO_PX, Correspondences, View, correspondences
+from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, Correspondences, View, correspondences
 from service.types import Candidates, Intrinsics, IterationRecord, Pose
 
 VIEWS = 6
@@ -33,8 +33,8 @@ MOST = 3
 LEAST, MANY = 15, 40
 """Matches on which a suspicion rests: by chance up to 9 agree. A pose that explains the whole photo has no rival with
 less than many."""
-REPEATED, MAX_ERROR_PX = 30, 4.0
-"""Matches of a view that agree on another pose, in a scene that repeats itself; where they are, at PHOTO_PX. Chair,
+REPEATED = 30
+"""Matches of a view that agree on another pose, in a scene that repeats itself: chair,
 materials, templeRing and fountain have views with 35 to 124, studio, fox and fern none with more than 24."""
 MOST_VIEWS, EVERY = 128, 2
 """Views of a scene that are looked through for that, every second one: 10 ms each, and more the more there are."""
@@ -100,7 +100,7 @@ def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher) -> b
     lens, pose = view.camera.intrinsics, view.camera.pose
     distance = float(np.median(np.linalg.norm(view.points_in_world - pose.position_in_world, axis=1)))
     votes = vote(view.features.descriptors, [other.features.descriptors for other in views])
-    error_px = MAX_ERROR_PX * lens.long_side / PHOTO_PX
+    error_px = MATCH_ERROR_PX * lens.long_side / PHOTO_PX
     suspicious = dict.fromkeys(WHOLE, 0.0)  # then few matches are enough
     found = rivals(view.features, lens, pose, distance, suspicious, views, votes, matcher, error_px)
     return any(rival.num_inliers >= REPEATED for rival in found)

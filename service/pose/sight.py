@@ -10,11 +10,9 @@ from jaxtyping import Float64
 from service.interfaces import Features, Tools
 from service.pose.index import ViewIndex
 from service.pose.region import excess
-from service.pose.views import PHOTO_PX, photo_features
+from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, photo_features
 from service.types import Query
 
-MATCH_ERROR_PX = 4.0
-"""At PHOTO_PX; XFeat's points scatter by 1.5 px."""
 GLIMPSE_SHARE = 0.77
 """Of the photo's size, enough to recognise a whole, sharp one in half the time: each of the 58 clean test photos has 75
 or more matches that agree with its likeliest view, where foreign ones have 12."""
