@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from service.types import IterationRecord
 from viewer.charts import curves_html, stages_html, vectors_html
 from viewer.client import ServiceTrouble
-from viewer.draw import ColourBy, Mode, beside, flicker_html, flow, match_colours, overlaid, reduced
+from viewer.draw import ColourBy, Mode, Overlay, beside, flicker_html, flow, match_colours, overlaid, reduced
 from viewer.feed import JobFeed
 from viewer.measure import MatchView, seen
 from viewer.panel import Panel
@@ -27,6 +27,7 @@ from viewer.playback import caption_html, flow_caption_html, record_html, small_
 from viewer.stage import Stage
 
 _TEXTURE_PX = 512
+_KEPT_PICTURES = 4
 _APART_S = 0.02
 """viser puts in one message what comes within a sixtieth of a second."""
 
@@ -43,6 +44,8 @@ class Detail:
         """Job, and of several photos the step, whose picture is in the camera that is shown."""
         self._todo: list[tuple[float, Callable[[], None]]] = []
         """What is still to be done for the step, and the earliest time for it."""
+        self._composed: dict[tuple[object, ...], UInt8[np.ndarray, "h w 3"]] = {}
+        """Pictures of this step and its neighbours, by what they show."""
 
     @property
     def fresh(self) -> bool:
@@ -61,6 +64,7 @@ class Detail:
     def clear(self) -> None:
         self._shown = self._textured = None
         self._todo = []
+        self._composed = {}
         self._stage.clear_job()
 
     def show(self, feed: JobFeed, index: int) -> None:
@@ -80,7 +84,7 @@ class Detail:
         """Let pictures, charts and 3D follow with `go_on`."""
         nearby = [k for k in (index - 1, index + 1) if 0 <= k < len(feed.records)]
         self._todo = [(0.0, partial(self._draw, feed, index))]
-        self._todo += [(0.0, partial(self._fetch, feed, feed.records[k])) for k in nearby]
+        self._todo += [(0.0, partial(self._prepare, feed, feed.records[k])) for k in nearby]
 
     def _draw(self, feed: JobFeed, index: int) -> None:
         """Bring pictures and charts up to the step."""
@@ -114,10 +118,12 @@ class Detail:
         self._stage.show_candidates(next(weighed, None), feed.job.photo)
         self._stage.show_matches(view, None if view is None else match_colours(view, self._colour_by))
 
-    def _fetch(self, feed: JobFeed, record: IterationRecord) -> None:
-        """Have at hand what the pictures of a step need."""
+    def _prepare(self, feed: JobFeed, record: IterationRecord) -> None:
+        """Have at hand the picture of a step."""
         with suppress(ServiceTrouble, ValueError):
-            self._render(feed, record, self._view(feed, record))
+            photo = _photo(feed, record)
+            if photo is not None and self.mode != "flicker":
+                self._compared(feed, record, self._view(feed, record), photo)
 
     def _view(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
         """Return the match vectors as the step sees them."""
@@ -138,7 +144,6 @@ class Detail:
         panel.matches.visible = mode == "beside"
         panel.weight.visible, panel.flicker.visible = mode == "blend", mode == "flicker"
         panel.picture.visible = mode != "flicker"
-        view = view if self._with_lines else None
         photo = _photo(feed, record)
         if photo is None:
             step = feed.job.photo_step if feed.job else None
@@ -147,17 +152,29 @@ class Detail:
             panel.caption.content = small_html(f"The render at this step's pose; {why}.")
             panel.window.visible, panel.flicker.visible = True, False
             return
-        render = self._render(feed, record, view)
         if mode == "flicker":
-            panel.flicker.content = flicker_html(photo, render)
-        elif mode == "beside":
-            panel.picture.image = beside(
-                photo, render, view, None if view is None else match_colours(view, self._colour_by)
-            )
+            panel.flicker.content = flicker_html(photo, self._render(feed, record, view))
         else:
-            panel.picture.image = overlaid(mode, photo, render, panel.weight.value)
-        panel.caption.content = caption_html(mode, view, self._colour_by)
+            panel.picture.image = self._compared(feed, record, view, photo)
+        panel.caption.content = caption_html(mode, view if self._with_lines else None, self._colour_by)
         panel.window.visible = True
+
+    def _compared(
+        self, feed: JobFeed, record: IterationRecord, view: MatchView | None, photo: UInt8[np.ndarray, "h w 3"]
+    ) -> UInt8[np.ndarray, "a b 3"]:
+        """Return photo and render in one picture; the last few are kept."""
+        mode, by, weight = self.mode, self._colour_by, self._panel.weight.value
+        key = feed.id, record.index, mode, by, weight, self._with_lines
+        if key not in self._composed:
+            render = self._render(feed, record, view)
+            if mode == "beside":
+                lines = view if self._with_lines else None
+                picture = beside(photo, render, lines, None if lines is None else match_colours(lines, by))
+            else:
+                picture = overlaid(cast(Overlay, mode), photo, render, weight)
+            kept = list(self._composed.items())[1 - _KEPT_PICTURES :]
+            self._composed = dict([*kept, (key, picture)])
+        return self._composed[key]
 
     def _render(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> UInt8[np.ndarray, "h w 3"]:
         """Return what stands beside the photo."""

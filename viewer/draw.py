@@ -14,7 +14,8 @@ from jaxtyping import Float, Int32, UInt8
 
 from viewer.measure import MatchView
 
-Mode = Literal["beside", "blend", "checker", "difference", "flicker"]
+Overlay = Literal["blend", "checker", "difference"]
+Mode = Literal["beside", Overlay, "flicker"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 ColourBy = Literal["inlier", "residual"]
 
@@ -51,7 +52,7 @@ def reduced(image: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarr
 
 
 def overlaid(
-    mode: Literal["blend", "checker", "difference"],
+    mode: Overlay,
     photo: UInt8[np.ndarray, "h w 3"],
     render: UInt8[np.ndarray, "a b 3"],
     weight: float = 0.5,
