@@ -252,14 +252,14 @@ def _searches(
         yield _search(stage, glimpse, deque(likeliest), query, tools), glimpse
         hunt.glimpsing = False
         stage = "look"
+    sight = turned_sight(sight, query, tools)
     likeliest = top(sight.votes(query, tools), options.candidates)
-    yield _search(stage, sight, deque(likeliest), query, tools), sight
-    sight = turned_sight(sight.sized(SECOND_LOOK), query, tools)
+    yield _search("turn" if sight.eighths else stage, sight, deque(likeliest), query, tools), sight
+    sight = sight.sized(SECOND_LOOK)
     votes = sight.votes(query, tools)
-    further = top(votes, len(votes))[0 if sight.eighths else options.candidates :]
-    untried = deque(further[: max(options.candidates, len(votes) // FURTHER)])
+    untried = deque(top(votes, len(votes))[options.candidates :][: max(options.candidates, len(votes) // FURTHER)])
     while untried:
-        yield _search("turn" if sight.eighths else "further", sight, untried, query, tools), sight
+        yield _search("further", sight, untried, query, tools), sight
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):

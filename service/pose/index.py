@@ -19,11 +19,12 @@ from service.interfaces import Features, Tools
 from service.pose.mirror import like_its_mirror_image
 from service.pose.retrieval import vote
 from service.pose.rivals import repeats_itself
+from service.pose.turn import Corners, corners
 from service.pose.viewpoints import INDEX_PX, index_cameras
-from service.pose.views import VIEW_FEATURES, View, view_from
+from service.pose.views import VIEW_FEATURES, View, lifted, to_uint8
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 6
+VERSION = 7
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 
@@ -31,6 +32,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class ViewIndex:
     views: tuple[View, ...]
+    corners: Corners
+    """Of all views; see pose/turn.py."""
     like_its_mirror_image: bool = False
     """Whether a mirrored photo of the scene may pass for one of the scene; see pose/mirror.py."""
     repeats_itself: bool = True
@@ -61,10 +64,17 @@ def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
-        views = tuple(pool.map(lambda camera: view_from(camera, tools.rasterizer, tools.matcher), cameras))
+        seen = list(pool.map(lambda camera: _seen(camera, tools), cameras))
+        views = tuple(view for view, _ in seen)
         mirrored, repeated = like_its_mirror_image(views, tools, pool), repeats_itself(views, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
-    return ViewIndex(views, mirrored, repeated)
+    return ViewIndex(views, Corners.pooled([own for _, own in seen]), mirrored, repeated)
+
+
+def _seen(camera: Camera, tools: Tools) -> tuple[View, Corners]:
+    (frame,) = tools.rasterizer.render([camera])
+    rgb = to_uint8(frame.rgb)
+    return lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, camera), corners(rgb)
 
 
 def _key(tools: Tools) -> str:
@@ -87,6 +97,8 @@ def _write(index: ViewIndex, path: Path) -> None:
     arrays = {
         "like_its_mirror_image": np.array(index.like_its_mirror_image),
         "repeats_itself": np.array(index.repeats_itself),
+        "corner_directions_deg": index.corners.directions_deg,
+        "corner_descriptors": index.corners.descriptors,
         "counts": np.array([len(view.points_in_world) for view in index.views]),
         "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
         "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
@@ -116,4 +128,5 @@ def _read(path: Path) -> ViewIndex:
         features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
         camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
         views.append(View(camera, features, stored["points_in_world"][start:stop]))
-    return ViewIndex(tuple(views), bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"]))
+    pooled = Corners(stored["corner_directions_deg"], stored["corner_descriptors"])
+    return ViewIndex(tuple(views), pooled, bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"]))

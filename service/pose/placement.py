@@ -54,10 +54,14 @@ ENOUGH_GOOD, GOOD_PER_AREA = (200, 1200), 40
 WIDE_TURN = 0.8
 ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
 """Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
+LEAST_SEEN = 0.25
+"""The share of them, seen by the fewest good views, that a round aims at."""
 SURROUNDED = 0.7
 AS_SURROUNDED = 0.6
 """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
 RAYS = 32
+LEAVING = 2.0
+"""Cells around a point that may belong to the surface it lies on."""
 AT_LEAST, AT_MOST, COVERED = 64, 640, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
@@ -89,22 +93,22 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
     best = np.argsort(-np.array(views.scores), kind="stable")[:BEST]
     views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(OFFSPRING)])
     good = views.good()
-    unseen = ~views.seen(good)
+    seen = views.seen(good)
     for _ in range(ROUNDS):
-        before, few = unseen.mean(), len(good) < space.enough
-        if before < 1 - ENOUGH_SEEN and not few:
+        before, few = _covered(seen), len(good) < space.enough
+        if before > ENOUGH_SEEN and not few:
             break
-        aimed = _by_size(space, rng, ROUND_CANDIDATES // 2, unseen if unseen.any() else None)
+        aimed = _by_size(space, rng, ROUND_CANDIDATES // 2, seen <= np.quantile(seen, LEAST_SEEN))
         near = rng.choice(good, ROUND_CANDIDATES // 2) if len(good) else []
         views.judge(aimed + [_jittered(views.poses[i], space, rng, WIDE_TURN) for i in near])
         good = views.good()
-        unseen = ~views.seen(good)
-        if before - unseen.mean() < LEAST_GAIN and not few:
+        seen = views.seen(good)
+        if _covered(seen) - before < LEAST_GAIN and not few:
             break
     chosen = good[_choice([views.cells(i) for i in good])]
     lens = search_lens(SEARCH_PX)
     cameras = tuple(Camera(lens, views.poses[i]) for i in chosen)
-    coverage = float(views.seen(chosen).mean())
+    coverage = _covered(views.seen(chosen))
     return Placement(cameras, len(views.poses), len(good), coverage, space.distance, views.interior)
 
 
@@ -112,7 +116,12 @@ def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Cam
     """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
     views = _Views(_survey(scene), _thinned(scene, rasterizer, np.random.default_rng(0)))
     views.add([Camera(camera.intrinsics.with_long_side(SEARCH_PX), camera.pose) for camera in cameras])
-    return float(views.seen(np.arange(len(cameras))).mean())
+    return _covered(views.seen(np.arange(len(cameras))))
+
+
+def _covered(seen: Int64[np.ndarray, "n"]) -> float:
+    """Return the share of the points that are seen at all."""
+    return float((seen > 0).mean())
 
 
 def floaters(scene: GaussianScene) -> float:
@@ -178,6 +187,15 @@ class _Space:
         inside = np.all((index >= 0) & (index < self.filled.shape), axis=-1)
         x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
         return inside & self.filled[x, y, z]
+
+    def clear(
+        self, points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], reach: float
+    ) -> Float64[np.ndarray, "n"]:
+        """Return how far one gets from points of surfaces before Gaussians are in the way, at most `reach`."""
+        steps = np.arange(LEAVING, max(reach / self.cell, LEAVING + 1)) * self.cell
+        met = self.occupied(points + steps[:, None, None] * directions)
+        met[-1] = True
+        return np.minimum(steps[met.argmax(0)], reach)
 
     def enclosure(self, position: Float64[np.ndarray, "3"]) -> float:
         """Return the share of all directions in which something is met within the grid."""
@@ -250,21 +268,28 @@ class _Views:
     def __init__(self, space: _Space, rasterizer: Rasterizer) -> None:
         self.poses: list[Pose] = []
         self.scores: list[float] = []
-        self.interior = False
-        """The scene surrounds its good views, as far as is known."""
         self._enclosures: list[float] = []
+        self._least_enclosed = 0.0
+        """Of a good view, as far as is known; more than 0: the scene surrounds them."""
         self._surfaces: list[Float64[np.ndarray, "n 3"]] = []
         self._space, self._rasterizer = space, rasterizer
         self._voxel = 0.25 * space.distance
-        self._points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
+        points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
+        self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
 
     def judge(self, poses: Sequence[Pose]) -> None:
-        """Render the candidates small. Those among Gaussians are not worth it."""
+        """Render the candidates small. Those among Gaussians are not worth it, nor those known to be outside."""
         blocked = self._space.occupied(np.stack([pose.position_in_world for pose in poses]))
-        lens = search_lens(SEARCH_PX)
         free = [pose for pose, bad in zip(poses, blocked, strict=True) if not bad]
-        self.add([Camera(lens, pose) for pose in free])
-        self._enclosures += [self._space.enclosure(pose.position_in_world) for pose in free]
+        enclosures = [self._space.enclosure(pose.position_in_world) for pose in free]
+        inside = np.flatnonzero(np.array(enclosures) >= self._least_enclosed)
+        lens = search_lens(SEARCH_PX)
+        self.add([Camera(lens, free[i]) for i in inside])
+        self._enclosures += [enclosures[i] for i in inside]
+
+    @property
+    def interior(self) -> bool:
+        return self._least_enclosed > 0
 
     def add(self, cameras: Sequence[Camera]) -> None:
         nearest = NEAREST * self._space.distance
@@ -284,14 +309,15 @@ class _Views:
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
         solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
         limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
-        self.interior = limit >= SURROUNDED
-        return solid[enclosures[solid] >= AS_SURROUNDED * limit] if self.interior else solid
+        self._least_enclosed = AS_SURROUNDED * limit if limit >= SURROUNDED else 0.0
+        return solid[enclosures[solid] >= self._least_enclosed]
 
-    def seen(self, chosen: Int64[np.ndarray, "k"]) -> Bool[np.ndarray, "n"]:
-        """Tell of each point of the space whether one of the views sees its voxel."""
-        surfaces = [self._surfaces[i] for i in chosen]
-        voxels = np.floor(np.concatenate([*surfaces, np.empty((0, 3))]) / self._voxel).astype(np.int64)
-        return np.isin(self._points, np.unique(_ids(voxels)))
+    def seen(self, chosen: Int64[np.ndarray, "k"]) -> Int64[np.ndarray, "n"]:
+        """Tell of each point of the space how many of the views see its voxel."""
+        own = [np.unique(_ids(np.floor(self._surfaces[i] / self._voxel).astype(np.int64))) for i in chosen]
+        ids = np.concatenate([*own, np.empty(0, np.int64)])
+        at = np.minimum(np.searchsorted(self._voxels, ids), len(self._voxels) - 1)
+        return np.bincount(at[self._voxels[at] == ids], minlength=len(self._voxels))[self._voxel_of]
 
     def cells(self, i: int) -> Int64[np.ndarray, "k"]:
         """Return what a view sees as (voxel, direction of view, octave of distance): what makes pictures alike."""
@@ -372,6 +398,7 @@ def _by_size(
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     targets = space.points[taken]
     distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.4), np.log(1.6), count))
+    distances = np.minimum(distances, 0.9 * space.clear(targets, -directions, float(distances.max())))
     return _looking(targets - distances[:, None] * directions, targets, space.up)
 
 

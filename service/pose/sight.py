@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from service.interfaces import Features, Tools
 from service.pose.index import ViewIndex
 from service.pose.region import excess
-from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, photo_features
+from service.pose.turn import PHOTO_CORNERS, corners, eighths_to_upright
+from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, known_at, photo_at, photo_features, sized
 from service.types import Query
 
 GLIMPSE_SHARE = 0.77
@@ -23,8 +24,6 @@ SAME_SCALE = 1.4
 SCALES_PX = (160, 640)
 GLANCE_PX = 256
 """Of the photo, enough to see whether it could be elsewhere."""
-VOTE_SHARE, CLOSER_LOOKS = 0.5, 2
-"""Of the photo's size, for a first vote on its turn; turns that are voted on in full size."""
 TURN_BIAS = 0.77
 """On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
 ODD_SHRINK = 0.8
@@ -45,16 +44,16 @@ class Sight:
         """Return the photo in another size."""
         return replace(self, long_side=round(share * self.long_side))
 
-    def features(self, query: Query, tools: Tools, share: float = 1.0) -> Features:
-        """Return the photo's features, looked at like this but smaller by `share`, in pixels of `Query.rgb`."""
+    def features(self, query: Query, tools: Tools) -> Features:
+        """Return the photo's features, looked at like this, in pixels of `Query.rgb`."""
         shrink = ODD_SHRINK if self.eighths % 2 else 1.0
-        return photo_features(query, tools, round(self.long_side * shrink * share), self.eighths)
+        return photo_features(query, tools, round(self.long_side * shrink), self.eighths)
 
-    def votes(self, query: Query, tools: Tools, share: float = 1.0) -> Float64[np.ndarray, "views"]:
+    def votes(self, query: Query, tools: Tools) -> Float64[np.ndarray, "views"]:
         """Return how much each view is like the photo, looked at like this; those far from its region are last."""
-        key = ("votes", self.long_side, self.eighths, share)
+        key = ("votes", self.long_side, self.eighths)
         if key not in tools.memo:
-            votes = tools.prepared.votes(self.features(query, tools, share).descriptors)
+            votes = tools.prepared.votes(self.features(query, tools).descriptors)
             tools.memo[key] = _within_reach(votes, query, tools.prepared)
         return tools.memo[key]
 
@@ -71,17 +70,13 @@ def first_sight(query: Query, tools: Tools) -> Sight:
 
 
 def turned_sight(upright: Sight, query: Query, tools: Tools) -> Sight:
-    """Return the photo upright, or turned as the views' votes say.
-
-    Votes on a smaller photo choose the turns that are worth a closer look.
-    """
-    turns = [replace(upright, eighths=eighths) for eighths in range(1, 8)]
-    turns.sort(key=lambda turned: -turned.votes(query, tools, VOTE_SHARE).max())
-    best, most = upright, upright.votes(query, tools).max()
-    for turned in turns[:CLOSER_LOOKS]:
-        if (found := TURN_BIAS * turned.votes(query, tools).max()) > most:
-            best, most = turned, found
-    return best
+    """Return the photo upright, or turned as its corners say, if the views' votes agree."""
+    size = sized(query.intrinsics, PHOTO_PX)
+    found = corners(photo_at(query, tools, size), PHOTO_CORNERS, known_at(query, tools, size))
+    turned = replace(upright, eighths=eighths_to_upright(found, tools.prepared.corners))
+    if turned.eighths and TURN_BIAS * turned.votes(query, tools).max() > upright.votes(query, tools).max():
+        return turned
+    return upright
 
 
 def _same_scale_px(query: Query, index: ViewIndex) -> int:
