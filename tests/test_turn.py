@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from service.pose.turn import MOST_CORNERS, PHOTO_CORNERS, Corners, corners, eighths_to_upright
+from service.pose.turn import MOST_CORNERS, PHOTO_CORNERS, Corners, corners, turns_to_upright
 
 PHOTOS = sorted((Path(__file__).parent.parent / "scenes" / "studio" / "photos").glob("*.jpg"))
 
@@ -35,7 +35,7 @@ def test_a_photo_turned_by_quarters_is_told_how_to_stand(quarters: int, views: C
     """numpy turns counter-clockwise, so the rest of the circle is left."""
     for number in range(len(PHOTOS)):
         turned = np.ascontiguousarray(np.rot90(picture(number), quarters))
-        assert eighths_to_upright(corners(turned, PHOTO_CORNERS), views) == -2 * quarters % 8
+        assert turns_to_upright(corners(turned, PHOTO_CORNERS), views)[0] == -2 * quarters % 8
 
 
 @pytest.mark.parametrize("degrees", [45, 135, 200, 330])
@@ -46,18 +46,18 @@ def test_of_a_photo_turned_by_any_angle_the_nearest_eighth_is_told(degrees: int,
         turned = np.asarray(photo.rotate(degrees, Image.Resampling.BICUBIC, expand=True))
         blank = Image.new("L", photo.size, 255).rotate(degrees, expand=True)
         known = np.asarray(blank) > 0
-        assert eighths_to_upright(corners(turned, PHOTO_CORNERS, known), views) == round(-degrees / 45) % 8
+        assert turns_to_upright(corners(turned, PHOTO_CORNERS, known), views)[0] == round(-degrees / 45) % 8
 
 
 def test_where_nothing_has_corners_nothing_is_turned(views: Corners) -> None:
     blank = corners(np.full((312, 416, 3), 128, np.uint8))
     assert len(blank.directions_deg) == len(blank.descriptors) == 0
-    assert eighths_to_upright(blank, views) == 0
-    assert eighths_to_upright(corners(picture(0), PHOTO_CORNERS), Corners.pooled([blank])) == 0
+    assert turns_to_upright(blank, views) == [0]
+    assert turns_to_upright(corners(picture(0), PHOTO_CORNERS), Corners.pooled([blank])) == [0]
 
 
 def test_of_many_views_some_corners_of_each_are_kept(views: Corners) -> None:
     many = Corners.pooled([views] * 100)
     assert MOST_CORNERS / 2 < len(many.directions_deg) <= MOST_CORNERS
     assert len(many.descriptors) == len(many.directions_deg)
-    assert eighths_to_upright(corners(np.ascontiguousarray(picture(1)[::-1, ::-1]), PHOTO_CORNERS), many) == 4
+    assert turns_to_upright(corners(np.ascontiguousarray(picture(1)[::-1, ::-1]), PHOTO_CORNERS), many)[0] == 4

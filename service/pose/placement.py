@@ -62,7 +62,7 @@ AS_SURROUNDED = 0.6
 RAYS = 32
 LEAVING = 2.0
 """Cells around a point that may belong to the surface it lies on."""
-AT_LEAST, AT_MOST, COVERED = 64, 640, 0.93
+AT_LEAST, AT_MOST, COVERED = 64, 1000, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
 SEEN_AGAIN = 0.25

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from service.interfaces import Features, Tools
 from service.pose.index import ViewIndex
 from service.pose.region import excess
-from service.pose.turn import PHOTO_CORNERS, corners, eighths_to_upright
+from service.pose.turn import PHOTO_CORNERS, corners, turns_to_upright
 from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, known_at, photo_at, photo_features, sized
 from service.types import Query
 
@@ -24,6 +24,8 @@ SAME_SCALE = 1.4
 SCALES_PX = (160, 640)
 GLANCE_PX = 256
 """Of the photo, enough to see whether it could be elsewhere."""
+TURNS = 2
+"""That are looked at, of those that the photo's corners may mean."""
 TURN_BIAS = 0.77
 """On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
 ODD_SHRINK = 0.8
@@ -73,10 +75,13 @@ def turned_sight(upright: Sight, query: Query, tools: Tools) -> Sight:
     """Return the photo upright, or turned as its corners say, if the views' votes agree."""
     size = sized(query.intrinsics, PHOTO_PX)
     found = corners(photo_at(query, tools, size), PHOTO_CORNERS, known_at(query, tools, size))
-    turned = replace(upright, eighths=eighths_to_upright(found, tools.prepared.corners))
-    if turned.eighths and TURN_BIAS * turned.votes(query, tools).max() > upright.votes(query, tools).max():
-        return turned
-    return upright
+    best, most = upright, 0.0
+    for eighths in [turn for turn in turns_to_upright(found, tools.prepared.corners) if turn][:TURNS]:
+        turned = replace(upright, eighths=eighths)
+        votes = TURN_BIAS * turned.votes(query, tools).max()
+        if votes > max(most, upright.votes(query, tools).max()):
+            best, most = turned, votes
+    return best
 
 
 def _same_scale_px(query: Query, index: ViewIndex) -> int:

@@ -21,6 +21,8 @@ MOST_CORNERS = 6400
 CONTRAST = 8
 """Of a corner's pixels with their surroundings, grey levels: dark photos have few of more."""
 
+HARDLY_FEWER = 0.7
+
 
 @dataclass(frozen=True, slots=True)
 class Corners:
@@ -47,11 +49,16 @@ def corners(
     return Corners(directions, np.empty((0, 32), np.uint8) if descriptors is None else np.asarray(descriptors))
 
 
-def eighths_to_upright(photo: Corners, views: Corners) -> int:
-    """Return by how many eighths of a turn, counter-clockwise, the photo must be turned to stand as the views do."""
+def turns_to_upright(photo: Corners, views: Corners) -> list[int]:
+    """Return the eighths of a turn, counter-clockwise, after which the photo may stand as the views do.
+
+    The likeliest is the first; others follow if hardly fewer corners speak for them.
+    """
     if not len(photo.directions_deg) or not len(views.directions_deg):
-        return 0
+        return [0]
     answers = cv2.BFMatcher(cv2.NORM_HAMMING).match(photo.descriptors, views.descriptors)
     own, other = np.array([(answer.queryIdx, answer.trainIdx) for answer in answers]).T
     turn = photo.directions_deg[own] - views.directions_deg[other]
-    return int(np.argmax(np.bincount(np.rint(turn / 45).astype(int) % 8, minlength=8)))
+    counts = np.bincount(np.rint(turn / 45).astype(int) % 8, minlength=8)
+    ranked = np.argsort(-counts, kind="stable")
+    return ranked[counts[ranked] >= HARDLY_FEWER * counts.max()].tolist()
