@@ -299,8 +299,9 @@ def _search(
         return
     if found and found.num_inliers < STRONG:
         found = yield from _rematched(found, query, tools)
-    if found:
-        yield from _aligned(found, query, tools)
+    unsettled = (yield from _aligned(found, query, tools)) if found else None
+    if unsettled:
+        yield from _refined(unsettled, query, tools)
 
 
 def _reflected(sight: Sight, query: Query, tools: Tools, worst: float) -> Iterator[IterationRecord]:
@@ -383,15 +384,20 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
     return found
 
 
-def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
-    """Align on a render, render at the result, align again, until a new render would be the same."""
+def _aligned(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
+    """Align on a render, render at the result, align again, until a new render would be the same.
+
+    Returns where it has come to if that takes too long: a free lens and the distance may creep along together.
+    """
     pose, camera, lens = found.pose, None, found.lens
-    for round_number in range(ALIGNMENTS):
+    for round_number in range(ALIGNMENTS + 1):
         settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
         size_px = FIRST_ALIGNED_PX if camera is None and not query.focal_sigma else None
         frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0, size_px)
         if new_camera is camera:
-            return
+            return None
+        if round_number == ALIGNMENTS:
+            return replace(found, pose=pose, lens=lens)
         camera = new_camera
         size = camera.intrinsics
         start = Camera(query.intrinsics.resized(size.width, size.height), pose)
@@ -401,7 +407,7 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Iterator[Iteration
         result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px))
         tools.memo["aligned"] = result  # for the gate
         if not np.isfinite(result.loss):
-            return
+            return None
         step_deg, step_units = pose_distance(pose, result.pose)
         pose, lens = result.pose, result.lens
         yield IterationRecord(
