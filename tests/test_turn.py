@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from service.pose.turn import MOST_CORNERS, PHOTO_CORNERS, Corners, corners, turns_to_upright
+from service.pose.turn import PHOTO_CORNERS, Corners, corners, turns_to_upright
 
 PHOTOS = sorted((Path(__file__).parent.parent / "scenes" / "studio" / "photos").glob("*.jpg"))
 
@@ -54,10 +54,3 @@ def test_where_nothing_has_corners_nothing_is_turned(views: Corners) -> None:
     assert len(blank.directions_deg) == len(blank.descriptors) == 0
     assert turns_to_upright(blank, views) == [0]
     assert turns_to_upright(corners(picture(0), PHOTO_CORNERS), Corners.pooled([blank])) == [0]
-
-
-def test_of_many_views_some_corners_of_each_are_kept(views: Corners) -> None:
-    many = Corners.pooled([views] * 100)
-    assert MOST_CORNERS / 2 < len(many.directions_deg) <= MOST_CORNERS
-    assert len(many.descriptors) == len(many.directions_deg)
-    assert turns_to_upright(corners(np.ascontiguousarray(picture(1)[::-1, ::-1]), PHOTO_CORNERS), many)[0] == 4

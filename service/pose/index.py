@@ -19,7 +19,7 @@ from service.interfaces import Features, Tools
 from service.pose.mirror import like_its_mirror_image
 from service.pose.retrieval import vote
 from service.pose.rivals import repeats_itself
-from service.pose.turn import Corners, corners
+from service.pose.turn import MOST_CORNERS, VIEW_CORNERS, Corners, corners
 from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, lifted, to_uint8
 from service.types import Camera, Intrinsics, Pose
@@ -64,17 +64,19 @@ def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
-        seen = list(pool.map(lambda camera: _seen(camera, tools), cameras))
-        views = tuple(view for view, _ in seen)
+        every = -(-len(cameras) * VIEW_CORNERS // MOST_CORNERS)
+
+        def seen(number: int) -> tuple[View, Corners | None]:
+            (frame,) = tools.rasterizer.render([cameras[number]])
+            rgb = to_uint8(frame.rgb)
+            view = lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
+            return view, corners(rgb) if number % every == 0 else None
+
+        found = list(pool.map(seen, range(len(cameras))))
+        views = tuple(view for view, _ in found)
         mirrored, repeated = like_its_mirror_image(views, tools, pool), repeats_itself(views, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
-    return ViewIndex(views, Corners.pooled([own for _, own in seen]), mirrored, repeated)
-
-
-def _seen(camera: Camera, tools: Tools) -> tuple[View, Corners]:
-    (frame,) = tools.rasterizer.render([camera])
-    rgb = to_uint8(frame.rgb)
-    return lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, camera), corners(rgb)
+    return ViewIndex(views, Corners.pooled([own for _, own in found if own]), mirrored, repeated)
 
 
 def _key(tools: Tools) -> str:

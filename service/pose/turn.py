@@ -17,11 +17,13 @@ from jaxtyping import Bool, Float32, UInt8
 
 PHOTO_CORNERS, VIEW_CORNERS = 200, 50
 MOST_CORNERS = 6400
-"""Of all views together: in large scenes not every corner of every view is kept."""
+"""Of all views together: in large scenes those of some views must do."""
 CONTRAST = 8
 """Of a corner's pixels with their surroundings, grey levels: dark photos have few of more."""
 
 HARDLY_FEWER = 0.7
+"""Than speak for the likeliest turn. Where the scene placed its views itself, that is the right one for 44 of 58 photos,
+and one of the two likeliest for 50."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,9 +35,10 @@ class Corners:
 
     @classmethod
     def pooled(cls, parts: Sequence[Corners]) -> Corners:
-        directions = np.concatenate([part.directions_deg for part in parts])
-        step = -(-len(directions) // MOST_CORNERS) or 1
-        return cls(directions[::step], np.concatenate([part.descriptors for part in parts])[::step])
+        return cls(
+            np.concatenate([*(part.directions_deg for part in parts), np.empty(0, np.float32)]),
+            np.concatenate([*(part.descriptors for part in parts), np.empty((0, 32), np.uint8)]),
+        )
 
 
 def corners(

@@ -3,7 +3,7 @@
 The steps are in `project` (ellipses and colours), `tiles` (depth order, tile lists), `blend` (the picture) and
 `backward` (gradients); `pack` has the memory layout. Semantics are gsplat's, with two additions: the 0.3 px^2
 screen-space dilation, right at the resolution the scene was trained at, is scaled by (f_render / f_train)^2, which
-takes the bias out of small renders; and whole blocks of 1024 Gaussians outside 1.3 times the field of view are culled.
+takes the bias out of small renders; and whole blocks of 256 Gaussians outside 1.3 times the field of view are culled.
 """
 
 from __future__ import annotations

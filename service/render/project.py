@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.jit import inline, kernel
+from service.render.pack import CHUNKS_PER_BLOCK
 from service.render.simd import (
     as_float,
     as_int,
@@ -143,7 +144,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
     for block in range(spheres.shape[0]):
         if not in_view(spheres[block], view, fx, fy, low_x, high_x, low_y, high_y, near):
             continue
-        for chunk in range(block * 64, min(block * 64 + 64, chunks)):
+        for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
             at = chunk * 160
             mx, my, mz = load(geometry, at), load(geometry, at + 16), load(geometry, at + 32)
             z = fma(mx, r20, fma(my, r21, fma(mz, r22, t2)))
