@@ -22,8 +22,8 @@ CONTRAST = 8
 """Of a corner's pixels with their surroundings, grey levels: dark photos have few of more."""
 
 HARDLY_FEWER = 0.7
-"""Than speak for the likeliest turn. Where the scene placed its views itself, that is right for 44 of 58 photos, and one
-of the two likeliest for 50."""
+"""Than speak for the likeliest turn. Where the scene placed its views itself, that is right for 44 of 58 photos, and
+one of the two likeliest for 50."""
 
 
 @dataclass(frozen=True, slots=True)
