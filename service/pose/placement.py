@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
+from service.jit import kernel
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 MIN_OPACITY = 0.3
@@ -192,16 +193,33 @@ class _Space:
         self, points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], reach: float
     ) -> Float64[np.ndarray, "n"]:
         """Return how far one gets from points of surfaces before Gaussians are in the way, at most `reach`."""
-        steps = np.arange(LEAVING, max(reach / self.cell, LEAVING + 1)) * self.cell
-        met = self.occupied(points + steps[:, None, None] * directions)
-        met[-1] = True
-        return np.minimum(steps[met.argmax(0)], reach)
+        starts = (points - self.low) / self.cell
+        steps = _steps_in_the_clear(self.filled, starts, directions, LEAVING, max(0, round(reach / self.cell)))
+        return np.minimum((LEAVING + steps) * self.cell, reach)
 
     def enclosure(self, position: Float64[np.ndarray, "3"]) -> float:
         """Return the share of all directions in which something is met within the grid."""
-        steps = np.arange(1.5, np.linalg.norm(self.filled.shape)) * self.cell
-        along = position + steps[:, None, None] * _lattice(RAYS)
-        return float(self.occupied(along).any(0).mean())
+        starts = np.tile((position - self.low) / self.cell, (RAYS, 1))
+        most = int(np.linalg.norm(self.filled.shape))
+        return float((_steps_in_the_clear(self.filled, starts, _lattice(RAYS), LEAVING, most) < most).mean())
+
+
+@kernel
+def _steps_in_the_clear(filled, starts, directions, first, most):
+    """Return how many steps of a cell each one gets, from `first` cells away on, before a filled one, or `most`."""
+    steps = np.empty(len(starts), np.int64)
+    for i in range(len(starts)):
+        steps[i] = most
+        for k in range(most):
+            away = first + k
+            x = int(np.floor(starts[i, 0] + away * directions[i, 0]))
+            y = int(np.floor(starts[i, 1] + away * directions[i, 1]))
+            z = int(np.floor(starts[i, 2] + away * directions[i, 2]))
+            inside = min(x, y, z) >= 0 and x < filled.shape[0] and y < filled.shape[1] and z < filled.shape[2]
+            if inside and filled[x, y, z]:
+                steps[i] = k
+                break
+    return steps
 
 
 def _survey(scene: GaussianScene) -> _Space:
