@@ -225,6 +225,17 @@ def test_what_a_small_photo_does_not_show_is_looked_for_in_its_full_size(room: L
     assert not stages & {"further", "turn", "sample"}
 
 
+def test_an_alignment_that_does_not_settle_is_followed_by_another_match(
+    room: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here it would settle with one more."""
+    monkeypatch.setattr("service.estimators.view_index.ALIGNMENTS", 1)
+    found = localize(photo_at(room, unseen_pose(4)), room)
+    stages = [record.stage for record in found.records]
+    assert stages[stages.index("align") + 1] == "rematch"
+    assert_near(found.pose, unseen_pose(4))
+
+
 def test_a_photo_half_hidden_is_found_or_refused_but_never_wrong(room: LoadedScene) -> None:
     truth = unseen_pose(5)
     query = photo_at(room, truth)

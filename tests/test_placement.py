@@ -10,7 +10,7 @@ import pytest
 from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
 from service.interfaces import Frame
-from service.pose.placement import _thinned, coverage, find_views, floaters, search_lens, solidity
+from service.pose.placement import _steps_in_the_clear, _thinned, coverage, find_views, floaters, search_lens, solidity
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
 
@@ -28,6 +28,19 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         ("AT_LEAST", 16),
     ):
         monkeypatch.setattr(f"service.pose.placement.{name}", count)
+
+
+def test_steps_end_before_what_is_filled_and_nothing_is_outside() -> None:
+    """By hand, in a grid of ten cells a side with a wall at x = 7."""
+    filled = np.zeros((10, 10, 10), bool)
+    filled[7] = True
+    starts = np.array([[2.5, 5.5, 5.5]] * 4)
+    diagonal = np.array([1.0, 1.0, 0.0]) / np.sqrt(2)
+    directions = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 0, 1], diagonal])
+    # Two cells away is x = 4.5, three steps on 7.5; on the diagonal the grid ends at y = 10, where x is 7: not met.
+    assert _steps_in_the_clear(filled, starts, directions, 2.0, 50).tolist() == [3, 50, 50, 50]
+    assert _steps_in_the_clear(filled, starts, directions, 2.0, 2).tolist() == [2, 2, 2, 2]
+    assert _steps_in_the_clear(filled, starts, directions, 5.0, 50).tolist() == [0, 50, 50, 50]
 
 
 def closed_room(count: int = COUNT) -> GaussianScene:
