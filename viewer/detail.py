@@ -164,7 +164,7 @@ class Detail:
     ) -> UInt8[np.ndarray, "a b 3"]:
         """Return photo and render in one picture; the last few are kept."""
         mode, by, weight = self.mode, self._colour_by, self._panel.weight.value
-        key = feed.id, record.index, mode, by, weight, self._with_lines
+        key = feed.id, feed.complete, record.index, mode, by, weight, self._with_lines
         if key not in self._composed:
             render = self._render(feed, record, view)
             if mode == "beside":
