@@ -121,9 +121,13 @@ class Detail:
     def _prepare(self, feed: JobFeed, record: IterationRecord) -> None:
         """Have at hand the picture of a step."""
         with suppress(ServiceTrouble, ValueError):
-            photo = _photo(feed, record)
-            if photo is not None and self.mode != "flicker":
-                self._compared(feed, record, self._view(feed, record), photo)
+            photo, view = _photo(feed, record), self._view(feed, record)
+            if photo is None:
+                feed.render(record.index, matched=False)
+            elif self.mode == "flicker":
+                self._render(feed, record, view)
+            else:
+                self._compared(feed, record, view, photo)
 
     def _view(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
         """Return the match vectors as the step sees them."""

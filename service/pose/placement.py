@@ -62,7 +62,7 @@ AS_SURROUNDED = 0.6
 """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
 RAYS = 32
 LEAVING = 2.0
-"""Cells around a point that may belong to the surface it lies on."""
+"""Cells around a point that are of the surface it lies on, or just there."""
 AT_LEAST, AT_MOST, COVERED = 64, 1000, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
