@@ -6,7 +6,7 @@
     -> verification gate -> does the mirror image fit better? Do many matches agree elsewhere, and is that as good?
 
 At first the photo is looked at in a small size. Only if the gate doesn't accept the answer the dearer searches are
-tried: in its full size, turned as its corners tell; larger still, with further views; then poses sampled near the views.
+tried: in its full size, turned as its corners tell; larger still, with further views; then poses sampled near views.
 From a prior pose alignment is tried at once; where that fails it is one more candidate view. Sizes and rounds are the
 research's; numbers that were measured stand beside the constants.
 """
