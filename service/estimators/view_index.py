@@ -93,6 +93,8 @@ UNMENDABLE = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_
 """Doubts about a pose at which photo and render agree: no other search knows better."""
 FIRST_ALIGNED_PX = 256
 """Long side of the first render that is aligned: it is as good as the big one at bringing the pose near."""
+ASTRAY_DEG = 10.0
+"""An alignment that turns the camera by more, away from a pose with many matches, is wrong."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
 DECOUPLED_STEPS = 8
@@ -360,9 +362,11 @@ def _matched(
 
 
 def _refined(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
-    """Match again, and align."""
-    if again := (yield from _rematched(found, query, tools)):
-        yield from _aligned(again, query, tools)
+    """Match again, and align; where that goes astray the matches have the last word."""
+    again = yield from _rematched(found, query, tools)
+    unsettled = (yield from _aligned(again, query, tools)) if again else None
+    if again and unsettled is again:
+        yield IterationRecord("align", again.pose, again.lens, num_inliers=again.num_inliers)
 
 
 def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
@@ -387,7 +391,8 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
 def _aligned(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
     """Align on a render, render at the result, align again, until a new render would be the same.
 
-    Returns where it has come to if that takes too long: a free lens and the distance may creep along together.
+    Returns where to match again: where it has come to if that takes too long (a free lens and the distance may creep
+    along together), where it began if it goes astray.
     """
     pose, camera, lens = found.pose, None, found.lens
     for round_number in range(ALIGNMENTS + 1):
@@ -406,8 +411,9 @@ def _aligned(found: Resection, query: Query, tools: Tools) -> Generator[Iteratio
         known = known_at(query, tools, size)
         result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px))
         tools.memo["aligned"] = result  # for the gate
-        if not np.isfinite(result.loss):
-            return None
+        astray = found.num_inliers >= GOOD_MATCH and pose_distance(found.pose, result.pose)[0] > ASTRAY_DEG
+        if astray or not np.isfinite(result.loss):
+            return found if found.num_inliers >= GOOD_MATCH else None
         step_deg, step_units = pose_distance(pose, result.pose)
         pose, lens = result.pose, result.lens
         yield IterationRecord(
