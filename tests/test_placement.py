@@ -10,7 +10,8 @@ import pytest
 from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
 from service.interfaces import Frame
-from service.pose.placement import _steps_in_the_clear, _thinned, coverage, find_views, floaters, search_lens, solidity
+from service.pose.placement import _thinned, coverage, find_views, floaters, search_lens, solidity
+from service.pose.space import _steps_in_the_clear
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
 

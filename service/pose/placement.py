@@ -25,15 +25,9 @@ from jaxtyping import Bool, Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
-from service.jit import kernel
+from service.pose.space import MIN_OPACITY, Space, lattice, survey
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
-MIN_OPACITY = 0.3
-MAX_POINTS = 400_000
-CELLS = 400_000
-"""Of the grid, at most, in the middle 98 % of the volume."""
-POINTS_PER_CELL = 4
-"""On the six sides of a cube of cells: fewer cells, if there are not enough points to close a wall."""
 SEARCH_GAUSSIANS = 200_000
 """More are thinned for the search: a view of 64 px doesn't show the difference."""
 SEARCH_PX = 64
@@ -42,16 +36,9 @@ SHELLS = (1.2, 2.0, 3.4, 5.0)
 """Radii, in units of the radius that holds half of the opaque Gaussians."""
 SHELL_CANDIDATES, VOLUME_CANDIDATES, SIZE_CANDIDATES = 40, 150, 100
 BEST, OFFSPRING = 50, 4
-GAUSSIAN_PX = 1.2
-"""Middle one of the median Gaussian's three sizes in its training photos; 0.5 to 2.4 in seven scenes."""
-ASSUMED_FOCAL_PX = 1000.0
-COARSE_RADII = (2.0, 5.0)
-"""Radii of the scene that the typical distance, and any, is at most: scenes of few, large Gaussians look far away."""
 NEAREST = 0.06
 """What is nearer than this share of the typical distance is in the way."""
 ROUNDS, ROUND_CANDIDATES = 24, 150
-ENOUGH_GOOD, GOOD_PER_AREA = (200, 1200), 40
-"""Good views to look for: so many for each square of the typical distance that the surfaces have."""
 WIDE_TURN = 0.8
 ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
 """Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
@@ -60,9 +47,6 @@ LEAST_SEEN = 0.25
 SURROUNDED = 0.7
 AS_SURROUNDED = 0.6
 """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
-RAYS = 32
-LEAVING = 2.0
-"""Cells around a point that are of the surface it lies on, or just there."""
 AT_LEAST, AT_MOST, COVERED = 64, 1000, 0.93
 FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
 """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
@@ -87,7 +71,7 @@ class Placement:
 
 def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Placement:
     """Find places from which the scene looks as it did to the cameras that it was trained with."""
-    space = _survey(scene)
+    space = survey(scene)
     search = _thinned(scene, rasterizer, rng)
     views = _Views(space, search)
     views.judge(_shells(space) + _in_volume(space, rng) + _by_size(space, rng, SIZE_CANDIDATES))
@@ -115,7 +99,7 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
 
 def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
     """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
-    views = _Views(_survey(scene), _thinned(scene, rasterizer, np.random.default_rng(0)))
+    views = _Views(survey(scene), _thinned(scene, rasterizer, np.random.default_rng(0)))
     views.add([Camera(camera.intrinsics.with_long_side(SEARCH_PX), camera.pose) for camera in cameras])
     return _covered(views.seen(np.arange(len(cameras))))
 
@@ -127,7 +111,7 @@ def _covered(seen: Int64[np.ndarray, "n"]) -> float:
 
 def floaters(scene: GaussianScene) -> float:
     """Return the share of the opaque Gaussians that have hardly any others around: no surface, but haze."""
-    space = _survey(scene)
+    space = survey(scene)
     size = FLOATER_REACH * space.distance
     cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
     ids = _ids(cells)
@@ -159,103 +143,6 @@ def search_lens(long_side: int) -> Intrinsics:
     return Intrinsics(long_side, height, focal, focal, 0.5 * long_side, 0.5 * height)
 
 
-@dataclass(frozen=True, slots=True)
-class _Space:
-    """The opaque Gaussians, at most MAX_POINTS, and a grid over the middle 98 % of them."""
-
-    points: Float64[np.ndarray, "n 3"]
-    distances: Float64[np.ndarray, "n"]
-    """From which each was photographed, by its size."""
-    low: Float64[np.ndarray, "3"]
-    cell: float
-    filled: Bool[np.ndarray, "x y z"]
-    middle: Float64[np.ndarray, "3"]
-    radius: float
-    """Holds half of the points."""
-    up: Float64[np.ndarray, "3"]
-    distance: float
-    """The typical one."""
-
-    @property
-    def enough(self) -> float:
-        """How many good views are looked for."""
-        area = self.filled.sum() * self.cell**2
-        return float(np.clip(GOOD_PER_AREA * area / self.distance**2, *ENOUGH_GOOD))
-
-    def occupied(self, positions: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Whether Gaussians are there; outside the grid there are none."""
-        index = np.floor((positions - self.low) / self.cell).astype(int)
-        inside = np.all((index >= 0) & (index < self.filled.shape), axis=-1)
-        x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
-        return inside & self.filled[x, y, z]
-
-    def clear(
-        self, points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], reach: float
-    ) -> Float64[np.ndarray, "n"]:
-        """Return how far one gets from points of surfaces before Gaussians are in the way, at most `reach`."""
-        starts = (points - self.low) / self.cell
-        steps = _steps_in_the_clear(self.filled, starts, directions, LEAVING, max(0, round(reach / self.cell)))
-        return np.minimum((LEAVING + steps) * self.cell, reach)
-
-    def enclosure(self, position: Float64[np.ndarray, "3"]) -> float:
-        """Return the share of all directions in which something is met within the grid."""
-        starts = np.tile((position - self.low) / self.cell, (RAYS, 1))
-        most = int(np.linalg.norm(self.filled.shape))
-        return float((_steps_in_the_clear(self.filled, starts, _lattice(RAYS), LEAVING, most) < most).mean())
-
-
-@kernel
-def _steps_in_the_clear(filled, starts, directions, first, most):
-    """Return how many steps of a cell each one gets, from `first` cells away on, before a filled one, or `most`."""
-    steps = np.empty(len(starts), np.int64)
-    for i in range(len(starts)):
-        steps[i] = most
-        for k in range(most):
-            away = first + k
-            x = int(np.floor(starts[i, 0] + away * directions[i, 0]))
-            y = int(np.floor(starts[i, 1] + away * directions[i, 1]))
-            z = int(np.floor(starts[i, 2] + away * directions[i, 2]))
-            inside = min(x, y, z) >= 0 and x < filled.shape[0] and y < filled.shape[1] and z < filled.shape[2]
-            if inside and filled[x, y, z]:
-                steps[i] = k
-                break
-    return steps
-
-
-def _survey(scene: GaussianScene) -> _Space:
-    opaque = np.flatnonzero(scene.opacities > MIN_OPACITY)
-    opaque = opaque if len(opaque) else np.arange(scene.count)
-    opaque = opaque[:: -(-len(opaque) // MAX_POINTS)]
-    points = scene.means[opaque].astype(np.float64)
-    sizes = np.sort(scene.scales[opaque].astype(np.float64), axis=1)[:, 1]  # long and thin ones: how fine they are
-    sizes = np.clip(sizes, *np.quantile(sizes, [0.1, 0.9]))
-    info = scene.info
-    focal = info.training_focal_px or info.training_long_side_px or ASSUMED_FOCAL_PX
-    low, high = np.quantile(points, [0.01, 0.99], axis=0)
-    low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
-    cells = min(CELLS, (len(points) / (6 * POINTS_PER_CELL)) ** 1.5)
-    cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / cells)), 1e-9)
-    shape = np.floor((high - low) / cell).astype(int) + 1
-    index = np.floor((points - low) / cell).astype(int)
-    index = index[np.all((index >= 0) & (index < shape), axis=1)]
-    counts = np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape)))
-    middle = np.median(points, axis=0)
-    radius = float(np.median(np.linalg.norm(points - middle, axis=1)))
-    up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
-    distances = np.clip(sizes * focal / GAUSSIAN_PX, 1e-9, max(COARSE_RADII[1] * radius, 1e-9))
-    return _Space(
-        points,
-        distances,
-        low,
-        cell,
-        (counts >= 2).reshape(shape),
-        middle,
-        radius,
-        up,
-        float(min(np.median(distances), COARSE_RADII[0] * radius)),
-    )
-
-
 def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
     """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
 
@@ -283,7 +170,7 @@ def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Genera
 class _Views:
     """Candidates, how solid each is, and what it sees of the scene."""
 
-    def __init__(self, space: _Space, rasterizer: Rasterizer) -> None:
+    def __init__(self, space: Space, rasterizer: Rasterizer) -> None:
         self.poses: list[Pose] = []
         self.scores: list[float] = []
         self._enclosures: list[float] = []
@@ -382,22 +269,14 @@ def _choice(cells: Sequence[Int64[np.ndarray, "_"]]) -> Int64[np.ndarray, "k"]:
     return np.array(chosen, int)
 
 
-def _shells(space: _Space) -> list[Pose]:
+def _shells(space: Space) -> list[Pose]:
     """Look at the middle from all around."""
     middle, radius = space.middle, space.radius
-    directions = _lattice(SHELL_CANDIDATES)
+    directions = lattice(SHELL_CANDIDATES)
     return [look_at(middle + factor * radius * d, middle, space.up) for factor in SHELLS for d in directions]
 
 
-def _lattice(count: int) -> Float64[np.ndarray, "n 3"]:
-    """Return evenly spread directions (a Fibonacci lattice)."""
-    i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5.0)) * i
-    ring = np.sqrt(1 - z * z)
-    return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], 1)
-
-
-def _in_volume(space: _Space, rng: np.random.Generator) -> list[Pose]:
+def _in_volume(space: Space, rng: np.random.Generator) -> list[Pose]:
     """Look from random places in the volume towards random Gaussians."""
     low, high = np.quantile(space.points, [0.05, 0.95], axis=0)
     positions = rng.uniform(low, high, (VOLUME_CANDIDATES, 3))
@@ -406,7 +285,7 @@ def _in_volume(space: _Space, rng: np.random.Generator) -> list[Pose]:
 
 
 def _by_size(
-    space: _Space, rng: np.random.Generator, count: int, wanted: Bool[np.ndarray, "n"] | None = None
+    space: Space, rng: np.random.Generator, count: int, wanted: Bool[np.ndarray, "n"] | None = None
 ) -> list[Pose]:
     """Look at random Gaussians, of those wanted, from about as far as their sizes tell; rather level than not."""
     among = np.arange(len(space.points)) if wanted is None else np.flatnonzero(wanted)
@@ -426,7 +305,7 @@ def _looking(
     return [look_at(p, t, up) for p, t in zip(positions, targets, strict=True) if np.any(p != t)]
 
 
-def _jittered(pose: Pose, space: _Space, rng: np.random.Generator, turn: float = 0.25) -> Pose:
+def _jittered(pose: Pose, space: Space, rng: np.random.Generator, turn: float = 0.25) -> Pose:
     """Move a pose a little and turn it, by some 15 degrees if not said otherwise; upright again."""
     reach = 0.3 * min(space.radius, space.distance)
     position = pose.position_in_world + reach * rng.uniform(-1, 1, 3)
