@@ -391,11 +391,11 @@ def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterat
 def _aligned(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
     """Align on a render, render at the result, align again, until a new render would be the same.
 
-    Returns where to match again: where it has come to if that takes too long (a free lens and the distance may creep
-    along together), where it began if it goes astray.
+    Returns where to match again: where a free lens and the distance have come to if they creep along together for too
+    long, where it began if it goes astray.
     """
     pose, camera, lens = found.pose, None, found.lens
-    for round_number in range(ALIGNMENTS + 1):
+    for round_number in range(ALIGNMENTS + bool(query.focal_sigma)):
         settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
         size_px = FIRST_ALIGNED_PX if camera is None and not query.focal_sigma else None
         frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0, size_px)
