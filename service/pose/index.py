@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 class ViewIndex:
     views: tuple[View, ...]
     corners: Corners
-    """Of all views; see pose/turn.py."""
+    """Of views from everywhere; see pose/turn.py."""
     like_its_mirror_image: bool = False
     """Whether a mirrored photo of the scene may pass for one of the scene; see pose/mirror.py."""
     repeats_itself: bool = True

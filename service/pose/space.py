@@ -25,7 +25,7 @@ ENOUGH_GOOD, GOOD_PER_AREA = (200, 1200), 40
 """Good views to look for: so many for each square of the typical distance that the surfaces have."""
 RAYS = 32
 LEAVING = 2.0
-"""Cells around a point that are of the surface it lies on, or just there."""
+"""Cells next to where a march begins that are not looked at: they may be of the surface that it leaves."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,7 @@
 Each corner of the photo is answered by the most similar one of all views, which are upright. Many answers are wrong,
 but even those are mostly of the same kind of thing: edges of tables lie level, those of walls stand. So the commonest
 difference of directions is the photo's turn: of the 58 clean test photos, turned by seven angles, darkened, blurred
-or with noise, it is never the wrong eighth; of those cropped to a half of the field of view, for one in ten.
+or with noise, it is never the wrong eighth; of those cropped to half of the field of view, for 9.
 """
 
 from __future__ import annotations
