@@ -58,8 +58,17 @@ class Rasterizer(Protocol):
         """Return a rasterizer of the same Gaussians, in the same memory, as if trained on photos of this size."""
         ...
 
-    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
-        """Render several cameras; independent ones may use idle cores."""
+    def render(
+        self,
+        cameras: Sequence[Camera],
+        roughly: bool = False,
+        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+    ) -> list[Frame]:
+        """Render several cameras; independent ones may use idle cores.
+
+        A rough picture may lack what is behind nearly opaque surfaces, up to 3 % of a pixel's light. A horizon is a
+        coarse image, for each camera one, of the z-depths beyond which nothing need be drawn.
+        """
         ...
 
     def pose_gradient(

@@ -9,9 +9,12 @@ import pytest
 
 from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
-from service.interfaces import Frame
-from service.pose.placement import _thinned, coverage, find_views, floaters, search_lens, solidity
+from service.interfaces import Frame, Tools
+from service.matchers import MATCHERS
+from service.pose.index import built_index
+from service.pose.placement import coverage, find_views, floaters, search_lens, solidity
 from service.pose.space import _steps_in_the_clear
+from service.pose.thin import BEHIND, horizon, thinned
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
 
@@ -150,10 +153,10 @@ def test_coverage_is_the_share_that_is_seen() -> None:
 
 
 def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.pose.placement.SEARCH_GAUSSIANS", 8000)
+    monkeypatch.setattr("service.pose.thin.ENOUGH", 8000)
     scene = closed_room(40_000)
     whole = CpuRasterizer(scene)
-    thin = _thinned(scene, whole, np.random.default_rng(0))
+    thin = thinned(scene, whole, np.random.default_rng(0))
     assert isinstance(thin, CpuRasterizer)
     assert thin.scene.count == pytest.approx(8000, rel=0.05)
     up = np.array([0.0, 0.0, 1.0])
@@ -161,3 +164,50 @@ def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch
     a, b = whole.render([camera])[0], thin.render([camera])[0]
     assert b.alpha.mean() > 0.95 * a.alpha.mean()
     assert np.median(np.abs(a.median_depth - b.median_depth) / a.median_depth) < 0.08
+
+
+def test_a_horizon_lies_behind_what_hides_and_nowhere_where_one_sees_through() -> None:
+    """A wall at 3 with a gap, half of a nearer board before it; by hand."""
+    alpha, depth = np.ones((8, 12), np.float32), np.full((8, 12), 3.0, np.float32)
+    depth[:, :4] = 2.0
+    alpha[:, 10] = 0.5
+    found = horizon(Frame(np.zeros((8, 12, 3), np.float32), alpha, depth, depth))
+    assert np.allclose(found[:, :3], 2 * BEHIND)
+    assert np.allclose(found[:, 3:9], 3 * BEHIND)  # column 3 looks past the board's edge
+    assert np.all(np.isinf(found[:, 9:]))
+
+
+class Watched(CpuRasterizer):
+    """Keeps what it drew with horizons, and of how many Gaussians."""
+
+    def __init__(self, scene: GaussianScene) -> None:
+        super().__init__(scene)
+        self.drawn: list[tuple[np.ndarray, int]] = []
+
+    def of(self, scene: GaussianScene) -> CpuRasterizer:
+        return CpuRasterizer(scene)
+
+    def render(self, cameras, roughly=False, horizons=None):
+        frames = super().render(cameras, roughly, horizons)
+        if horizons:
+            self.drawn.append((frames[0].rgb, self._scratch().visible))
+        return frames
+
+
+def test_views_of_a_large_scene_show_all_that_is_seen_but_not_what_walls_hide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A room with a second one behind its wall, of whose Gaussians not one has to be drawn."""
+    monkeypatch.setattr("service.pose.thin.ENOUGH", 20_000)
+    monkeypatch.setattr("service.pose.thin.LARGE", 30_000)
+    room = closed_room(30_000)
+    scene = joined(room, changed(room, 1.0, (2.2 * ROOM[0], 0.0, 0.0)))
+    eye, up = np.array([-0.5, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])
+    camera = Camera(search_lens(160), look_at(eye, eye + np.array([1.0, 0.1, -0.1]), up))
+    watched, alone = Watched(scene), CpuRasterizer(room)
+    built_index([camera], Tools(scene, watched, MATCHERS.load("sift").create(), np.random.default_rng(0)))
+    ((rgb, drawn),) = watched.drawn
+    truth = alone.render([camera])[0].rgb
+    visible = alone._scratch().visible
+    watched.render([camera])
+    assert watched._scratch().visible > 1.3 * visible
+    assert drawn <= visible
+    assert np.abs(rgb - truth).mean() < 0.01

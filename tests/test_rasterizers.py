@@ -17,7 +17,7 @@ import torch
 from service.geometry import look_at, moved, se3_exp
 from service.interfaces import Frame, Rasterizer
 from service.render import RASTERIZERS
-from service.render.cpu import dilation_for
+from service.render.cpu import CpuRasterizer, dilation_for
 from service.render.gsplat_cuda import GsplatRasterizer
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
@@ -106,6 +106,53 @@ def test_picture_equals_the_reference(create, degree, antialiased):
         close(frame.alpha, truth.alpha)
         close(frame.depth, truth.depth, scale=2.0)
         close(frame.median_depth, truth.median_depth, scale=2.0)
+
+
+def small_gaussians() -> GaussianScene:
+    scene = make_scene(3000)
+    return replace(scene, scales=0.4 * scene.scales)
+
+
+@pytest.mark.parametrize("depth", [1.0, 1.6, 2.2])
+def test_nothing_is_drawn_beyond_the_same_horizon_everywhere(depth):
+    """Against the reference without what is farther; on the CPU, for a renderer need not leave anything out."""
+    scene, camera = small_gaussians(), make_camera()
+    z = scene.means @ camera.pose.camera_from_world[2, :3] + camera.pose.camera_from_world[2, 3]
+    near = z <= depth
+    fewer = {n: getattr(scene, n)[near] for n in ("means", "quats", "scales", "opacities", "sh")}
+    horizon = np.full((5, 7), depth, np.float32)
+    frame = CpuRasterizer(scene).render([camera], horizons=[horizon])[0]
+    truth = render_reference(replace(scene, **fewer), camera)
+    assert (truth.alpha > 0.1).sum() > 200
+    close(frame.rgb, truth.rgb)
+    close(frame.depth, truth.depth, scale=2.0)
+
+
+def test_an_open_tile_shows_everything():
+    """The left half is open as far as there is something, the right half only to 0.5."""
+    scene, camera = small_gaussians(), make_camera(96, 64)
+    horizon = np.full((8, 12), np.inf, np.float32)
+    horizon[:, 6:] = 0.5
+    frame = CpuRasterizer(scene).render([camera], horizons=[horizon])[0]
+    truth = render_reference(scene, camera)
+    close(frame.rgb[:, :48], truth.rgb[:, :48])
+    assert np.abs(frame.rgb - truth.rgb.numpy())[:, 48:].mean() > 0.02
+
+
+def test_a_rough_picture_lacks_at_most_what_little_light_is_left(create):
+    """Three in a hundred of a pixel's light; and gradients are not those of a rough picture."""
+    scene = make_scene(3000)
+    camera = make_camera()
+    rasterizer = create(scene)
+    rough = rasterizer.render([camera], roughly=True)[0]
+    d_rgb = np.ones_like(rough.rgb)
+    after_rough = rasterizer.pose_gradient(camera, d_rgb)
+    truth = render_reference(scene, camera)
+    assert np.all(rough.alpha > truth.alpha.numpy() - 0.031)
+    assert np.all(np.abs(rough.rgb - truth.rgb.numpy()) < 0.031 * max(1.0, float(truth.rgb.max())))
+    assert rasterizer.name != "cpu" or np.any(rough.alpha < truth.alpha.numpy() - 0.005)
+    rasterizer.render([camera])
+    assert np.allclose(after_rough, rasterizer.pose_gradient(camera, d_rgb), rtol=1e-6)
 
 
 def test_picture_equals_gsplats_projection_and_harmonics(create):

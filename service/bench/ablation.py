@@ -1,7 +1,8 @@
 """`splatfix bench ablation`: what each part of the default estimator contributes, each removed in turn.
 
-Every third photo of each scene, as it is and spoilt in several ways; the index of views is always the whole one's. A
-part is removed by putting something simpler in its place for the time of a run: the estimator has no switches for it.
+Every photo of each scene, as it is and spoilt in several ways, and with the scene's cameras ignored; the index of views
+is always the whole estimator's. A part is removed by putting something simpler in its place for the time of a run: the
+estimator has no switches for it.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from service.bench.localize import Subject, Trial, answered, subject, trials_of
 from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
-from service.localize import Request
+from service.localize import DEFAULT_ESTIMATOR, Request
 from service.pose import alignment, pyramid, sight
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
@@ -27,13 +28,12 @@ from service.pose.views import Correspondences
 from service.render import cpu
 from service.types import IterationRecord, Query
 
-EVERY = 3
 CONDITIONS = {
-    "clean": (), "gain 0.7": ("gain=0.7",), "roll 45": ("roll=45",), "crop 0.5": ("crop=0.5",),
-    "occlusion 0.35": ("occlusion=0.35",), "focal 5 % off": ("focal=1.05",),
+    "clean": (), "gain 1.4": ("gain=1.4",), "roll 45": ("roll=45",), "crop 0.5": ("crop=0.5",),
+    "occlusion 0.35": ("occlusion=0.35",), "focal 5 % off": ("focal=1.05",), "bare scene": (),
 }  # fmt: skip
-APPROXIMATE = "focal 5 % off"
-"""The condition whose focal length is told to be approximate."""
+APPROXIMATE, BARE = "focal 5 % off", "bare scene"
+"""The condition whose focal length is told to be approximate, and the one whose scene comes without cameras."""
 
 
 DEFAULTS = view_index.Options()
@@ -75,6 +75,8 @@ def removals() -> dict[str, Removal]:
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
         "decoupled solver (PnP again instead)": Removal(((v, "_solved_near", _resected_again),)),
+        "look in the mirror": Removal(((v._Hunt, "reflect", _nothing),)),
+        "look elsewhere": Removal(((v._Hunt, "contest", _nothing),)),
     }
 
 
@@ -96,10 +98,11 @@ def run(
     chosen = {part: known[part] for part in parts or known}
     outcomes: dict[tuple[str, str], list[Outcome]] = {(p, c): [] for p in chosen for c in CONDITIONS}
     for number, folder in enumerate(folders):
-        one = subject(folder, cache_dir=cache_dir)
-        one = replace(one, photos=one.photos[::EVERY])
-        one.loaded.prepare(view_index.__name__.rsplit(".", 1)[-1])
+        with_cameras = subject(folder, cache_dir=cache_dir)
+        bare = subject(folder, cameras="ignored", cache_dir=cache_dir)
         for i, (condition, modify) in enumerate(CONDITIONS.items()):
+            one = bare if condition == BARE else with_cameras
+            one.loaded.prepare(DEFAULT_ESTIMATOR)
             trials = list(trials_of(one, "none", len(one.photos), 0, modify, folders[(number + 1) % len(folders)]))
             for part, removal in chosen.items():
                 outcomes[part, condition] += _outcomes(one, trials, removal, condition)
@@ -111,7 +114,8 @@ def run(
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Return the rows as a Markdown table: how many are within 5 deg / 0.05 and 1 deg / 0.01, and CPU time."""
     cells = {(row["part"], row["condition"]): row for row in rows}
-    lines = ["| without | " + " | ".join(CONDITIONS) + " | false | CPU ms, clean |", "| --- |" + " --- |" * 8]
+    lines = ["| without | " + " | ".join(CONDITIONS) + " | false | CPU ms, clean |"]
+    lines.append("| --- |" + " --- |" * (len(CONDITIONS) + 2))
     for part in dict.fromkeys(row["part"] for row in rows):
         own = [cells[part, condition] for condition in CONDITIONS]
         counts = [f"{row['success_5deg_0p05']} / {row['success_1deg_0p01']}" for row in own]
@@ -208,6 +212,10 @@ def _fixed_dilation(camera: Any, info: Any) -> float:
 
 def _no_glance(*others: Any) -> None:
     return None
+
+
+def _nothing(*others: Any) -> Iterator[IterationRecord]:
+    return iter(())
 
 
 def _resected_again(near: Resection, matches: Correspondences, query: Query) -> Resection | None:

@@ -19,12 +19,13 @@ from service.interfaces import Features, Tools
 from service.pose.mirror import like_its_mirror_image
 from service.pose.retrieval import vote
 from service.pose.rivals import repeats_itself
+from service.pose.thin import Rough
 from service.pose.turn import MOST_CORNERS, VIEW_CORNERS, Corners, corners
 from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, lifted, to_uint8
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 7
+VERSION = 8
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 
@@ -65,9 +66,10 @@ def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
         every = -(-len(cameras) * VIEW_CORNERS // MOST_CORNERS)
+        rough = Rough(tools.scene, tools.rasterizer, tools.rng)
 
         def seen(number: int) -> tuple[View, Corners | None]:
-            (frame,) = tools.rasterizer.render([cameras[number]])
+            frame = rough.render(cameras[number])
             rgb = to_uint8(frame.rgb)
             view = lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
             return view, corners(rgb) if number % every == 0 else None

@@ -18,7 +18,7 @@ are surrounded by the scene, one that isn't looks at the outside of its walls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -26,10 +26,9 @@ from jaxtyping import Bool, Float64, Int64
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
 from service.pose.space import MIN_OPACITY, Space, lattice, survey
+from service.pose.thin import thinned
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
-SEARCH_GAUSSIANS = 200_000
-"""More are thinned for the search: a view of 64 px doesn't show the difference."""
 SEARCH_PX = 64
 SEARCH_FOV_DEG = 60.0
 SHELLS = (1.2, 2.0, 3.4, 5.0)
@@ -72,7 +71,7 @@ class Placement:
 def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Placement:
     """Find places from which the scene looks as it did to the cameras that it was trained with."""
     space = survey(scene)
-    search = _thinned(scene, rasterizer, rng)
+    search = thinned(scene, rasterizer, rng)
     views = _Views(space, search)
     views.judge(_shells(space) + _in_volume(space, rng) + _by_size(space, rng, SIZE_CANDIDATES))
     best = np.argsort(-np.array(views.scores), kind="stable")[:BEST]
@@ -99,7 +98,7 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
 
 def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
     """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
-    views = _Views(survey(scene), _thinned(scene, rasterizer, np.random.default_rng(0)))
+    views = _Views(survey(scene), thinned(scene, rasterizer, np.random.default_rng(0)))
     views.add([Camera(camera.intrinsics.with_long_side(SEARCH_PX), camera.pose) for camera in cameras])
     return _covered(views.seen(np.arange(len(cameras))))
 
@@ -143,30 +142,6 @@ def search_lens(long_side: int) -> Intrinsics:
     return Intrinsics(long_side, height, focal, focal, 0.5 * long_side, 0.5 * height)
 
 
-def _thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
-    """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
-
-    One of area a stays with the probability p = min(1, k a), and its area becomes 2 a / p: what is left to chance
-    leaves holes otherwise.
-    """
-    if scene.count <= SEARCH_GAUSSIANS:
-        return rasterizer
-    order = np.argsort(scene.scales, axis=1)[:, 1:]
-    flat = np.take_along_axis(scene.scales, order, 1)
-    areas = (flat[:, 0] * flat[:, 1] * scene.opacities).astype(np.float64) + 1e-30
-    share = SEARCH_GAUSSIANS * areas / areas.sum()
-    for _ in range(10):  # those that are certain leave room for others
-        certain = share >= 1
-        share[~certain] *= (SEARCH_GAUSSIANS - certain.sum()) / share[~certain].sum()
-    chosen = np.flatnonzero(rng.random(scene.count) < share)
-    scales = scene.scales[chosen].copy()
-    wider = np.where(share[chosen] < 1, np.sqrt(2.0 / share[chosen]), 1.0)
-    wider = (flat[chosen] * wider[:, None]).astype(np.float32)
-    np.put_along_axis(scales, order[chosen], wider, 1)
-    arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "opacities")}
-    return rasterizer.of(replace(scene, **arrays, scales=scales, sh=scene.sh[chosen, :1]))
-
-
 class _Views:
     """Candidates, how solid each is, and what it sees of the scene."""
 
@@ -177,6 +152,8 @@ class _Views:
         self._least_enclosed = 0.0
         """Of a good view, as far as is known; more than 0: the scene surrounds them."""
         self._surfaces: list[Float64[np.ndarray, "n 3"]] = []
+        self._surface_ids: list[Int64[np.ndarray, "_"]] = []
+        """Of the voxels that each sees."""
         self._space, self._rasterizer = space, rasterizer
         self._voxel = 0.25 * space.distance
         points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
@@ -184,13 +161,12 @@ class _Views:
 
     def judge(self, poses: Sequence[Pose]) -> None:
         """Render the candidates small. Those among Gaussians are not worth it, nor those known to be outside."""
-        blocked = self._space.occupied(np.stack([pose.position_in_world for pose in poses]))
-        free = [pose for pose, bad in zip(poses, blocked, strict=True) if not bad]
-        enclosures = [self._space.enclosure(pose.position_in_world) for pose in free]
-        inside = np.flatnonzero(np.array(enclosures) >= self._least_enclosed)
+        positions = np.stack([pose.position_in_world for pose in poses])
+        enclosures = self._space.enclosures(positions)
+        worth = np.flatnonzero(~self._space.occupied(positions) & (enclosures >= self._least_enclosed))
         lens = search_lens(SEARCH_PX)
-        self.add([Camera(lens, free[i]) for i in inside])
-        self._enclosures += [enclosures[i] for i in inside]
+        self.add([Camera(lens, poses[i]) for i in worth.tolist()])
+        self._enclosures += enclosures[worth].tolist()
 
     @property
     def interior(self) -> bool:
@@ -198,7 +174,7 @@ class _Views:
 
     def add(self, cameras: Sequence[Camera]) -> None:
         nearest = NEAREST * self._space.distance
-        for camera, frame in zip(cameras, self._rasterizer.render(cameras), strict=True):
+        for camera, frame in zip(cameras, self._rasterizer.render(cameras, roughly=True), strict=True):
             height, width = frame.alpha.shape
             row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
             solid = _solid(frame, nearest)
@@ -208,6 +184,8 @@ class _Views:
             self.poses.append(camera.pose)
             self.scores.append(float(solid.mean()))
             self._surfaces.append(transformed(camera.pose.world_from_camera, points))
+            voxels = np.floor(self._surfaces[-1] / self._voxel).astype(np.int64)
+            self._surface_ids.append(np.unique(_ids(voxels)))
 
     def good(self) -> Int64[np.ndarray, "k"]:
         """Return which candidates are solid and, where that tells, inside; and take note whether it does."""
@@ -219,8 +197,7 @@ class _Views:
 
     def seen(self, chosen: Int64[np.ndarray, "k"]) -> Int64[np.ndarray, "n"]:
         """Tell of each point of the space how many of the views see its voxel."""
-        own = [np.unique(_ids(np.floor(self._surfaces[i] / self._voxel).astype(np.int64))) for i in chosen]
-        ids = np.concatenate([*own, np.empty(0, np.int64)])
+        ids = np.concatenate([*(self._surface_ids[i] for i in chosen), np.empty(0, np.int64)])
         at = np.minimum(np.searchsorted(self._voxels, ids), len(self._voxels) - 1)
         return np.bincount(at[self._voxels[at] == ids], minlength=len(self._voxels))[self._voxel_of]
 

@@ -66,11 +66,13 @@ class Space:
         steps = _steps_in_the_clear(self.filled, starts, directions, LEAVING, max(0, round(reach / self.cell)))
         return np.minimum((LEAVING + steps) * self.cell, reach)
 
-    def enclosure(self, position: Float64[np.ndarray, "3"]) -> float:
-        """Return the share of all directions in which something is met within the grid."""
-        starts = np.tile((position - self.low) / self.cell, (RAYS, 1))
+    def enclosures(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
+        """Return for each place the share of all directions in which something is met within the grid."""
+        starts = np.repeat((positions - self.low) / self.cell, RAYS, axis=0)
+        directions = np.tile(lattice(RAYS), (len(positions), 1))
         most = int(np.linalg.norm(self.filled.shape))
-        return float((_steps_in_the_clear(self.filled, starts, lattice(RAYS), LEAVING, most) < most).mean())
+        met = _steps_in_the_clear(self.filled, starts, directions, LEAVING, most) < most
+        return met.reshape(-1, RAYS).mean(1)
 
 
 @kernel

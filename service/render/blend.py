@@ -7,7 +7,8 @@
 
 Semantics (gsplat's): alpha below 1/255 is skipped, alpha is clamped at 0.999, a Gaussian that would bring the
 transmittance T to 1e-4 or below is not added and ends the pixel. T goes on decaying unfrozen here: the loop-carried
-chain is one fma, and `T after > 1e-4` is the mask of what counts.
+chain is one fma, and `T after > 1e-4` is the mask of what counts. A rough picture ends a block once each of its pixels
+has less than `enough` left.
 """
 
 from __future__ import annotations
@@ -117,9 +118,9 @@ def touching_lists(local, count, tile_x, tile_y, alive, lists, lengths):
 
 
 @kernel
-def blend(records, starts, entries, width, height, background, local, lists, lengths, state,
+def blend(records, starts, entries, width, height, background, enough, local, lists, lengths, state,
           rgb, alpha, depth, median):  # fmt: skip
-    """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each."""
+    """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each. `enough`: at least T_MIN."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     lane_x = to_float(iota() & isplat(3))
@@ -146,7 +147,7 @@ def blend(records, starts, entries, width, height, background, local, lists, len
                     continue
                 px = lane_x + np.float32(tile_x + block % 4 * 4 + 0.5)
                 py = lane_y + np.float32(tile_y + block // 4 * 4 + 0.5)
-                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, state):
+                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, enough, state):
                     alive &= ~(np.uint32(1) << np.uint32(block))
         for block in range(16):
             if (inside >> np.uint32(block)) & np.uint32(1):
@@ -155,8 +156,8 @@ def blend(records, starts, entries, width, height, background, local, lists, len
 
 
 @inline
-def _run_block(local, lists, block, length, px, py, state):
-    """Composite the block's list onto its state. False when every pixel is opaque."""
+def _run_block(local, lists, block, length, px, py, enough, state):
+    """Composite the block's list onto its state. False when every pixel is opaque enough."""
     base = block * STATE
     t, r, g = load(state, base), load(state, base + 16), load(state, base + 32)
     b, d, m = load(state, base + 48), load(state, base + 64), load(state, base + 80)
@@ -182,7 +183,7 @@ def _run_block(local, lists, block, length, px, py, state):
             g = fma(w, broadcast(local, G + i), g)
             b = fma(w, broadcast(local, BL + i), b)
             d = fma(w, broadcast(local, Z + i), d)
-        if bits(t > T_MIN) == 0:
+        if bits(t > enough) == 0:
             going = False
             break
     store(state, base, t)

@@ -29,9 +29,9 @@ class Counted:
     def trained_at(self, long_side_px: int) -> Counted:
         return Counted(self.inner.trained_at(long_side_px), self.tally)
 
-    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+    def render(self, cameras: Sequence[Camera], *rest: Any, **named: Any) -> list[Frame]:
         self.tally.count += len(cameras)
-        return self.inner.render(cameras)
+        return self.inner.render(cameras, *rest, **named)
 
     def pose_gradient(
         self, camera: Camera, d_rgb: Any, d_depth: Any = None, d_alpha: Any = None

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from jaxtyping import Float32, Float64
 
 from service.interfaces import Frame, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
-from service.render.blend import BATCH, LIST, LOCAL, STATE, blend
+from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, blend
 from service.render.chain import ROW, pose_twist, scene_rows, unpack_rows
 from service.render.pack import LANES, Packed, aligned, fill, pack
 from service.render.project import RECORD, TILE, project
@@ -34,6 +35,10 @@ NEAR = 0.01
 """Scene units; gsplat's default."""
 ASSUMED_TRAINING_LONG_SIDE_PX = 1000
 """Where neither training cameras nor the manifest tell the resolution that a scene was trained at."""
+ROUGHLY = np.float32(0.03)
+"""Transmittance at which a rough picture ends; walls of trained scenes let about 0.01 through, too much for T_MIN."""
+
+NO_HORIZONS = np.empty(0, np.float32)
 
 _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
 
@@ -84,10 +89,16 @@ class CpuRasterizer:
         """Take in the scene's values again, for a scene under training: its arrays are views of changing ones."""
         fill(self.packed, self.scene)
 
-    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+    def render(
+        self,
+        cameras: Sequence[Camera],
+        roughly: bool = False,
+        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+    ) -> list[Frame]:
+        enough = ROUGHLY if roughly else T_MIN
         if len(cameras) == 1:
-            return [self._render(cameras[0])]
-        return list(_POOL.map(self._render, cameras))
+            return [self._render(cameras[0], enough, horizons[0] if horizons else None)]
+        return list(_POOL.map(self._render, cameras, repeat(enough), horizons or repeat(None)))
 
     def pose_gradient(
         self,
@@ -126,19 +137,23 @@ class CpuRasterizer:
         )  # fmt: skip
         return result
 
-    def _render(self, camera: Camera) -> Frame:
+    def _render(
+        self, camera: Camera, enough: np.float32 = T_MIN, horizon: Float32[np.ndarray, "_ _"] | None = None
+    ) -> Frame:
         s = self._scratch()
         s.camera = None  # an error on the way must not leave another camera's lists behind
-        self._bin(camera, s)
+        self._bin(camera, s, horizon)
         k = camera.intrinsics
         frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))
         blend(
-            s.records, s.starts, s.entries, k.width, k.height, self._background, s.local, s.lists, s.lengths, s.state,
+            s.records, s.starts, s.entries, k.width, k.height, self._background, enough, s.local, s.lists, s.lengths,
+            s.state,
             frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1),
         )  # fmt: skip
         for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
             image.flags.writeable = False
-        s.camera, s.info, s.frame = camera, self.scene.info, frame
+        if enough == T_MIN and horizon is None:  # no gradients of a rough picture
+            s.camera, s.info, s.frame = camera, self.scene.info, frame
         return frame
 
     def _backward(self, camera: Camera, d_rgb: Any, d_depth: Any, d_alpha: Any) -> _Scratch:
@@ -173,12 +188,13 @@ class CpuRasterizer:
         info = self.scene.info
         return np.float32(dilation_for(camera, info)), info.render_mode == "antialiased"
 
-    def _bin(self, camera: Camera, s: _Scratch) -> None:
+    def _bin(self, camera: Camera, s: _Scratch, horizon: Float32[np.ndarray, "_ _"] | None) -> None:
         """Project, sort and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
+        horizons = NO_HORIZONS if horizon is None else _of_tiles(horizon, k.width, k.height)
         s.visible, count = project(
             packed.geometry, packed.sh, packed.spheres, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
-            *self._dilation(camera), np.float32(NEAR), s.records, s.depths, s.rects, s.local,
+            *self._dilation(camera), np.float32(NEAR), horizons, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:
@@ -193,6 +209,16 @@ def _view_and_lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     k = camera.intrinsics
     view = np.ascontiguousarray(camera.pose.camera_from_world[:3], np.float32).reshape(-1)
     return view, np.array([k.fx, k.fy, k.cx, k.cy], np.float32)
+
+
+def _of_tiles(horizon: Float32[np.ndarray, "h w"], width: int, height: int) -> Float32[np.ndarray, "_"]:
+    """Return the farthest horizon in each tile."""
+    for axis, side in enumerate((height, width)):
+        ends = np.minimum(np.arange(0, side + TILE, TILE), side) * horizon.shape[axis] / side
+        last = np.ceil(ends[1:]).astype(int) - 1
+        farthest = np.maximum.reduceat(horizon, ends[:-1].astype(int), axis)
+        horizon = np.maximum(farthest, np.take(horizon, last, axis))
+    return np.ascontiguousarray(horizon, np.float32).reshape(-1)
 
 
 def _flat(image: np.ndarray) -> np.ndarray:

@@ -98,7 +98,12 @@ class GsplatRasterizer:
         other.scene = replace(self.scene, info=info)
         return other
 
-    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+    def render(
+        self,
+        cameras: Sequence[Camera],
+        roughly: bool = False,
+        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+    ) -> list[Frame]:
         groups: dict[tuple, list[int]] = defaultdict(list)
         for index, camera in enumerate(cameras):
             k = camera.intrinsics

@@ -24,7 +24,6 @@ from service.render.simd import (
     iota,
     isplat,
     load,
-    popcount,
     select,
     sqrt,
     store,
@@ -116,13 +115,47 @@ def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
     )
 
 
+@inline
+def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, horizons):
+    """Whether a bounding sphere lies behind the horizons of all tiles that it may reach into."""
+    x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
+    cz = view[8] * x + view[9] * y + view[10] * z + view[11]
+    nearest, farthest = cz - radius, cz + radius
+    if nearest <= near:
+        return False
+    cx = view[0] * x + view[1] * y + view[2] * z + view[3]
+    cy = view[4] * x + view[5] * y + view[6] * z + view[7]
+    x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, lens[0], lens[2], tiles_x)
+    y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, lens[1], lens[3], tiles_y)
+    return hidden(nearest, x0, y0, x1, y1, tiles_x, horizons)
+
+
+@inline
+def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
+    """Return the first tile of a row that a box reaches into, dilation and all, and the one after the last."""
+    first = (min(low / nearest, low / farthest) * focal + centre) / TILE - 1
+    last = (max(high / nearest, high / farthest) * focal + centre) / TILE + 2
+    return int(max(0, min(first, tiles))), int(max(0, min(last, tiles)))
+
+
+@inline
+def hidden(depth, x0, y0, x1, y1, tiles_x, horizons):
+    """Whether what is at this depth lies behind the horizons of all these tiles."""
+    for ty in range(y0, y1):
+        for tx in range(x0, x1):
+            if depth <= horizons[np.intp(ty * tiles_x + tx)]:
+                return False
+    return True
+
+
 @kernel
-def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, antialiased, near,
+def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, antialiased, near, horizons,
             records, depths, rects, scratch):  # fmt: skip
     """Write a record, a depth and a tile rectangle for every visible Gaussian; return (visible, tile entries).
 
-    `view`: camera_from_world, 12 floats row by row. `lens`: fx, fy, cx, cy. A rectangle is four 16-bit tile numbers:
-    x0, y0, x1, y1 (ends excluded).
+    `view`: camera_from_world, 12 floats row by row. `lens`: fx, fy, cx, cy. `horizons`: for each tile the depth beyond
+    which nothing is seen; empty: as far as there is something. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1
+    (ends excluded).
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     high_x = (width - cx) / fx + np.float32(0.15) * width / fx
@@ -143,6 +176,8 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
     integers = scratch.view(np.int32)
     for block in range(spheres.shape[0]):
         if not in_view(spheres[block], view, fx, fy, low_x, high_x, low_y, high_y, near):
+            continue
+        if len(horizons) and block_hidden(spheres[block], view, lens, near, tiles_x, tiles_y, horizons):
             continue
         for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
             at = chunk * 160
@@ -211,18 +246,18 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
             store(integers, 528, to_int(vmax((py - high) * to_tile, 0.0)))
             store(integers, 544, to_int(vmin(floor((px + wide) * to_tile) + 1.0, tiles_x)))
             store(integers, 560, to_int(vmin(floor((py + high) * to_tile) + 1.0, tiles_y)))
-            first = visible
-            visible += popcount(mask)
             for lane in range(16):
                 if (mask >> np.uint32(lane)) & np.uint32(1):
-                    store(records, first * 16, load(scratch, 256 + lane * 16))
-                    depths[first] = scratch[96 + lane]
                     x0, y0 = integers[512 + lane], integers[528 + lane]
                     x1, y1 = integers[544 + lane], integers[560 + lane]
-                    rects[first] = (
+                    if len(horizons) and hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, horizons):
+                        continue
+                    store(records, visible * 16, load(scratch, 256 + lane * 16))
+                    depths[visible] = scratch[96 + lane]
+                    rects[visible] = (
                         np.uint64(x0) | np.uint64(y0) << np.uint64(16)
                         | np.uint64(x1) << np.uint64(32) | np.uint64(y1) << np.uint64(48)
                     )  # fmt: skip
                     entries += (x1 - x0) * (y1 - y0)
-                    first += 1
+                    visible += 1
     return visible, entries

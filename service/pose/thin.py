@@ -1,0 +1,67 @@
+"""A large scene at a glance: fewer Gaussians for small renders, and what those tell about what hides what."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from service.interfaces import Frame, Rasterizer
+from service.types import Camera, GaussianScene
+
+ENOUGH = 200_000
+"""Gaussians: a view of 64 px doesn't show more."""
+LARGE = 500_000
+"""Gaussians from which on a look at fewer of them, which tells what hides what, is worth its time."""
+GLANCE_PX = 64
+HIDING_ALPHA = 0.9
+BEHIND = 1.2
+"""What is this times as far as an opaque surface is behind it."""
+
+
+def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
+    """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
+
+    One of area a stays with the probability p = min(1, k a), and its area becomes 2 a / p: what is left to chance
+    leaves holes otherwise.
+    """
+    if scene.count <= ENOUGH:
+        return rasterizer
+    least = scene.scales.min(1)
+    areas = scene.scales.prod(1) / np.maximum(least, 1e-30) * scene.opacities + np.float32(1e-30)
+    share = ENOUGH * areas / areas.sum(dtype=np.float64)
+    for _ in range(10):  # those that are certain leave room for others
+        certain = share >= 1
+        room = ENOUGH - np.count_nonzero(certain)
+        share *= np.where(certain, 1.0, room / share.sum(where=~certain, dtype=np.float64))
+    chosen = np.flatnonzero(rng.random(scene.count, np.float32) < share)
+    wider = np.sqrt(2.0 / share[chosen], where=share[chosen] < 1, out=np.ones(len(chosen)))
+    scales = (scene.scales[chosen] * wider[:, None]).astype(np.float32)
+    thinnest = np.argmin(scene.scales[chosen], axis=1)[:, None]
+    np.put_along_axis(scales, thinnest, least[chosen, None], 1)
+    arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "opacities")}
+    return rasterizer.of(replace(scene, **arrays, scales=scales, sh=scene.sh[chosen, :1]))
+
+
+def horizon(frame: Frame) -> Float32[np.ndarray, "h w"]:
+    """Return the z-depth from which on what a pixel shows hides the rest there and beside it; infinite where open."""
+    hiding = frame.alpha > HIDING_ALPHA
+    depth = np.where(hiding, BEHIND * np.maximum(frame.depth, frame.median_depth), np.float32(np.inf))
+    return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+
+
+class Rough:
+    """Renders a scene without what walls hide."""
+
+    def __init__(self, scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> None:
+        self._rasterizer = rasterizer
+        self._thinned = thinned(scene, rasterizer, rng) if scene.count > LARGE else None
+
+    def render(self, camera: Camera) -> Frame:
+        horizons = None
+        if self._thinned:
+            small = Camera(camera.intrinsics.with_long_side(GLANCE_PX), camera.pose)
+            horizons = [horizon(frame) for frame in self._thinned.render([small], roughly=True)]
+        return self._rasterizer.render([camera], roughly=True, horizons=horizons)[0]
