@@ -6,6 +6,7 @@ camera in its own frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,12 +21,18 @@ def hat(v: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
 
 
 def so3_exp(rotation_vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rodrigues' formula; Taylor below 1e-4 rad, where the closed form loses digits."""
-    angle = float(np.linalg.norm(rotation_vector))
+    """Rodrigues' formula."""
+    first, second, _ = _rodrigues(math.sqrt(rotation_vector @ rotation_vector))
     k = hat(rotation_vector)
+    return np.eye(3) + first * k + second * (k @ k)
+
+
+def _rodrigues(angle: float) -> tuple[float, float, float]:
+    """Return sin a / a, (1 - cos a) / a^2 and (a - sin a) / a^3; Taylor where these lose digits."""
     if angle < 1e-4:
-        return np.eye(3) + k + 0.5 * k @ k + k @ k @ k / 6.0
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * k @ k
+        return 1.0 - angle**2 / 6.0, 0.5, 1.0 / 6.0
+    sine, cosine = math.sin(angle), math.cos(angle)
+    return sine / angle, (1.0 - cosine) / angle**2, (angle - sine) / angle**3
 
 
 def so3_log(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
@@ -40,16 +47,12 @@ def so3_log(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
 def se3_exp(twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
     """The motion of a twist."""
     phi, rho = np.asarray(twist[:3], np.float64), np.asarray(twist[3:], np.float64)
-    angle = float(np.linalg.norm(phi))
+    first, second, third = _rodrigues(math.sqrt(phi @ phi))
     k = hat(phi)
-    if angle < 1e-4:
-        left_jacobian = np.eye(3) + 0.5 * k + k @ k / 6.0
-    else:
-        a, b = (1 - np.cos(angle)) / angle**2, (angle - np.sin(angle)) / angle**3
-        left_jacobian = np.eye(3) + a * k + b * k @ k
+    squared = k @ k
     result = np.eye(4)
-    result[:3, :3] = so3_exp(phi)
-    result[:3, 3] = left_jacobian @ rho
+    result[:3, :3] += first * k + second * squared
+    result[:3, 3] = rho + (second * k + third * squared) @ rho  # the left Jacobian
     return result
 
 

@@ -96,6 +96,8 @@ class Intrinsics:
 
     def corrected(self, lens: Lens) -> Intrinsics:
         """Return the same camera with another focal length and principal point."""
+        if lens == EXACT:
+            return self
         return replace(
             self,
             fx=self.fx * lens.focal_factor,

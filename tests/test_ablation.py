@@ -58,7 +58,7 @@ def test_the_table_has_a_line_a_part_and_counts_what_is_false() -> None:
     ]  # fmt: skip
     lines = table(rows).splitlines()
     assert len(lines) == 4
-    assert lines[3] == "| alignment |" + " 3 / 2 |" * 6 + " 1 | 99 |"
+    assert lines[3] == "| alignment |" + " 3 / 2 |" * len(CONDITIONS) + " 1 | 99 |"
 
 
 def test_an_unknown_part_is_named() -> None:

@@ -305,15 +305,14 @@ def _solved(
 ) -> Float64[np.ndarray, "13"]:
     """Solve the weighted normal equations; each unknown is scaled, for they differ by orders of magnitude."""
     size = len(columns)
-    factor = state.slopes[:size]
-    hessian, right = _normal_equations(columns, weights, residuals)
-    hessian, right = hessian * np.outer(factor, factor), right * factor
+    hessian, right = _normal_equations(columns, weights, residuals, state.slopes)
     if state.focal_sigma:
         trust = CORRELATED * loss * lens_precision(state.focal_sigma)
         hessian[range(10, 13), range(10, 13)] += trust
         right[LENS] -= trust * lens_state(state.lens)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
-    damped = hessian * np.outer(scale, scale) + 1e-6 * np.eye(size)
+    scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
+    damped = hessian * scale * scale[:, None]
+    damped[range(size), range(size)] += 1e-6
     step = np.zeros(13)
     step[:size] = scale * np.linalg.solve(damped, scale * right)
     return step
@@ -412,8 +411,8 @@ def _places(points, t, k, shape, right, down):
 
 
 @summing
-def _normal_equations(columns, weights, residuals):
-    """Return columns . weights . columns^T and columns . weights . residuals."""
+def _normal_equations(columns, weights, residuals, factor):
+    """Return columns . weights . columns^T and columns . weights . residuals; each column times its factor."""
     count, n = columns.shape
     hessian, right = np.empty((count, count)), np.empty(count)
     weighted = np.empty(n, np.float32)
@@ -422,10 +421,10 @@ def _normal_equations(columns, weights, residuals):
         for i in range(n):
             weighted[i] = columns[a, i] * weights[i]
             total += weighted[i] * residuals[i]
-        right[a] = total
+        right[a] = factor[a] * total
         for b in range(a + 1):
             total = np.float32(0)
             for i in range(n):
                 total += weighted[i] * columns[b, i]
-            hessian[a, b] = hessian[b, a] = total
+            hessian[a, b] = hessian[b, a] = factor[a] * factor[b] * total
     return hessian, right
