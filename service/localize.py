@@ -285,7 +285,7 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
 def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verdict:
     """Put on record what the gate can't see in the render: a mirrored photo, other answers, too small a budget."""
     if last.mirrored:
-        return doubted(verdict, Reason.MIRRORED)
+        return replace(doubted(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
     share = 1.0 if last.rivals is None else 1.0 - float(last.rivals.scores.sum())
     if share < LOCALIZED:
         return doubted(verdict, Reason.AMBIGUOUS, share * verdict.score)

@@ -14,6 +14,7 @@ from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.geometry import project, transformed
 from service.localize import LoadedScene, localize
+from service.pose.gate import FLOORS
 from service.pose.mirror import mirrored
 from service.types import Box, Pose, Query, Reason, Status
 
@@ -37,6 +38,17 @@ def test_a_mirrored_photo_of_a_symmetric_room_is_not_localized(seed: int, symmet
     assert found.verdict.status is Status.UNCERTAIN
     assert found.verdict.reason is Reason.MIRRORED
     assert "mirror" in [record.stage for record in found.records]
+
+
+def test_a_mirrored_photo_is_told_also_where_the_gate_does_not_believe_it_anyway(
+    symmetric: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(FLOORS, "colours", 0.992)
+    photo = photo_at(symmetric, unseen_pose())
+    assert localize(photo, symmetric).verdict.status is Status.LOCALIZED
+    verdict = localize(mirrored(photo), symmetric).verdict
+    assert verdict.signals["colours"] < 0.992
+    assert (verdict.status, verdict.reason) == (Status.UNCERTAIN, Reason.MIRRORED)
 
 
 def test_a_noisy_photo_is_looked_for_both_ways_and_found(symmetric: LoadedScene) -> None:

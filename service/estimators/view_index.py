@@ -28,7 +28,7 @@ from service.interfaces import Tools
 from service.pose.alignment import align
 from service.pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
 from service.pose.focal import WIDER, focal_resection, refine
-from service.pose.gate import appearance, glance, verify
+from service.pose.gate import UNCERTAIN, appearance, glance, verify
 from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
@@ -126,18 +126,21 @@ def prepare(tools: Tools, cache_dir: Path | None) -> ViewIndex:
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
     """Search until the gate accepts an answer; see the module's picture."""
-    hunt = _Hunt(query, tools)
+    hunt = _Hunt(query, tools, Sight(GLANCE_PX))
     if query.prior:
-        yield from hunt.follow(_from_prior(query, tools), expected=True)
-    for search, sight in () if hunt.accepted else _searches(query, tools, options, hunt):
-        yield from hunt.follow(search)
+        yield from hunt.follow(_from_prior(query, tools), hunt.sight, expected=True)
         if hunt.accepted:
-            yield from hunt.reflect(sight)
-            if not hunt.mirrored:
-                yield from hunt.contest(sight)
+            if query.region is None:  # a guess doesn't decide between places that look alike
+                yield from hunt.contest()
             return
-    if hunt.accepted and query.region is None:  # a guess doesn't decide between places that look alike
-        yield from hunt.contest(Sight(GLANCE_PX))
+    for search, sight in _searches(query, tools, options, hunt):
+        yield from hunt.follow(search, sight)
+        if hunt.accepted:
+            break
+    if hunt.score >= UNCERTAIN:
+        yield from hunt.reflect()
+    if hunt.accepted and not hunt.mirrored:
+        yield from hunt.contest()
 
 
 @dataclass(slots=True)
@@ -146,6 +149,8 @@ class _Hunt:
 
     query: Query
     tools: Tools
+    sight: Sight
+    """How the photo was looked at when the answer was found."""
     answer: IterationRecord | None = None
     """The one that the gate likes best."""
     score: float = 0.0
@@ -157,7 +162,9 @@ class _Hunt:
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance gives: foreign photos never do."""
 
-    def follow(self, search: Iterator[IterationRecord], expected: bool = False) -> Iterator[IterationRecord]:
+    def follow(
+        self, search: Iterator[IterationRecord], sight: Sight, expected: bool = False
+    ) -> Iterator[IterationRecord]:
         """Yield a search's records, with the best answer so far, and put its end before the gate.
 
         An answer that was expected, or that many matches with a view led to, needs no more of them if the pixels are
@@ -175,34 +182,42 @@ class _Hunt:
         seen = glance(known, last.pose, self.tools, matched) if enough else None
         verdict = seen or verify(known, last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
-            self.answer, self.score = last, verdict.score
+            self.answer, self.score, self.sight = last, verdict.score, sight
         unmendable = verdict.reason in UNMENDABLE and not self.glimpsing
         self.accepted = verdict.status is Status.LOCALIZED or unmendable
         yield self._with_answer(
             IterationRecord("verify", last.pose, loss=1.0 - self.score, num_inliers=verdict.inliers)
         )
 
-    def reflect(self, sight: Sight) -> Iterator[IterationRecord]:
-        """Where the scene is much like its mirror image, look whether the photo's mirror image fits better."""
+    def reflect(self) -> Iterator[IterationRecord]:
+        """Where the scene is much like its mirror image, look whether the photo's mirror image fits better.
+
+        What doesn't fit well as it is has to fit well beyond doubt in the mirror.
+        """
         assert self.answer is not None
+        if not self.tools.prepared.like_its_mirror_image:
+            return
         known = self.query.corrected(self.answer.lens)
         own = verify(known, self.answer.pose, self.tools).signals
-        if not self.tools.prepared.like_its_mirror_image or own["gradients"] > BEYOND_DOUBT:
+        if own["gradients"] > BEYOND_DOUBT:
             return
         query = replace(mirrored(known), prior=None, region=None)  # those are of the photo as it was sent
         tools = replace(self.tools, memo={})
         worst, last = OUT_OF_REACH * (self.answer.loss or np.inf), None
-        for last in _reflected(replace(sight, eighths=-sight.eighths % 8), query, tools, worst):
+        for last in _reflected(replace(self.sight, eighths=-self.sight.eighths % 8), query, tools, worst):
             yield self._with_answer(replace(last, stage="mirror", matches=None))
         if last is None or last.stage != "align":
             return
-        frame, camera = rendered_frame(last.pose, query.corrected(last.lens), tools)
+        known = query.corrected(last.lens)
+        if not self.accepted and verify(known, last.pose, tools).status is not Status.LOCALIZED:
+            return
+        frame, camera = rendered_frame(last.pose, known, tools)
         size = camera.intrinsics
         there = appearance(photo_at(query, tools, size), frame, known_at(query, tools, size))
         self.mirrored = unlikeness(there) < unlikeness(own)
         yield replace(self.answer, stage="mirror", mirrored=self.mirrored)
 
-    def contest(self, sight: Sight) -> Iterator[IterationRecord]:
+    def contest(self) -> Iterator[IterationRecord]:
         """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all.
 
         A pose that explains the whole photo has none in a scene whose views are all different.
@@ -215,11 +230,11 @@ class _Hunt:
             return
         frame, _ = rendered_frame(self.answer.pose, known, self.tools)
         distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
-        pixels = sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
+        pixels = self.sight.max_error_px * self.query.intrinsics.long_side / PHOTO_PX
         judged = (self.answer.pose, distance, signals)
         suspected = rivals(
-            sight.features(self.query, self.tools), known.intrinsics, *judged,
-            self.tools.prepared.views, sight.votes(self.query, self.tools), self.tools.matcher, pixels,
+            self.sight.features(self.query, self.tools), known.intrinsics, *judged,
+            self.tools.prepared.views, self.sight.votes(self.query, self.tools), self.tools.matcher, pixels,
         )  # fmt: skip
         for rival in suspected:
             rival, last = replace(rival, lens=self.answer.lens), None
