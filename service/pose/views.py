@@ -158,17 +158,13 @@ def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
 def rendered_frame(
     pose: Pose, query: Query, tools: Tools, tolerance_px: float = 1.0, long_side: int | None = None
 ) -> tuple[Frame, Camera]:
-    """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since.
-
-    One of another size is a rough one.
-    """
-    full = LENS_RENDER_PX if query.focal_sigma else RENDER_PX
-    camera = Camera(sized(query.intrinsics, long_side or full), pose)
+    """Return the render with the photo's intrinsics; the job's last one if hardly anything moved since."""
+    long_side = long_side or (LENS_RENDER_PX if query.focal_sigma else RENDER_PX)
+    camera = Camera(sized(query.intrinsics, long_side), pose)
     last: tuple[Frame, Camera] | None = tools.memo.get("last_frame")
     if last and _nearly_seen(*last, camera, tolerance_px):
         return last
-    (frame,) = tools.rasterizer.render([camera], roughly=bool(long_side))
-    tools.memo["last_frame"] = frame, camera
+    tools.memo["last_frame"] = tools.rasterizer.render([camera])[0], camera
     return tools.memo["last_frame"]
 
 
