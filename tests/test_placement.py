@@ -167,14 +167,17 @@ def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_horizon_lies_behind_what_hides_and_nowhere_where_one_sees_through() -> None:
-    """A wall at 3 with a gap, half of a nearer board before it; by hand."""
-    alpha, depth = np.ones((8, 12), np.float32), np.full((8, 12), 3.0, np.float32)
+    """A wall at 3 with a gap and a pane at 2 before it, half of a nearer board beside them; by hand."""
+    alpha, depth = np.ones((8, 16), np.float32), np.full((8, 16), 3.0, np.float32)
     depth[:, :4] = 2.0
     alpha[:, 10] = 0.5
-    found = horizon(Frame(np.zeros((8, 12, 3), np.float32), alpha, depth, depth))
+    median = depth.copy()
+    depth[:, 14], median[:, 14] = 2.4, 2.0  # two fifths of the light come through the pane
+    found = horizon(Frame(np.zeros((8, 16, 3), np.float32), alpha, depth, median))
     assert np.allclose(found[:, :3], 2 * BEHIND)
-    assert np.allclose(found[:, 3:9], 3 * BEHIND)  # column 3 looks past the board's edge
-    assert np.all(np.isinf(found[:, 9:]))
+    assert np.allclose(found[:, [*range(3, 9), 12]], 3 * BEHIND)  # column 3 looks past the board's edge
+    assert np.all(np.isinf(found[:, 9:12]))
+    assert np.all(found[:, 13:] > 3 * BEHIND)
 
 
 class Watched(CpuRasterizer):

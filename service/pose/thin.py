@@ -16,9 +16,11 @@ ENOUGH = 200_000
 LARGE = 500_000
 """Gaussians from which on a look at fewer of them, which tells what hides what, is worth its time."""
 GLANCE_PX = 64
-HIDING_ALPHA = 0.9
-BEHIND = 1.2
-"""What is this times as far as an opaque surface is behind it."""
+OPAQUE, BEHIND = 0.9, 1.2
+"""What is so many times as far as a surface of this alpha is behind it..."""
+LOST = 0.1
+"""...unless more than this share of the light may come from there. In the views of a building of 3 million Gaussians one
+pixel in a hundred differs by more than 0.1 then; with mean and median depth taken for the surface, one in forty."""
 
 
 def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
@@ -30,12 +32,12 @@ def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generat
     if scene.count <= ENOUGH:
         return rasterizer
     least = scene.scales.min(1)
-    areas = scene.scales.prod(1) / np.maximum(least, 1e-30) * scene.opacities + np.float32(1e-30)
-    share = ENOUGH * areas / areas.sum(dtype=np.float64)
+    areas = scene.scales.prod(1, np.float64) / np.maximum(least, 1e-30) * scene.opacities + 1e-30
+    share = ENOUGH * areas / areas.sum()
     for _ in range(10):  # those that are certain leave room for others
         certain = share >= 1
         room = ENOUGH - np.count_nonzero(certain)
-        share *= np.where(certain, 1.0, room / share.sum(where=~certain, dtype=np.float64))
+        share *= np.where(certain, 1.0, room / share.sum(where=~certain))
     chosen = np.flatnonzero(rng.random(scene.count, np.float32) < share)
     wider = np.sqrt(2.0 / share[chosen], where=share[chosen] < 1, out=np.ones(len(chosen)))
     scales = (scene.scales[chosen] * wider[:, None]).astype(np.float32)
@@ -46,10 +48,13 @@ def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generat
 
 
 def horizon(frame: Frame) -> Float32[np.ndarray, "h w"]:
-    """Return the z-depth from which on what a pixel shows hides the rest there and beside it; infinite where open."""
-    hiding = frame.alpha > HIDING_ALPHA
-    depth = np.where(hiding, BEHIND * np.maximum(frame.depth, frame.median_depth), np.float32(np.inf))
-    return np.asarray(cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+    """Return the z-depth from which on what a pixel shows hides the rest there and beside it; infinite where open.
+
+    Of a mean depth beyond the median's at most LOST comes from beyond there (Markov's inequality).
+    """
+    surface, beyond = frame.median_depth, frame.depth - frame.median_depth
+    behind = np.maximum(BEHIND * surface, surface + beyond / LOST)
+    return np.asarray(cv2.dilate(np.where(frame.alpha > OPAQUE, behind, np.float32(np.inf)), np.ones((3, 3), np.uint8)))
 
 
 class Rough:
