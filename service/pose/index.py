@@ -25,7 +25,7 @@ from service.pose.viewpoints import INDEX_PX, index_cameras
 from service.pose.views import VIEW_FEATURES, View, lifted, to_uint8
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 9
+VERSION = 8
 """Raise it with any change that makes stored indexes differ from fresh ones."""
 log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ GLANCE_PX = 64
 OPAQUE, BEHIND = 0.9, 1.2
 """What is so many times as far as a surface of this alpha is behind it..."""
 LOST = 0.1
-"""...unless more than this share of the light may come from there. In the views of a building of 3 million Gaussians one
-pixel in a hundred differs by more than 0.1 then; with mean and median depth taken for the surface, one in forty."""
+"""...unless more than this share of the light may come from there. In the views of a building of 3 million Gaussians
+one pixel in a hundred differs by more than 0.1 then; with the larger of both depths taken for the surface's, three."""
 
 
 def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
