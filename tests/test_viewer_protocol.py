@@ -198,7 +198,7 @@ def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: 
 def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 3, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: browser.widget("step")["value"] == 2 and "agree" in browser.text(), "the job")
+        browser.wait(lambda: browser.widget("step")["value"] == 2 and "15 agree" in browser.text(), "the job")
         assert not browser.widget("look through this camera")["disabled"]
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "step 1")
