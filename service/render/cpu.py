@@ -4,6 +4,7 @@ The steps are in `project` (ellipses and colours), `tiles` (depth order, tile li
 `backward` (gradients); `pack` has the memory layout. Semantics are gsplat's, with two additions: the 0.3 px^2
 screen-space dilation, right at the resolution the scene was trained at, is scaled by (f_render / f_train)^2, which
 takes the bias out of small renders; and whole blocks of 256 Gaussians outside 1.3 times the field of view are culled.
+Where asked, a picture ends early (`roughly`) and leaves out what lies beyond given depths (`horizons`).
 """
 
 from __future__ import annotations
