@@ -22,7 +22,8 @@ from service.pose.index import ViewIndex
 from service.pose.pnp import resection
 from service.pose.retrieval import top
 from service.pose.views import PHOTO_PX, correspondences, photo_features
-from service.types import IterationRecord, PoseEstimate, Query, StageTiming, Status
+from service.results import IterationRecord, PoseEstimate, StageTiming, Status
+from service.types import Query
 
 VIEWS = 3
 """Of each scene, that the photo is matched with."""

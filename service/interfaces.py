@@ -9,7 +9,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from service.types import Camera, GaussianScene, IterationRecord, Query
+from service.results import IterationRecord
+from service.types import Camera, GaussianScene, Query
 
 
 @dataclass(frozen=True, slots=True)

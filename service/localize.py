@@ -30,18 +30,10 @@ from service.matchers import MATCHERS
 from service.pose.gate import LOCALIZED, doubted, verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
+from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
-from service.types import (
-    GaussianScene,
-    IterationRecord,
-    PoseEstimate,
-    Query,
-    Reason,
-    StageTiming,
-    Status,
-    Verdict,
-)
+from service.types import GaussianScene, Query
 
 DEFAULT_ESTIMATOR = "view_index"
 RASTERIZER_ORDER = ("gsplat_cuda", "cpu")

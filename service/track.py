@@ -24,22 +24,12 @@ from service.geometry import moved, pose_distance, se3_log
 from service.interfaces import Frame, RenderTally, Tools
 from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
 from service.pose.alignment import Evidence, align, evidence
-from service.pose.gate import appearance, clear, geometry_signals, judged, verify
+from service.pose.appearance import appearance
+from service.pose.gate import clear, geometry_signals, judged, verify
 from service.pose.views import known_at, photo_at, sized
 from service.render.counted import Counted
-from service.types import (
-    EXACT,
-    Camera,
-    IterationRecord,
-    Lens,
-    Pose,
-    PoseEstimate,
-    Query,
-    Reason,
-    StageTiming,
-    Status,
-    Verdict,
-)
+from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
+from service.types import EXACT, Camera, Lens, Pose, Query
 
 PHOTO_LONG_SIDE = 832
 """Photos of a sequence needn't be decoded larger."""

@@ -23,21 +23,8 @@ from service.api.convert import intrinsics_out, named_camera_out, pose_out, reco
 from service.api.schemas import FrameOut, JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
 from service.api.splats import packed_splats
 from service.geometry import look_at
-from service.types import (
-    Camera,
-    Candidates,
-    GaussianScene,
-    Intrinsics,
-    IterationRecord,
-    MatchVectors,
-    NamedCamera,
-    Pose,
-    PoseEstimate,
-    Reason,
-    SceneInfo,
-    Status,
-    Verdict,
-)
+from service.results import Candidates, IterationRecord, MatchVectors, PoseEstimate, Reason, Status, Verdict
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 

@@ -8,8 +8,8 @@ import pytest
 from service.bench import ablation
 from service.bench.ablation import CONDITIONS, removals, run, table
 from service.errors import UnknownName
-from service.estimators import view_index
 from service.geometry import look_at, moved, pose_distance, project, transformed
+from service.pose import stages
 from service.pose.pnp import Resection
 from service.pose.views import Correspondences
 from service.types import Intrinsics, Query
@@ -38,7 +38,7 @@ def test_the_decoupled_solver_and_its_stand_in_find_the_planted_pose_among_wrong
     query = Query(
         rgb=np.zeros((384, 512, 3), np.uint8), intrinsics=LENS, photo_intrinsics=LENS, intrinsics_source="given"
     )
-    for solve in (view_index._solved_near, ablation._resected_again):
+    for solve in (stages.solved_near, ablation._resected_again):
         found = solve(near, matches, query)
         assert found is not None
         degrees, units = pose_distance(found.pose, truth)

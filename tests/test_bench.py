@@ -24,7 +24,8 @@ from service.images import encode_image, read_query, with_palette
 from service.interfaces import Frame
 from service.localize import LoadedScene
 from service.pose.focus import centre_depth
-from service.types import Camera, Intrinsics, Pose, PoseEstimate, Reason, Status, Verdict
+from service.results import PoseEstimate, Reason, Status, Verdict
+from service.types import Camera, Intrinsics, Pose
 
 UP = np.array([0.0, 0.0, 1.0])
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -21,7 +21,8 @@ from service.localize import LoadedScene, Request, localize
 from service.pose.descent import photometric
 from service.pose.losses import LOSSES, loss_against
 from service.pose.views import to_uint8
-from service.types import Camera, Candidates, Intrinsics, IterationRecord, MatchVectors, Pose, Query, Reason, Status
+from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
+from service.types import Camera, Intrinsics, Pose, Query
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 LENS_UPRIGHT = Intrinsics(HEIGHT, WIDTH, FOCAL, FOCAL, HEIGHT / 2, WIDTH / 2)
@@ -229,7 +230,7 @@ def test_an_alignment_that_does_not_settle_is_followed_by_another_match(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a photo whose lens is free: here it would settle with some more rounds."""
-    monkeypatch.setattr("service.estimators.view_index.ALIGNMENTS", 1)
+    monkeypatch.setattr("service.pose.stages.ALIGNMENTS", 1)
     photo = photo_at(room, unseen_pose(4))
     lens = replace(photo.intrinsics, fx=1.05 * FOCAL, fy=1.05 * FOCAL, trust="approximate")
     found = localize(replace(photo, intrinsics=lens, photo_intrinsics=lens), room)

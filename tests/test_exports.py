@@ -16,16 +16,8 @@ from service.api.geo import geographic
 from service.api.schemas import Result
 from service.errors import NoGeoAnchor
 from service.geometry import look_at, rotation_from_quat
-from service.types import (
-    GeoAnchor,
-    Intrinsics,
-    Pose,
-    PoseEstimate,
-    Reason,
-    StageTiming,
-    Status,
-    Verdict,
-)
+from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
+from service.types import GeoAnchor, Intrinsics, Pose
 
 CREATED = datetime(2026, 1, 2, 3, 4, 5, 250_000, tzinfo=UTC)
 POSE = look_at(np.array([1.0, 2.0, 3.0]), np.array([4.0, 4.0, 2.0]), np.array([0.0, 0.0, 1.0]))

@@ -18,7 +18,7 @@ from service.geometry import moved
 from service.interfaces import ImageMatcher, ImagePairs, Matcher
 from service.localize import LoadedScene, Request, localize
 from service.matchers import MATCHERS, networks, xfeat
-from service.types import Status
+from service.results import Status
 
 GLUED = ("aliked_lightglue", "disk_lightglue")
 

@@ -17,18 +17,8 @@ from service.errors import BackendMissing, EstimatorFault
 from service.geometry import moved
 from service.interfaces import Features, Frame, SceneGradients
 from service.localize import Cancelled, LoadedScene, Request, localize
-from service.types import (
-    Camera,
-    GaussianScene,
-    Intrinsics,
-    IterationRecord,
-    Lens,
-    Pose,
-    Query,
-    Reason,
-    SceneInfo,
-    Status,
-)
+from service.results import IterationRecord, Reason, Status
+from service.types import Camera, GaussianScene, Intrinsics, Lens, Pose, Query, SceneInfo
 
 LENS = Intrinsics(64, 64, 60.0, 60.0, 32.0, 32.0)
 QUERY = Query(np.zeros((64, 64, 3), np.uint8), LENS, "guessed", LENS.resized(128, 128), warnings=("from the photo",))

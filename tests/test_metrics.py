@@ -6,7 +6,8 @@ import pytest
 from service.bench.metrics import Outcome, Units, errors, summary, units_of
 from service.geometry import look_at, moved, pose_distance, so3_exp
 from service.pose.focus import is_forward_facing
-from service.types import Camera, Intrinsics, Pose, Status
+from service.results import Status
+from service.types import Camera, Intrinsics, Pose
 
 LENS = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0)
 UP = np.array([0.0, 0.0, 1.0])

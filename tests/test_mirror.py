@@ -16,7 +16,8 @@ from service.geometry import project, transformed
 from service.localize import LoadedScene, localize
 from service.pose.gate import FLOORS
 from service.pose.mirror import mirrored
-from service.types import Box, Pose, Query, Reason, Status
+from service.results import Reason, Status
+from service.types import Box, Pose, Query
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 

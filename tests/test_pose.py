@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from hypothesis import strategies as st
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.alignment import align
-from service.pose.gate import SCALES, Scale, clear, colour_agreement, gradient_agreement, probability, verify
+from service.pose.appearance import Blocks, Pair, colour_agreement, gradient_agreement, tint_agreement
+from service.pose.gate import SCALES, Scale, clear, probability, verify
 from service.pose.index import built_index, prepared_index
 from service.pose.pnp import reprojection_error_px, resection
 from service.pose.retrieval import top, vote
@@ -30,7 +32,8 @@ from service.pose.views import (
     sized,
     to_uint8,
 )
-from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, Query, Reason, SceneInfo, Status
+from service.results import Reason, Status
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, Query, SceneInfo
 
 LENS = Intrinsics(192, 160, 170.0, 168.0, 97.0, 79.0)
 UP = np.array([0.0, 0.0, 1.0])
@@ -402,7 +405,14 @@ def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place()
     half_hidden[:, 210:] = 255 * np.random.default_rng(0).integers(0, 2, (320, 174, 3))
     known = np.ones((320, 384), bool)
     known[:, 210:] = False
-    for measure in (gradient_agreement, colour_agreement):
+
+    def gradients(*images: Any) -> tuple[float, float]:
+        return gradient_agreement(Blocks.of(Pair.of(*images)))
+
+    def colours(*images: Any) -> tuple[float, float]:
+        return colour_agreement(Pair.of(*images))
+
+    for measure in (gradients, colours):
         assert min(measure(to_uint8(frame.rgb), frame)) > 0.99
         assert min(measure(darker, frame)) > 0.95
         assert measure(hidden, frame)[0] > 0.9
@@ -420,14 +430,48 @@ def test_a_half_of_one_colour_tells_nothing_against_a_pose() -> None:
     rgb = frame.rgb.copy()
     rgb[:, :250] = 1.0
     bright = Frame(rgb, frame.alpha, frame.depth, frame.median_depth)
-    most, half = colour_agreement(to_uint8(0.97 * rgb), bright)
+    most, half = colour_agreement(Pair.of(to_uint8(0.97 * rgb), bright))
     assert half >= most > 0.95
 
 
-def test_pixels_are_enough_only_where_colours_agree_too() -> None:
-    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "drift_px": 0.1}
+def test_tints_tell_like_things_of_other_colours_apart_but_forgive_light_and_what_hides_them() -> None:
+    """Nine like balls in a row of rows; the colours of three are exchanged, as if they were seen one further on."""
+    rng = np.random.default_rng(0)
+    colours = rng.uniform(0.1, 0.9, (9, 3)).astype(np.float32)
+
+    def balls(colour: np.ndarray) -> np.ndarray:
+        rgb = np.full((320, 384, 3), 0.95, np.float32)
+        y, x = np.indices((320, 384))
+        for number, rgb_of in enumerate(colour):
+            row, column = divmod(number, 3)
+            dx, dy = (x - 64 - 128 * column) / 45, (y - 55 - 105 * row) / 45
+            shade = np.sqrt(np.clip(1 - dx**2 - dy**2, 0, 1)) * (1 + 0.3 * np.sin(8 * dx) * np.sin(8 * dy))
+            inside = (dx**2 + dy**2 < 1)[..., None]
+            rgb = np.where(inside, rgb_of * (0.4 + 0.6 * shade[..., None]), rgb)
+        return rgb.astype(np.float32)
+
+    def tints(photo: np.ndarray) -> float:
+        return tint_agreement(Blocks.of(Pair.of(to_uint8(photo), frame)))
+
+    flat = np.ones((320, 384), np.float32)
+    frame = Frame(balls(colours), flat, flat, flat)
+    assert tints(frame.rgb) > 0.999
+    assert tints(np.clip(0.7 * frame.rgb * np.array([0.9, 1.0, 1.1], np.float32) + 0.05, 0, 1)) > 0.97
+    assert tints(frame.rgb**1.4) > 0.95
+    hidden = frame.rgb.copy()
+    hidden[:160, :130] = rng.uniform(0, 1, (160, 130, 3))
+    assert tints(hidden) > 0.95
+    exchanged = balls(colours[[1, 2, 0, 3, 4, 5, 6, 7, 8]])
+    assert tints(exchanged) < 0.9
+    assert gradient_agreement(Blocks.of(Pair.of(to_uint8(exchanged), frame)))[0] > 0.9
+    assert tint_agreement(Blocks.of(Pair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0  # nothing agrees
+
+
+def test_pixels_are_enough_only_where_tints_agree_too() -> None:
+    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "tints": 0.99}
+    signals["drift_px"] = 0.1
     assert clear(signals)
-    assert not clear(signals | {"colours": 0.89, "colours_half": 0.95})  # one sphere of a row too far
+    assert not clear(signals | {"tints": 0.85})  # one sphere of a row too far
     assert not clear(signals | {"gradients": 0.5, "gradients_half": 0.7})
 
 

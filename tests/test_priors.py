@@ -14,7 +14,8 @@ from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
 from service.pose.region import admits, excess, loosened
-from service.types import Box, Gaussian, Pose, PoseEstimate, Reason, Region, Status
+from service.results import PoseEstimate, Reason, Status
+from service.types import Box, Gaussian, Pose, Region
 
 TRUTH = unseen_pose()
 FAST = Request(options=Options(effort="fast"))

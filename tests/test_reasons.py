@@ -18,7 +18,8 @@ from service.localize import LoadedScene, Request, localize
 from service.pose.alignment import align
 from service.pose.gate import verify
 from service.pose.mirror import mirrored
-from service.types import HINTS, Box, Camera, Pose, Query, Reason, Status, Verdict
+from service.results import HINTS, Reason, Status, Verdict
+from service.types import Box, Camera, Pose, Query
 
 TRUTH = unseen_pose()
 UP = np.array([0.0, 0.0, 1.0])

@@ -14,8 +14,9 @@ from service.api.schemas import Timing
 from service.geometry import pose_distance
 from service.localize import LoadedScene, Request, localize
 from service.pose.rivals import ranked
+from service.results import IterationRecord, Reason, Status
 from service.track import Tracker
-from service.types import IterationRecord, Pose, Reason, Status
+from service.types import Pose
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from service.api.convert import record_out
 from service.api.splats import importance, packed_splats
 from service.geometry import look_at, project, transformed
-from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Reason, Status
+from service.results import IterationRecord, MatchVectors, Reason, Status
+from service.types import Camera, Intrinsics
 from viewer import charts, draw, measure, shapes
 from viewer.client import Answer, JobView, Service, ServiceTrouble, parsed_record, parsed_splats, sse_events
 from viewer.feed import JobFeed, Library

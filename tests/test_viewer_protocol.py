@@ -24,7 +24,8 @@ import zstandard
 from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
-from service.types import Lens, Reason, Status
+from service.results import Reason, Status
+from service.types import Lens
 from viewer import app, draw, private, session, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble

@@ -12,7 +12,8 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Float64
 
-from service.types import IterationRecord, Pose
+from service.results import IterationRecord
+from service.types import Pose
 from viewer.measure import SHORTEST_PX, MatchView, angle_counts, mean_angle_deg, pose_error
 
 _BINS = 24

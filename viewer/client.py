@@ -1,4 +1,4 @@
-"""The service as the viewer sees it: HTTP in, values of `service.types` out. The only file with httpx."""
+"""The service as the viewer sees it: HTTP in, values of `service.types` and `results` out. The only file with httpx."""
 
 from __future__ import annotations
 
@@ -13,17 +13,8 @@ import httpx
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from service.types import (
-    Camera,
-    Candidates,
-    Intrinsics,
-    IterationRecord,
-    Lens,
-    MatchVectors,
-    NamedCamera,
-    Pose,
-    frozen,
-)
+from service.results import Candidates, IterationRecord, MatchVectors
+from service.types import Camera, Intrinsics, Lens, NamedCamera, Pose, frozen
 
 FINISHED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 _JOBS_LISTED = 50

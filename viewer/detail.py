@@ -16,7 +16,7 @@ from typing import cast
 import numpy as np
 from jaxtyping import UInt8
 
-from service.types import IterationRecord
+from service.results import IterationRecord
 from viewer.charts import curves_html, stages_html, vectors_html
 from viewer.client import ServiceTrouble
 from viewer.draw import ColourBy, Mode, Overlay, beside, flicker_html, flow, match_colours, overlaid, reduced

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from service.types import IterationRecord
+from service.results import IterationRecord
 from viewer.client import JobSummary, JobView, SceneView, Service, ServiceTrouble, Splats
 from viewer.draw import decode
 from viewer.measure import Lifted, lifted

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
-from service.types import Camera, Intrinsics, MatchVectors, Pose
+from service.results import MatchVectors
+from service.types import Camera, Intrinsics, Pose
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,8 @@ from html import escape
 
 import numpy as np
 
-from service.types import IterationRecord, Pose
+from service.results import IterationRecord
+from service.types import Pose
 from viewer.client import Answer, JobSummary, JobView
 from viewer.draw import INLIER, OUTLIER, ColourBy, Mode, score_colours
 from viewer.measure import MatchView, pose_error

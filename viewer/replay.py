@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import viser
 
-from service.types import IterationRecord
+from service.results import IterationRecord
 from viewer import shapes
 from viewer.client import JobView, Splats
 from viewer.draw import match_colours, reduced

@@ -15,7 +15,8 @@ import viser
 import viser.transforms as vt
 from jaxtyping import Float64, UInt8
 
-from service.types import Camera, Candidates, Intrinsics, IterationRecord, Pose
+from service.results import Candidates, IterationRecord
+from service.types import Camera, Intrinsics, Pose
 from viewer import shapes
 from viewer.client import JobView
 from viewer.draw import score_colours

@@ -22,8 +22,9 @@ from service.api.trajectory import Trajectory
 from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFailed
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.logs import bound
+from service.results import IterationRecord
 from service.track import localize_sequence
-from service.types import IterationRecord, Query
+from service.types import Query
 
 _log = logging.getLogger(__name__)
 

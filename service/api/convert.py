@@ -31,20 +31,8 @@ from service.api.schemas import (
     Transform,
 )
 from service.geometry import quat_from_rotation
-from service.types import (
-    HINTS,
-    Box,
-    Camera,
-    GeoAnchor,
-    Intrinsics,
-    IterationRecord,
-    Lens,
-    NamedCamera,
-    Pose,
-    PoseEstimate,
-    Region,
-    StageTiming,
-)
+from service.results import HINTS, IterationRecord, PoseEstimate, StageTiming
+from service.types import Box, Camera, GeoAnchor, Intrinsics, Lens, NamedCamera, Pose, Region
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: OpenGL's y points up and its z backwards. Its own inverse."""

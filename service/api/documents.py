@@ -38,8 +38,8 @@ from service.localize import choose_rasterizer
 from service.matchers import MATCHERS
 from service.plugins import PluginFolder
 from service.render import RASTERIZERS
+from service.results import Status
 from service.scene_formats import SCENE_FORMATS
-from service.types import Status
 
 _PACKAGES = (
     "splatfix",

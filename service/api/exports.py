@@ -15,7 +15,8 @@ from service.api.convert import pose_out
 from service.api.schemas import FrameOut, IntrinsicsOut, PoseOut, Result
 from service.errors import NoGeoAnchor
 from service.intrinsics import ONE_FOCAL
-from service.types import Pose, Status
+from service.results import Status
+from service.types import Pose
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "geopose"]
 EXPORT_TYPES: dict[ExportFormat, str] = {

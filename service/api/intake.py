@@ -36,7 +36,8 @@ from service.images import read_query
 from service.intrinsics import intrinsics_from
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 from service.pose.region import admits
-from service.types import Box, Gaussian, Intrinsics, Pose, Query, Region, StageTiming
+from service.results import StageTiming
+from service.types import Box, Gaussian, Intrinsics, Pose, Query, Region
 
 _FIELDS = frozenset(LocalizeIn.model_fields)
 _ERRORS = {

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.types import Reason, Status
+from service.results import Reason, Status
 
 Matrix = list[list[float]]
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]

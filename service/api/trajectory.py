@@ -8,8 +8,9 @@ from service.api.convert import covariance_out, record_out, result_out, timing_o
 from service.api.documents import versions
 from service.api.schemas import FrameOut, Record, Result
 from service.localize import Clock
+from service.results import PoseEstimate, StageTiming, Status
 from service.track import SequencePose
-from service.types import GeoAnchor, PoseEstimate, StageTiming, Status
+from service.types import GeoAnchor
 
 
 class Trajectory:

@@ -21,12 +21,13 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose import alignment, pyramid, sight
+from service.pose import alignment, pyramid, sight, stages
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
 from service.pose.views import Correspondences
 from service.render import cpu
-from service.types import IterationRecord, Query
+from service.results import IterationRecord
+from service.types import Query
 
 CONDITIONS = {
     "clean": (), "gain 1.4": ("gain=1.4",), "roll 45": ("roll=45",), "crop 0.5": ("crop=0.5",),
@@ -51,7 +52,7 @@ class Removal:
 
 def removals() -> dict[str, Removal]:
     """Return the parts, and how the estimator does without each."""
-    v, a = view_index, alignment
+    v, s, a = view_index, stages, alignment
     return {
         "nothing": Removal(),
         "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
@@ -63,9 +64,9 @@ def removals() -> dict[str, Removal]:
         "photo turned": Removal(((v, "turned_sight", _upright),)),
         "sampled poses (effort fast)": Removal(options=view_index.Options(effort="fast")),
         "rendering and matching again": Removal(((v, "STRONG", 0),)),
-        "alignment": Removal(((v, "_aligned", _as_found),)),
-        "second render of the alignment": Removal(((v, "ALIGNMENTS", 1), (v, "FIRST_ALIGNED_PX", None))),
-        "small first render": Removal(((v, "FIRST_ALIGNED_PX", None),)),
+        "alignment": Removal(((v, "aligned", _as_found), (s, "aligned", _as_found))),
+        "second render of the alignment": Removal(((s, "ALIGNMENTS", 1), (s, "FIRST_ALIGNED_PX", None))),
+        "small first render": Removal(((s, "FIRST_ALIGNED_PX", None),)),
         "larger second look": Removal(((v, "SECOND_LOOK", 1.0),)),
         "gain, bias, gamma, blur": Removal(((a, "_solved", _without_look),)),
         "L1 weights": Removal(((a._Level, "residuals", _evenly_weighted),)),
@@ -74,7 +75,7 @@ def removals() -> dict[str, Removal]:
         "depth of the occluder at edges": Removal(((a, "edge_owner_depth", _own_depth),)),
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
-        "decoupled solver (PnP again instead)": Removal(((v, "_solved_near", _resected_again),)),
+        "decoupled solver (PnP again instead)": Removal(((s, "solved_near", _resected_again),)),
         "look in the mirror": Removal(((v._Hunt, "reflect", _nothing),)),
         "look elsewhere": Removal(((v._Hunt, "contest", _nothing),)),
     }
@@ -164,7 +165,7 @@ def _patched(patches: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
 
 # --- what stands in for the parts
 
-_SOLVED, _RESIDUALS, _SOLVED_NEAR = alignment._solved, alignment._Level.residuals, view_index._solved_near
+_SOLVED, _RESIDUALS, _SOLVED_NEAR = alignment._solved, alignment._Level.residuals, stages.solved_near
 
 
 def _any_views(index: ViewIndex, descriptors: np.ndarray) -> np.ndarray:
@@ -222,4 +223,4 @@ def _resected_again(near: Resection, matches: Correspondences, query: Query) -> 
     """Solve the matches with a render at a pose as if they were with a view, where the lens is known."""
     if query.focal_sigma:
         return _SOLVED_NEAR(near, matches, query)
-    return view_index._resected(matches, query, view_index.REMATCH_ERROR_PX, 500)
+    return stages.resected(matches, query, stages.REMATCH_ERROR_PX, 500)

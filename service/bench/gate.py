@@ -28,17 +28,19 @@ from jaxtyping import Bool, Float32, Float64
 from service.bench.localize import Subject, subject
 from service.bench.metrics import COARSE, errors, nees
 from service.bench.queries import BenchPhoto, sent
-from service.estimators.view_index import GOOD_MATCH, Options
+from service.estimators.view_index import Options
 from service.geometry import moved
 from service.images import encode_image, read_query, resized
 from service.interfaces import Tools
 from service.localize import Request, localize
 from service.pose.alignment import align
-from service.pose.gate import BY_PIXELS, CLEAR_COLOURS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
 from service.pose.mirror import mirrored
+from service.pose.stages import GOOD_MATCH
 from service.pose.views import photo_at, rendered_frame
+from service.results import Reason, Status, Verdict
 from service.track import aligned_from, glance
-from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
+from service.types import Camera, Intrinsics, Pose, Query
 
 WITHIN_REASON: tuple[tuple[str, ...], ...] = (
     (), ("gain=0.7",), ("gain=1.4",), ("gamma=0.6",), ("gamma=1.6",), ("white_balance=1.25",), ("blur=4",),
@@ -245,7 +247,7 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
     kinds = np.array([sample.kind for sample in samples])
     doubted = np.array([sample.doubted for sample in samples])
     usual = right & ~np.char.startswith(kinds, "beyond")
-    clear = np.array([sample.matched and sample.signals["colours"] > CLEAR_COLOURS for sample in samples])
+    matched = np.array([sample.matched for sample in samples])
     result: dict[str, Any] = {"glance": _glances(glanced)}
     by_pixels = np.zeros(len(samples))
     for name, model in (("by_pixels", BY_PIXELS), ("with_matches", WITH_MATCHES)):
@@ -261,7 +263,7 @@ def summary(samples: Sequence[Sample]) -> dict[str, Any]:
         if name == "by_pixels":
             by_pixels = tested
         else:  # as the estimator asks: matches only where the pixels don't make it clear
-            tested = np.where(clear & (by_pixels >= LOCALIZED), np.maximum(by_pixels, tested), tested)
+            tested = np.where(matched & (by_pixels >= LOCALIZED), np.maximum(by_pixels, tested), tested)
         ends = [SCALES[n].value_at(f) for n, f in zip(list(model)[1:], floors(features[usual])[1:], strict=True)]
         result[name] = {
             "weights": dict(zip(model, np.round(fitted(features[~doubted], right[~doubted]), 2).tolist(), strict=True)),

@@ -27,9 +27,10 @@ from service.estimators import ESTIMATORS
 from service.images import read_query
 from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.pose.focus import centre_depth
+from service.results import PoseEstimate
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
-from service.types import Camera, GaussianScene, Intrinsics, Pose, PoseEstimate
+from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 MAX_OCCLUDERS = 20

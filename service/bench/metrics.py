@@ -10,7 +10,8 @@ from jaxtyping import Float64
 
 from service.geometry import pose_distance, se3_log
 from service.pose.focus import focus_of
-from service.types import Camera, Pose, PoseEstimate, Status
+from service.results import PoseEstimate, Status
+from service.types import Camera, Pose
 
 FOCUS_DISTANCE = 4.0
 """Median distance of the training cameras from the focus, in normalized units."""

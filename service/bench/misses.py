@@ -17,7 +17,8 @@ from jaxtyping import Bool, Float32
 
 from service.bench.localize import Subject, Trial
 from service.images import encode_image, read_query, resized
-from service.types import Camera, PoseEstimate
+from service.results import PoseEstimate
+from service.types import Camera
 
 LONG_SIDE = 480
 DIFFERENCE_GAIN = 4.0

@@ -25,9 +25,10 @@ from service.images import encode_image, read_query
 from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request
 from service.pose.focus import centre_depth
+from service.results import PoseEstimate, Status
 from service.scene_formats import load_scene
 from service.track import PHOTO_LONG_SIDE, Tracker
-from service.types import Camera, Intrinsics, Pose, PoseEstimate, Status
+from service.types import Camera, Intrinsics, Pose
 
 STEP_DEG, STEP_UNITS = 0.7, 0.02
 LONG_SIDE = 800

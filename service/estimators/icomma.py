@@ -30,7 +30,8 @@ from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import loss_against, require_loss
 from service.pose.matching import epipolar_inliers, match_record, render_and_match
 from service.pose.views import RENDER_PX, Correspondences, known_at, photo_at, sized
-from service.types import Camera, Intrinsics, IterationRecord, Pose, Query
+from service.results import IterationRecord
+from service.types import Camera, Intrinsics, Pose, Query
 
 MATCHES_IMAGES = True
 """It works with matchers that have no features of one image."""

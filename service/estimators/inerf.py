@@ -24,7 +24,8 @@ from service.pose.descent import Se3, photometric, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import Loss, interest_region, loss_against, require_loss
 from service.pose.views import RENDER_PX, known_at, photo_at, sized
-from service.types import IterationRecord, Pose, Query
+from service.results import IterationRecord
+from service.types import Pose, Query
 
 DECAY, DECAY_STEPS = 0.8, 100
 LIMITS = {"steps": (1, 100_000), "rays": (0, 10_000_000), "rate": (0, 10), "long_side_px": (32, 4096)}

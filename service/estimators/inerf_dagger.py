@@ -11,7 +11,8 @@ from service.interfaces import Tools
 from service.pose.descent import require_within
 from service.pose.losses import require_loss
 from service.pose.views import RENDER_PX
-from service.types import IterationRecord, Query
+from service.results import IterationRecord
+from service.types import Query
 
 prepare = inerf.prepare
 

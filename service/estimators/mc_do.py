@@ -36,7 +36,8 @@ from service.pose.viewpoints import index_cameras
 from service.pose.views import RENDER_PX, Correspondences, View, known_at, photo_at, sized
 from service.render import RASTERIZERS
 from service.render.counted import Counted
-from service.types import Camera, Candidates, IterationRecord, Pose, Query
+from service.results import Candidates, IterationRecord
+from service.types import Camera, Pose, Query
 
 MATCHES_IMAGES = True
 """It works with matchers that have no features of one image."""

@@ -28,7 +28,8 @@ from service.pose.descent import So3T3, photometric, require_within
 from service.pose.focus import Focus, focus_of_scene
 from service.pose.losses import loss_against, require_loss
 from service.pose.views import known_at, photo_at, sized
-from service.types import Candidates, IterationRecord, Pose, Query
+from service.results import Candidates, IterationRecord
+from service.types import Pose, Query
 
 DECAY, DECAY_STEPS = 0.33, 256
 START_DEG, START_UNITS = 15.0, 0.3

@@ -7,14 +7,14 @@
 
 At first the photo is looked at in a small size. Only if the gate doesn't accept the answer the dearer searches are
 tried: in its full size, turned as its corners tell; larger still, with further views; then poses sampled near views.
-From a prior pose alignment is tried at once; where that fails it is one more candidate view. Sizes and rounds are the
-research's; numbers that were measured stand beside the constants.
+From a prior pose alignment is tried at once; where that fails it is one more candidate view. What a search does is in
+`service/pose/stages.py`. Sizes and rounds are the research's; numbers that were measured stand beside the constants.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -23,18 +23,14 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from service.errors import InvalidOptions
-from service.geometry import pose_distance
 from service.interfaces import Tools
-from service.pose.alignment import align
-from service.pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
-from service.pose.focal import WIDER, focal_resection, refine
-from service.pose.gate import UNCERTAIN, appearance, glance, verify
+from service.pose.appearance import appearance
+from service.pose.gate import UNCERTAIN, glance, verify
 from service.pose.hypotheses import poses_near_views
 from service.pose.index import ViewIndex, prepared_index
 from service.pose.matching import render_and_match
 from service.pose.mirror import BEYOND_DOUBT, OUT_OF_REACH, mirrored, unlikeness
-from service.pose.pnp import Resection, resection
-from service.pose.region import admits, loosened
+from service.pose.pnp import Resection
 from service.pose.retrieval import top
 from service.pose.rivals import apart, ranked, rivals, whole
 from service.pose.sight import (
@@ -45,28 +41,21 @@ from service.pose.sight import (
     first_sight,
     turned_sight,
 )
+from service.pose.stages import GOOD_MATCH, aligned, match_record, matched, refined, rematched, resected
 from service.pose.views import (
     MATCH_ERROR_PX,
     PHOTO_PX,
-    Correspondences,
-    View,
-    correspondences,
     known_at,
     photo_at,
-    photo_features,
     rendered_frame,
     rendered_view,
     sized,
 )
-from service.types import EXACT, Camera, Candidates, IterationRecord, MatchVectors, Pose, Query, Reason, Status
+from service.results import Candidates, IterationRecord, Reason, Status
+from service.types import Camera, Query
 
-REMATCH_ERROR_PX = 3.0
 GLIMPSES = 2
 """Views that the small photo is matched with."""
-GOOD_MATCH = 60
-"""Inliers with one view that make further views needless."""
-CHANCE = 15
-"""Fewer inliers with a render at the pose are chance: photos of other scenes have 6 to 12."""
 WORTH, WORTH_SHARE = 12, 0.055
 """Inliers, and their share of the matches, from which on it is worth to render there: of 168 searches with fewer, 119
 of them for photos of other scenes, none led anywhere; with 12 to 30 those have a median share of 0.04 to 0.05."""
@@ -79,25 +68,12 @@ MOST_ROUNDS = 100
 """Of an exhaustive search without a budget."""
 PROMISING = 12
 """Inliers of a sampled pose with which it is worth a larger render."""
-SETTLED_PX = 0.3
-"""Where alignment moved what is seen by less, another render would be the same."""
-LENS_SETTLED_PX = 0.05
-"""The same while the focal length is free: it hides behind the distance, and hardly moves what is seen."""
-SETTLED_DEG, SETTLED_SHARE = 0.3, 0.005
-"""A rematch that moves the pose by less (share: of the distance to what is seen) is the last."""
 OUT_OF_QUESTION = 3.0
 """Times the answer's mean residual, after one alignment: no such rival is an answer, or nearly as good as one."""
 MISFIT = 0.1
 """Mean residual (0..1) of an alignment that led nowhere; right ones have 0.005 to 0.06."""
 UNMENDABLE = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
 """Doubts about a pose at which photo and render agree: no other search knows better."""
-FIRST_ALIGNED_PX = 256
-"""Long side of the first render that is aligned: it is as good as the big one at bringing the pose near."""
-ASTRAY_DEG = 10.0
-"""An alignment that turns the camera by more, away from a pose with many matches, is wrong."""
-REMATCHES, ALIGNMENTS = 3, 4
-"""Rounds of rendering at the pose and matching, or aligning, with that; at most."""
-DECOUPLED_STEPS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,9 +153,9 @@ class _Hunt:
         if last is None or last.stage != "align":
             return  # the search gave up
         known = self.query.corrected(last.lens)
-        matched = last.num_inliers or 0
-        enough = expected or (matched >= GOOD_MATCH and not known.focal_sigma)
-        seen = glance(known, last.pose, self.tools, matched) if enough else None
+        agreeing = last.num_inliers or 0
+        enough = expected or (agreeing >= GOOD_MATCH and not known.focal_sigma)
+        seen = glance(known, last.pose, self.tools, agreeing) if enough else None
         verdict = seen or verify(known, last.pose, self.tools)
         if self.answer is None or verdict.score > self.score:
             self.answer, self.score, self.sight = last, verdict.score, sight
@@ -238,10 +214,10 @@ class _Hunt:
         )  # fmt: skip
         for rival in suspected:
             rival, last = replace(rival, lens=self.answer.lens), None
-            first = next(_aligned(rival, self.query, self.tools), None)
+            first = next(aligned(rival, self.query, self.tools), None)
             if first is None or (first.loss or 0.0) > OUT_OF_QUESTION * (self.answer.loss or np.inf):
                 continue
-            for last in _refined(rival, self.query, self.tools):
+            for last in refined(rival, self.query, self.tools):
                 yield self._with_answer(last)
             if last is None or last.stage != "align" or not all(apart(last.pose, a.pose, distance) for a in answers):
                 continue
@@ -286,7 +262,7 @@ def _searches(
 def _from_prior(query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Align from the prior pose, which may be some ten degrees off; end early where nothing fits."""
     assert query.prior is not None
-    for record in _aligned(Resection(query.prior, np.zeros(0, bool)), query, tools):
+    for record in aligned(Resection(query.prior, np.zeros(0, bool)), query, tools):
         if (record.loss or 0.0) > MISFIT:
             return
         yield replace(record, num_inliers=None)
@@ -311,23 +287,23 @@ def _search(
     views = (index.views[untried.popleft()] for _ in range(len(untried)))
     if query.prior and stage == "retrieve":
         views = chain([rendered_view(query.prior, query, tools)[0]], views)
-    found = yield from _matched(sight, views, query, tools)
+    found = yield from matched(sight, views, query, tools)
     if found and found.num_inliers < max(WORTH, WORTH_SHARE * len(found.inlier)):
         return
     if found and found.num_inliers < STRONG:
-        found = yield from _rematched(found, query, tools)
-    unsettled = (yield from _aligned(found, query, tools)) if found else None
+        found = yield from rematched(found, query, tools)
+    unsettled = (yield from aligned(found, query, tools)) if found else None
     if unsettled:
-        yield from _refined(unsettled, query, tools)
+        yield from refined(unsettled, query, tools)
 
 
 def _reflected(sight: Sight, query: Query, tools: Tools, worst: float) -> Iterator[IterationRecord]:
     """Match a mirrored photo and align it; end early where the first alignment's residual is worse than this."""
     views = (tools.prepared.views[i] for i in top(sight.votes(query, tools), GLIMPSES))
-    found = yield from _matched(sight, views, query, tools)
+    found = yield from matched(sight, views, query, tools)
     if found is None or found.num_inliers < WORTH:
         return
-    for record in _aligned(found, query, tools):
+    for record in aligned(found, query, tools):
         if (record.loss or 0.0) > worst:
             return
         yield record
@@ -342,155 +318,9 @@ def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationReco
     best: Resection | None = None
     for pose in poses:
         matches, view = render_and_match(Camera(lens, pose), tools.rasterizer, query, tools)
-        found = _resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)
+        found = resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        yield _match_record("sample", best or pose, matches, found, view.camera)
+        yield match_record("sample", best or pose, matches, found, view.camera)
     if best and best.num_inliers >= PROMISING:
-        yield from _refined(best, query, tools)
-
-
-def _matched(
-    sight: Sight, views: Iterable[View], query: Query, tools: Tools
-) -> Generator[IterationRecord, None, Resection | None]:
-    """Match the photo with one view after the other until one explains it; else with all of them together."""
-    photo = sight.features(query, tools)
-    best: Resection | None = None
-    seen: list[Correspondences] = []
-    for view in views:
-        seen.append(correspondences(photo, view, tools.matcher))
-        found = _resected(seen[-1], query, sight.max_error_px, 500)
-        if found and (best is None or found.num_inliers > best.num_inliers):
-            best = found
-        yield _match_record("match", best or view.camera.pose, seen[-1], found, view.camera)
-        if best and best.num_inliers >= GOOD_MATCH:
-            return best
-    pooled = Correspondences.pooled(seen)
-    together = _resected(pooled, query, sight.max_error_px, 2000)
-    if together and (best is None or together.num_inliers > best.num_inliers):
-        best = together
-    if best is None:
-        return None
-    count = len(pooled.photo_px)
-    yield IterationRecord("pool", best.pose, best.lens, num_matches=count, num_inliers=best.num_inliers)
-    return best
-
-
-def _refined(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
-    """Match again, and align; where that goes astray the matches have the last word."""
-    again = yield from _rematched(found, query, tools)
-    unsettled = (yield from _aligned(again, query, tools)) if again else None
-    if again and unsettled is again:
-        yield IterationRecord("align", again.pose, again.lens, num_inliers=again.num_inliers)
-
-
-def _rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
-    """Render at the pose and match with that: a right pose gains matches, a chance one has none there."""
-    photo = photo_features(query, tools)
-    for _ in range(REMATCHES):
-        view, _ = rendered_view(found.pose, query.corrected(found.lens), tools)
-        matches = correspondences(photo, view, tools.matcher)
-        again = _solved_near(found, matches, query)
-        if again is None or again.num_inliers < CHANCE:
-            return None
-        step_deg, step_units = pose_distance(found.pose, again.pose)
-        distance = np.median(np.linalg.norm(view.points_in_world - again.pose.position_in_world, axis=1))
-        found = again
-        record = _match_record("rematch", found, matches, found, view.camera)
-        yield replace(record, step_deg=step_deg, step_units=step_units)
-        if step_deg < SETTLED_DEG and step_units < SETTLED_SHARE * distance:
-            break
-    return found
-
-
-def _aligned(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
-    """Align on a render, render at the result, align again, until a new render would be the same.
-
-    Returns where to match again: where a free lens and the distance have come to if they creep along together for too
-    long, where it began if it goes astray.
-    """
-    pose, camera, lens = found.pose, None, found.lens
-    for round_number in range(ALIGNMENTS + bool(query.focal_sigma)):
-        settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
-        size_px = FIRST_ALIGNED_PX if camera is None and not query.focal_sigma else None
-        frame, new_camera = rendered_frame(pose, query.corrected(lens), tools, settled if camera else 1.0, size_px)
-        if new_camera is camera:
-            return None
-        if round_number == ALIGNMENTS:
-            return replace(found, pose=pose, lens=lens)
-        camera = new_camera
-        size = camera.intrinsics
-        start = Camera(query.intrinsics.resized(size.width, size.height), pose)
-        levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
-        photo = photo_at(query, tools, size)
-        known = known_at(query, tools, size)
-        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px))
-        tools.memo["aligned"] = result  # for the gate
-        astray = found.num_inliers >= GOOD_MATCH and pose_distance(found.pose, result.pose)[0] > ASTRAY_DEG
-        if astray or not np.isfinite(result.loss):
-            return found if found.num_inliers >= GOOD_MATCH else None
-        step_deg, step_units = pose_distance(pose, result.pose)
-        pose, lens = result.pose, result.lens
-        yield IterationRecord(
-            "align",
-            pose,
-            lens,
-            result.loss,
-            num_inliers=found.num_inliers,
-            step_deg=step_deg,
-            step_units=step_units,
-        )
-
-
-def _resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> Resection | None:
-    """Resect with the photo's focal length, or with the best one if that is approximate."""
-    pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
-    given = (matches.photo_px, matches.points_in_world)
-    if query.focal_sigma:
-        found = focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
-    else:
-        found = resection(*given, query.intrinsics, pixels, max_trials)
-    return found if found and _possible(found.pose, matches, query) else None
-
-
-def _solved_near(near: Resection, matches: Correspondences, query: Query) -> Resection | None:
-    """Solve the matches with a render at a pose: decoupled from there; by PnP, and refined, if the lens is free."""
-    if query.focal_sigma:
-        pixels = REMATCH_ERROR_PX * query.intrinsics.long_side / PHOTO_PX
-        lens = query.intrinsics.corrected(near.lens)
-        found = resection(matches.photo_px, matches.points_in_world, lens, WIDER * pixels, 500)
-        if found:
-            found = replace(found, lens=near.lens)
-            given = (matches.photo_px, matches.points_in_world)
-            found = refine(*given, query.intrinsics, found, query.focal_sigma, pixels)
-    elif len(matches.photo_px) < MIN_POINTS:
-        return None
-    else:
-        points = matches.points_in_world.astype(np.float64)
-        centre = np.median(points, axis=0)
-        matched = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, centre)
-        solved = least_squares_solve(matched, near.pose, DECOUPLED_STEPS)
-        found = Resection(solved.pose, solved.weights >= 0.5, near.lens)
-    return found if found and _possible(found.pose, matches, query) else None
-
-
-def _possible(pose: Pose, matches: Correspondences, query: Query) -> bool:
-    """Tell whether the photo's region may hold what the pose leads to."""
-    if query.region is None:
-        return True
-    distance = np.median(np.linalg.norm(matches.points_in_world - pose.position_in_world, axis=1))
-    return admits(loosened(query.region, float(distance)), pose)
-
-
-def _match_record(
-    stage: str, best: Resection | Pose, matches: Correspondences, found: Resection | None, camera: Camera
-) -> IterationRecord:
-    inlier = found.inlier if found else np.zeros(len(matches.photo_px), bool)
-    return IterationRecord(
-        stage,
-        best if isinstance(best, Pose) else best.pose,
-        EXACT if isinstance(best, Pose) else best.lens,
-        num_matches=len(inlier),
-        num_inliers=int(inlier.sum()),
-        matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),
-    )
+        yield from refined(best, query, tools)

@@ -1,14 +1,14 @@
 """The verification gate: one rule that says of any estimator's answer whether to believe it.
 
 Signals of several kinds are measured at the pose: whether the render there has the photo's gradients (fine structure,
-whatever the exposure) and its colours (a row of equal things seen one further has the right edges and the wrong
-colours), each over most of the photo and over its better half (the other may be hidden); how many fresh matches
+whatever the exposure) and its colours, each over most of the photo and over its better half (the other may be hidden),
+and whether the colours agree where the gradients do (a row of like things seen one further, and a mirror image, have
+the right edges and the wrong colours; see `appearance.py`); how many fresh matches
 between photo and render agree with the pose, to the pixel and without any fit, what share that is, and how they are
 spread; and by how much alignment would still move the pose. Together they give a probability that the pose is right
 (within 5 degrees and 1/80 of the distance), by a logistic model whose weights `splatfix bench gate` fits and tests:
 each signal is cut off at both ends and weighs positively. Sums forgive, so each signal has a floor besides, that 249
-of 250 right poses stay above: below it a pose is in doubt, however good the rest (a mirrored picture of a row of
-spheres has all edges in place, and other colours).
+of 250 right poses stay above: below it a pose is in doubt, however good the rest.
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Float, Float32, Float64
 
 from service.interfaces import Frame, Tools
 from service.pose.alignment import Evidence, evidence
+from service.pose.appearance import APPEARANCE, MIN_ALPHA, appearance, both_known
 from service.pose.pnp import reprojection_error_px
 from service.pose.region import admits
 from service.pose.views import (
@@ -32,18 +33,10 @@ from service.pose.views import (
     photo_features,
     rendered_frame,
     rendered_view,
-    to_uint8,
 )
-from service.types import Camera, Intrinsics, Pose, Query, Reason, Status, Verdict
+from service.results import Reason, Status, Verdict
+from service.types import Camera, Intrinsics, Pose, Query
 
-GRADIENTS_PX = 192
-"""Long side at which photo and render are compared: coarse enough to forgive what training left blurred."""
-COLOUR_PX = 64
-SIGMA_PX = 0.7
-BLOCK_PX = 8
-HIDDEN_SHARE, HALF = 0.25, 0.5
-"""Of the photo, that may be hidden."""
-MIN_ALPHA = 0.5
 MAX_ERROR_PX = 4.0
 """At RENDER_PX. XFeat's points scatter by 1.5."""
 MIN_FEATURES = 30
@@ -78,6 +71,7 @@ SCALES = {
     "gradients_half": Scale(0.5, 0.99),
     "colours": Scale(0.2, 0.97),
     "colours_half": Scale(0.5, 0.99),
+    "tints": Scale(0.5, 0.99),
     "drift_px": Scale(20.0, 0.3, ratio=True),
     "inliers": Scale(10.0, 300.0, ratio=True),
     "inlier_share": Scale(0.1, 0.8),
@@ -85,28 +79,27 @@ SCALES = {
 }
 WITH_MATCHES = {
     "bias": -6.7, "gradients": 0.0, "gradients_half": 2.43, "colours": 0.0, "colours_half": 0.0,
-    "drift_px": 4.03, "inliers": 0.0, "inlier_share": 4.67, "inlier_spread": 0.0,
+    "tints": 0.0, "drift_px": 4.03, "inliers": 0.0, "inlier_share": 4.67, "inlier_spread": 0.0,
 }  # fmt: skip
 BY_PIXELS = {
-    "bias": -6.69, "gradients": 2.68, "gradients_half": 4.16, "colours": 0.0, "colours_half": 0.0, "drift_px": 4.28,
+    "bias": -6.69, "gradients": 2.68, "gradients_half": 4.16, "colours": 0.0, "colours_half": 0.0, "tints": 0.0,
+    "drift_px": 4.28,
 }  # fmt: skip
 FLOORS = {
-    "gradients": 0.613, "gradients_half": 0.836, "colours": 0.662, "colours_half": 0.863, "drift_px": 6.025,
-    "inliers": 106.731, "inlier_share": 0.513, "inlier_spread": 0.437,
+    "gradients": 0.613, "gradients_half": 0.836, "colours": 0.662, "colours_half": 0.863, "tints": 0.92,
+    "drift_px": 6.025, "inliers": 106.731, "inlier_share": 0.513, "inlier_spread": 0.437,
 }  # fmt: skip
-"""In `drift_px` a ceiling."""
+"""In `drift_px` a ceiling. In `tints` between right poses, which have 0.946 and more, and those that mistake a thing for
+its like or for its mirror image: nearly all at most 0.93."""
 LOCALIZED, UNCERTAIN = 0.8, 0.1
 """Least probabilities."""
 DOUBTFUL = 0.5
 """What remains of a good score where a signal or the lens is in doubt, or hardly anything is seen."""
-CLEAR_COLOURS = 0.95
-"""Without matches: of 170 right poses all have more than 0.99, of those that are one of a row of like things too far
-at most 0.9."""
 HOPELESS = 0.35
 """Mean of the scaled signals of a kind, below which nothing was recognised: foreign photos have 0.0 to 0.3."""
-APPEARANCE, UNLIKE = ("gradients", "gradients_half", "colours", "colours_half"), 0.3
-"""Signals whose scaled mean tells that a render is so unlike the photo that nothing else need be looked at: right poses
-of photos spoilt within reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
+UNLIKE = 0.3
+"""Scaled mean of how photo and render look below which nothing else need be looked at: right poses of photos spoilt
+within reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
 NO_MATCHES = {"inliers": 0.0, "inlier_share": 0.0, "inlier_spread": 0.0}
 MIN_COVERAGE = 0.04
 MAX_SIGMA_SHARE = 0.0085
@@ -156,7 +149,7 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
     view, _ = rendered_view(pose, query, tools)
     known = known_at(query, tools, size)
     found = correspondences(photo, view, tools.matcher)
-    signals |= _match_signals(found, _both_known(frame, known), query, size, pose)
+    signals |= _match_signals(found, both_known(frame, known), query, size, pose)
     if known is not None:  # as many as a whole photo would have
         signals["inliers"] /= max(float(known.mean()), 0.1)
     verdict = judged(signals, pixels, query.focal_sigma, len(photo.scores) < MIN_FEATURES)
@@ -190,14 +183,6 @@ def doubted(verdict: Verdict, reason: Reason, score: float = DOUBTFUL) -> Verdic
     if verdict.status is not Status.LOCALIZED:
         return verdict
     return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
-
-
-def appearance(
-    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
-) -> dict[str, float]:
-    """Return the signals of how alike photo and frame look."""
-    agreements = gradient_agreement(photo, frame, known) + colour_agreement(photo, frame, known)
-    return dict(zip(APPEARANCE, agreements, strict=True))
 
 
 def geometry_signals(frame: Frame, size: Intrinsics, pixels: Evidence | None) -> dict[str, float]:
@@ -242,7 +227,7 @@ def probability(signals: Mapping[str, float]) -> float:
 
 def clear(signals: Mapping[str, float]) -> bool:
     """Tell whether the signals of the pixels are enough to take a pose for right."""
-    return probability(signals) >= LOCALIZED and not in_doubt(signals) and signals["colours"] > CLEAR_COLOURS
+    return probability(signals) >= LOCALIZED and not in_doubt(signals)
 
 
 def in_doubt(signals: Mapping[str, float]) -> list[str]:
@@ -303,88 +288,3 @@ def _of_lens(
     off = abs(pixels.focal_pull)
     contradicted = off > CONTRADICTION and off > 3 * pixels.focal_sigma
     return (Reason.INTRINSICS_CONTRADICTED if contradicted else None), covariance, 0.0
-
-
-def gradient_agreement(
-    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
-) -> tuple[float, float]:
-    """Return how well the gradients correlate, -1..1, block by block, where scene and photo are known.
-
-    Blocks weigh by what the render has in them. Those that agree best and hold three quarters of the weight count,
-    and for the second value, half of it: a passer-by spoils a few blocks, a wrong pose all.
-    """
-    height, width = frame.alpha.shape
-    factor = GRADIENTS_PX / max(height, width)
-    size = (max(BLOCK_PX, round(width * factor)), max(BLOCK_PX, round(height * factor)))
-    opaque = cv2.resize(_both_known(frame, known), size, interpolation=cv2.INTER_AREA) > MIN_ALPHA
-    if known is not None:  # the gradients along the unknown's edge are its own
-        opaque = cv2.erode(opaque.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    a, b = (_gradients(image, size) * opaque[..., None] for image in (photo, to_uint8(frame.rgb)))
-    ab, aa, weight = _block_sums(a * b), _block_sums(a * a), _block_sums(b * b)
-    correlation = ab / np.sqrt(aa * weight + 1e-6)
-    worst_first = np.argsort(correlation)
-    below = np.cumsum(weight[worst_first])
-
-    def best(hidden: float) -> float:
-        kept = worst_first[below > hidden * below[-1]]
-        return float(correlation[kept] @ weight[kept] / max(weight[kept].sum(), 1e-6))
-
-    return best(HIDDEN_SHARE), best(HALF)
-
-
-def _both_known(frame: Frame, known: Bool[np.ndarray, "h w"] | None) -> Float32[np.ndarray, "h w"]:
-    return frame.alpha if known is None else frame.alpha * known
-
-
-def colour_agreement(
-    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, known: Bool[np.ndarray, "h w"] | None = None
-) -> tuple[float, float]:
-    """Return the correlation of the colours of two thumbnails, -1..1, where scene and photo are known.
-
-    Each channel has its own gain and offset (exposure, white balance); the quarter, and for the second value the
-    half, that fits them worst is left out.
-    """
-    height, width = frame.alpha.shape
-    factor = COLOUR_PX / max(height, width)
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
-    layers = (photo, to_uint8(frame.rgb), _both_known(frame, known))
-    small = [cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in layers]
-    opaque = small[2] > MIN_ALPHA
-    a, b = (np.ascontiguousarray(image[opaque].T, np.float32) for image in small[:2])
-    if a.shape[1] < 8:
-        return 0.0, 0.0
-    most = _correlation(a, b, HIDDEN_SHARE)
-    return most, max(most, _correlation(a, b, HALF))  # a half that is of one colour tells nothing
-
-
-def _correlation(a: Float32[np.ndarray, "3 n"], b: Float32[np.ndarray, "3 n"], hidden: float) -> float:
-    """Return the correlation of what is left when the share that fits worst is left out, after three fits."""
-    kept = np.ones(a.shape[1], np.float32)
-    for _ in range(3):
-        x, y = _centred(a, kept), _centred(b, kept)
-        gain = ((x * y) @ kept) / np.maximum((y * y) @ kept, np.float32(1e-6))
-        misfit = np.abs(x - gain[:, None] * y).sum(0)
-        count = len(kept) - int(hidden * len(kept))
-        kept = (misfit <= np.partition(misfit, count - 1)[count - 1]).astype(np.float32)
-    x, y = _centred(a, kept), _centred(b, kept)
-    both, of_x, of_y = (float((u * v @ kept).sum()) for u, v in ((x, y), (x, x), (y, y)))
-    return both / max(np.sqrt(of_x * of_y), 1e-6)
-
-
-def _centred(values: Float32[np.ndarray, "3 n"], kept: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "3 n"]:
-    return values - (values @ kept / kept.sum())[:, None]
-
-
-def _block_sums(image: Float32[np.ndarray, "h w 2"]) -> Float64[np.ndarray, "blocks"]:
-    rows, columns = image.shape[0] // BLOCK_PX, image.shape[1] // BLOCK_PX
-    whole = image[: rows * BLOCK_PX, : columns * BLOCK_PX]
-    means = np.asarray(cv2.resize(whole, (columns, rows), interpolation=cv2.INTER_AREA))
-    return BLOCK_PX**2 * means.sum(2, dtype=np.float64).ravel()
-
-
-def _gradients(rgb: UInt8[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float32[np.ndarray, "_ _ 2"]:
-    gray = cv2.resize(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
-    gray = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), SIGMA_PX)
-    along_x = cv2.Sobel(gray, cv2.CV_32F, 1, 0, ksize=1)
-    along_y = cv2.Sobel(gray, cv2.CV_32F, 0, 1, ksize=1)
-    return np.stack([along_x, along_y], 2)

@@ -21,7 +21,8 @@ from service.pose.views import (
     to_uint8,
     view_from,
 )
-from service.types import Camera, Intrinsics, IterationRecord, MatchVectors, Pose, Query
+from service.results import IterationRecord, MatchVectors
+from service.types import Camera, Intrinsics, Pose, Query
 
 
 def render_and_match(

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.interfaces import Tools
-from service.pose.gate import APPEARANCE
+from service.pose.appearance import APPEARANCE
 from service.pose.pnp import resection
 from service.pose.retrieval import top, vote
 from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, VIEW_FEATURES, View, correspondences, to_uint8
@@ -51,7 +51,7 @@ def like_its_mirror_image(views: Sequence[View], tools: Tools, pool: Executor) -
 
 def unlikeness(signals: Mapping[str, float]) -> float:
     """Return how unlike photo and render are by the gate's signals, 0 (alike) and more."""
-    return sum(1.0 - signals[name] for name in APPEARANCE)
+    return sum(1.0 - signals[name] for name in (*APPEARANCE, "tints"))
 
 
 def _recognised(view: View, views: Sequence[View], tools: Tools) -> int:

@@ -20,7 +20,8 @@ from service.interfaces import Features, Matcher
 from service.pose.pnp import Resection, reprojection_error_px, resection
 from service.pose.retrieval import top, vote
 from service.pose.views import MATCH_ERROR_PX, PHOTO_PX, Correspondences, View, correspondences
-from service.types import Candidates, Intrinsics, IterationRecord, Pose
+from service.results import Candidates, IterationRecord
+from service.types import Intrinsics, Pose
 
 VIEWS = 6
 FEATURES = 400

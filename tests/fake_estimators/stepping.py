@@ -12,7 +12,8 @@ import numpy as np
 
 from service.errors import EstimatorFault
 from service.interfaces import Tools
-from service.types import IterationRecord, MatchVectors, Query
+from service.results import IterationRecord, MatchVectors
+from service.types import Query
 
 GO_ON = threading.Event()
 """A held job waits for it after its first record."""

@@ -22,7 +22,8 @@ from service.api.schemas import JobList, JobOut, JobState, PhotoOut, Record, Tra
 from service.api.store import JobFilter
 from service.images import encode_image
 from service.localize import LoadedScene
-from service.types import Camera, Status
+from service.results import Status
+from service.types import Camera
 
 router = APIRouter()
 

@@ -17,7 +17,8 @@ from service.estimators import ESTIMATORS
 from service.geometry import pose_distance, so3_exp
 from service.images import read_query, resized
 from service.localize import Request, localize
-from service.types import Camera, IterationRecord, Pose, PoseEstimate, Query
+from service.results import IterationRecord, PoseEstimate
+from service.types import Camera, Pose, Query
 
 PICTURE_PX = 240
 ONLY_TURNED_DEG, ONLY_SHIFTED = 20.0, 0.35

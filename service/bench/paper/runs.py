@@ -25,7 +25,7 @@ from service.bench.metrics import Outcome, errors
 from service.bench.paper.plan import SLOW, STEP_CURVES, Cell
 from service.errors import InvalidRequest
 from service.localize import Request
-from service.types import PoseEstimate
+from service.results import PoseEstimate
 
 CURVE_POINTS = 120
 WAVES = ((5, 1), (15, 2), (None, None))

@@ -1,0 +1,213 @@
+"""What an estimator tells: a record of each step, the gate's verdict, and the answer with both.
+
+Frozen, slotted, arrays really read-only, as everything in `service/types.py`, which has the conventions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from service.types import EXACT, Camera, Intrinsics, Lens, Pose, frozen
+
+
+@dataclass(frozen=True, slots=True)
+class MatchVectors:
+    """Matches between the photo and a render, for looking at; at most 300."""
+
+    photo_px: Float32[np.ndarray, "m 2"]
+    """In pixels of `Query.rgb`."""
+    render_px: Float32[np.ndarray, "m 2"]
+    """In pixels of `render_camera`."""
+    inlier: Bool[np.ndarray, "m"]
+    render_camera: Camera
+
+    LIMIT = 300
+
+    @classmethod
+    def sample(
+        cls,
+        photo_px: Float32[np.ndarray, "m 2"],
+        render_px: Float32[np.ndarray, "m 2"],
+        inlier: Bool[np.ndarray, "m"],
+        render_camera: Camera,
+    ) -> MatchVectors:
+        """Keep an evenly spread choice of at most LIMIT matches, in their order."""
+        keep = np.unique(np.linspace(0, max(len(inlier) - 1, 0), min(len(inlier), cls.LIMIT)).astype(int))
+        return cls(
+            frozen(photo_px[keep], np.float32),
+            frozen(render_px[keep], np.float32),
+            frozen(inlier[keep], np.bool_),
+            render_camera,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Poses that a stage weighed against one another."""
+
+    world_from_camera: Float64[np.ndarray, "k 4 4"]
+    scores: Float64[np.ndarray, "k"]
+    """Higher is better; comparable within one record only."""
+
+
+@dataclass(frozen=True, slots=True)
+class IterationRecord:
+    """One line of the trace: what an estimator knows after a step. Small, no images."""
+
+    stage: str
+    pose: Pose
+    """The answer that the estimator would give if it were stopped here: best so far."""
+    lens: Lens = EXACT
+    """What goes with the pose; other than the default only where the photo's intrinsics are approximate."""
+    loss: float | None = None
+    """The stage's own objective; comparable within a stage only."""
+    num_matches: int | None = None
+    num_inliers: int | None = None
+    step_deg: float | None = None
+    """How far the pose turned in this step."""
+    step_units: float | None = None
+    matches: MatchVectors | None = None
+    candidates: Candidates | None = None
+    rivals: Candidates | None = None
+    """Other answers that the gate accepts too, most probable first; scores are probabilities, the pose has the rest."""
+    mirrored: bool = False
+    """The photo's mirror image fits the scene better."""
+    index: int = 0
+    """Number of the record in the trace; stamped by the driver, like the times."""
+    elapsed_s: float = 0.0
+    """Wall time since the driver started."""
+    cpu_s: float = 0.0
+    """CPU time of the job's thread since the driver started."""
+
+
+class Status(StrEnum):
+    LOCALIZED = "localized"
+    UNCERTAIN = "uncertain"
+    NOT_LOCALIZED = "not_localized"
+
+
+class Reason(StrEnum):
+    """Why a result has its status: a closed list, part of the API. `HINTS` says what to do about each."""
+
+    AGREES = "agrees"
+    FEW_FEATURES = "few_features"
+    NO_MATCHING_VIEW = "no_matching_view"
+    RENDER_DISAGREES = "render_disagrees"
+    FEW_INLIERS = "few_inliers"
+    LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
+    FOCAL_UNCERTAIN = "focal_uncertain"
+    INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
+    PLACE_UNCERTAIN = "place_uncertain"
+    OUTSIDE_PRIOR = "outside_prior"
+    AMBIGUOUS = "ambiguous"
+    MIRRORED = "mirrored"
+    BUDGET_EXHAUSTED = "budget_exhausted"
+
+
+HINTS: dict[Reason, str] = {
+    Reason.AGREES: "",
+    Reason.FEW_FEATURES: "The photo shows almost no texture: take it sharper, brighter or with more of the scene.",
+    Reason.NO_MATCHING_VIEW: "Nothing in the photo was recognised: check that it shows this scene, or send a prior.",
+    Reason.RENDER_DISAGREES: (
+        "The scene rendered at the best pose does not look like the photo: check the intrinsics, and whether the "
+        "scene has changed since it was captured."
+    ),
+    Reason.FEW_INLIERS: (
+        "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
+    ),
+    Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: show the captured part, or send a prior.",
+    Reason.FOCAL_UNCERTAIN: (
+        "The photo fits the scene, but does not tell its focal length, on which the place depends: send intrinsics."
+    ),
+    Reason.INTRINSICS_CONTRADICTED: (
+        "The photo fits the scene far better with another focal length: check the intrinsics, or send them with "
+        'trust "approximate".'
+    ),
+    Reason.PLACE_UNCERTAIN: (
+        "The photo fits the scene, but hardly tells from where it was taken: show more of the scene, or nearer things."
+    ),
+    Reason.OUTSIDE_PRIOR: (
+        "The photo fits the scene, but at a place that the prior's Gaussian or box excludes: check it, or send a wider "
+        "one."
+    ),
+    Reason.AMBIGUOUS: (
+        "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
+        "or a Gaussian."
+    ),
+    Reason.MIRRORED: (
+        "The photo's mirror image fits the scene better: send it as it was taken; front cameras often mirror."
+    ),
+    Reason.BUDGET_EXHAUSTED: "The budget ended before the evidence was enough: allow more seconds.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the verification gate says of a pose."""
+
+    status: Status
+    reason: Reason
+    score: float
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
+    every estimator; at most 0.5 where the lens is in doubt. At least 0.8 is `localized`."""
+    inliers: int
+    """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
+    photo of a sequence that its alignment alone makes clear."""
+    agreement: float
+    """Normalized cross-correlation of the gradients of photo and render, -1..1, where they agree best: a quarter
+    of the photo may be hidden."""
+    coverage: float
+    """Share of the photo in which the scene is rendered opaque."""
+    covariance: Float64[np.ndarray, "6 6"] | None
+    """Of the right perturbation (rotation in rad, translation in units) in the camera frame:
+    true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
+    focal_sigma: float = 0.0
+    """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
+    signals: Mapping[str, float] = field(default_factory=dict)
+    """All that the gate measured, by name; `service/pose/gate.py` says what each is."""
+
+
+@dataclass(frozen=True, slots=True)
+class StageTiming:
+    stage: str
+    wall_s: float
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class PoseEstimate:
+    """A finished localization: the answer, what it rests on, and how it came about."""
+
+    pose: Pose
+    verdict: Verdict
+    intrinsics: Intrinsics
+    """Used for the whole upright photo."""
+    intrinsics_source: Literal["given", "exif", "guessed"]
+    scene_id: str
+    scene_sha256: str
+    estimator: str
+    rasterizer: str
+    matcher: str
+    seed: int
+    budget_exhausted: bool
+    renders: int
+    """Pictures that the estimator rendered, and gradients as one more each; the gate's own not counted."""
+    timings: tuple[StageTiming, ...]
+    warnings: tuple[str, ...]
+    records: tuple[IterationRecord, ...]
+    considered: tuple[tuple[str, int], ...] = ()
+    """Where the photo was looked for in several scenes: each one's id, and how many matches agreed, best first."""
+
+    @property
+    def alternatives(self) -> tuple[tuple[Pose, float], ...]:
+        """Other poses that explain the photo, too, and how probable each is, most probable first."""
+        rivals = self.records[-1].rivals if self.records else None
+        if rivals is None:
+            return ()
+        return tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))
