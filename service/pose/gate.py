@@ -3,12 +3,12 @@
 Signals of several kinds are measured at the pose: whether the render there has the photo's gradients (fine structure,
 whatever the exposure) and its colours, each over most of the photo and over its better half (the other may be hidden),
 and whether the colours agree where the gradients do (a row of like things seen one further, and a mirror image, have
-the right edges and the wrong colours; see `appearance.py`); how many fresh matches
-between photo and render agree with the pose, to the pixel and without any fit, what share that is, and how they are
-spread; and by how much alignment would still move the pose. Together they give a probability that the pose is right
-(within 5 degrees and 1/80 of the distance), by a logistic model whose weights `splatfix bench gate` fits and tests:
-each signal is cut off at both ends and weighs positively. Sums forgive, so each signal has a floor besides, that 249
-of 250 right poses stay above: below it a pose is in doubt, however good the rest.
+the right edges and the wrong colours; see `appearance.py`); how many fresh matches between photo and render agree with
+the pose, to the pixel and without any fit, what share that is, and how they are spread; and by how much alignment would
+still move the pose. Together they give a probability that the pose is right (within 5 degrees and 1/80 of the
+distance), by a logistic model whose weights `splatfix bench gate` fits and tests: each signal is cut off at both ends
+and weighs positively. Sums forgive, so each signal has a floor besides, that 249 of 250 right poses stay above: below
+it a pose is in doubt, however good the rest.
 """
 
 from __future__ import annotations
@@ -86,11 +86,11 @@ BY_PIXELS = {
     "drift_px": 4.28,
 }  # fmt: skip
 FLOORS = {
-    "gradients": 0.613, "gradients_half": 0.836, "colours": 0.662, "colours_half": 0.863, "tints": 0.92,
+    "gradients": 0.613, "gradients_half": 0.836, "colours": 0.662, "colours_half": 0.863, "tints": 0.935,
     "drift_px": 6.025, "inliers": 106.731, "inlier_share": 0.513, "inlier_spread": 0.437,
 }  # fmt: skip
-"""In `drift_px` a ceiling. In `tints` between right poses, which have 0.946 and more, and those that mistake a thing for
-its like or for its mirror image: nearly all at most 0.93."""
+"""In `drift_px` a ceiling. In `tints` between right poses, which have 0.946 and more, and those that mistake a thing
+for its like or for its mirror image: nearly all at most 0.93."""
 LOCALIZED, UNCERTAIN = 0.8, 0.1
 """Least probabilities."""
 DOUBTFUL = 0.5
