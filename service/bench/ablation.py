@@ -21,7 +21,7 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose import alignment, pyramid, sight, stages
+from service.pose import alignment, appearance, pyramid, sight, stages
 from service.pose.index import ViewIndex
 from service.pose.pnp import Resection
 from service.pose.views import Correspondences
@@ -76,6 +76,7 @@ def removals() -> dict[str, Removal]:
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
         "decoupled solver (PnP again instead)": Removal(((s, "solved_near", _resected_again),)),
+        "tints": Removal(((appearance, "tint_agreement", _alike),)),
         "look in the mirror": Removal(((v._Hunt, "reflect", _nothing),)),
         "look elsewhere": Removal(((v._Hunt, "contest", _nothing),)),
     }
@@ -213,6 +214,10 @@ def _fixed_dilation(camera: Any, info: Any) -> float:
 
 def _no_glance(*others: Any) -> None:
     return None
+
+
+def _alike(blocks: appearance.Blocks) -> float:
+    return 1.0
 
 
 def _nothing(*others: Any) -> Iterator[IterationRecord]:
