@@ -61,7 +61,7 @@ OCCLUDERS = 2
 PENALTY = 0.02
 """On the squared weights, against certainty that few samples don't give."""
 BELOW_FLOOR = 0.003
-"""Share of right poses, for each signal: at most 3 % may be refused, and there are eight floors."""
+"""Share of right poses, for each signal: at most 3 % may be refused, and there are nine floors."""
 BINS = 10
 OTHER_DOUBTS = (
     Reason.FOCAL_UNCERTAIN,
