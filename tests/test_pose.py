@@ -458,6 +458,10 @@ def test_tints_tell_like_things_of_other_colours_apart_but_forgive_light_and_wha
     assert tints(frame.rgb) > 0.999
     assert tints(np.clip(0.7 * frame.rgb * np.array([0.9, 1.0, 1.1], np.float32) + 0.05, 0, 1)) > 0.97
     assert tints(frame.rgb**1.4) > 0.95
+    gray = np.repeat(frame.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
+    assert tints(gray) > 0.999
+    assert tints(0.5 * gray + 0.5 * frame.rgb) > 0.999
+    assert tints(frame.rgb * np.array([1.2, 1.0, 0.5], np.float32)) > 0.97
     hidden = frame.rgb.copy()
     hidden[:160, :130] = rng.uniform(0, 1, (160, 130, 3))
     assert tints(hidden) > 0.95

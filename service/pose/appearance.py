@@ -34,6 +34,8 @@ which it shows nothing."""
 WHOLE, ENOUGH = 0.99, 0.25
 """Shares of a block's pixels."""
 WHITE = 255
+LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+RIDGE = 1e-4
 SMALLEST = 1e-6 / BLOCK_PX**4
 """Of gradients, which keeps flat blocks from agreeing."""
 FEW = 8
@@ -127,9 +129,10 @@ def gradient_agreement(blocks: Blocks) -> tuple[float, float]:
 
 
 def tint_agreement(blocks: Blocks) -> float:
-    """Return the correlation of the colours of blocks whose gradients agree, -1..1: all of them, none is left out.
+    """Return the correlation of the colours of blocks whose gradients agree, 0..1: all of them, none is left out.
 
-    1 where so few agree that their colours tell nothing.
+    Each channel may be the render's channel with a part of its luma, neither negative, and an offset: of any exposure,
+    white balance and saturation, down to a photo without colours. 1 where so few agree that their colours tell nothing.
     """
     if not blocks.known.any():
         return 1.0
@@ -137,7 +140,28 @@ def tint_agreement(blocks: Blocks) -> float:
     same = blocks.known & shows & (np.minimum(blocks.correlation, blocks.around) > SAME_FORM)
     if same.sum() < FEW:
         return 1.0
-    return _correlation(blocks.photo_rgb[same].T, blocks.render_rgb[same].T, 0.0)
+    photo, render = (rgb[same] - rgb[same].mean(0) for rgb in (blocks.photo_rgb, blocks.render_rgb))
+    luma = (render @ LUMA)[:, None]
+    of_channel, of_luma = _shares(photo, render, luma)
+    expected = of_channel * render + of_luma * luma
+    both, of_photo, of_expected = (float((u * v).sum()) for u, v in ((photo, expected), (photo,) * 2, (expected,) * 2))
+    return both / max(np.sqrt(of_photo * of_expected), 1e-6)
+
+
+def _shares(
+    photo: Float32[np.ndarray, "n 3"], render: Float32[np.ndarray, "n 3"], luma: Float32[np.ndarray, "n 1"]
+) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]]:
+    """Return the factors of a render's channels and of its luma, none negative, that are nearest to the photo."""
+    rr, ll, rl = ((u * v).sum(0) for u, v in ((render, render), (luma, luma), (render, luma)))
+    pr, pl = (photo * render).sum(0), (photo * luma).sum(0)
+    rr, ll = rr * (1 + RIDGE) + RIDGE, ll * (1 + RIDGE) + RIDGE  # a render may be without colours, too
+    determinant = rr * ll - rl * rl
+    of_channel, of_luma = (pr * ll - pl * rl) / determinant, (pl * rr - pr * rl) / determinant
+    alone_r, alone_l = np.maximum(pr / rr, 0), np.maximum(pl / ll, 0)
+    return (
+        np.where(of_channel < 0, 0, np.where(of_luma < 0, alone_r, of_channel)),
+        np.where(of_channel < 0, alone_l, np.where(of_luma < 0, 0, of_luma)),
+    )
 
 
 def both_known(frame: Frame, known: Bool[np.ndarray, "h w"] | None) -> Float32[np.ndarray, "h w"]:
