@@ -441,6 +441,9 @@ class TestModifications:
         assert modified(shot, ["noise=0.1"], rng).rgb.std() == pytest.approx(0.1, rel=0.05)
         warm = modified(shot, ["white_balance=1.25"], rng).rgb
         assert np.allclose(warm[0, 0], [0.5, 0.4, 0.32])
+        red = replace(shot, rgb=rgb * np.array([1.0, 0.0, 0.0], np.float32))
+        assert np.allclose(modified(red, ["saturation=0"], rng).rgb, 0.299 * 0.4, atol=1e-6)
+        assert np.allclose(modified(red, ["saturation=0.5"], rng).rgb[0, 0], [0.2598, 0.0598, 0.0598], atol=1e-6)
         assert np.allclose(modified(shot, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
 
     def test_blur_has_its_width(self):

@@ -45,6 +45,7 @@ from service.types import Camera, Intrinsics, Pose, Query
 WITHIN_REASON: tuple[tuple[str, ...], ...] = (
     (), ("gain=0.7",), ("gain=1.4",), ("gamma=0.6",), ("gamma=1.6",), ("white_balance=1.25",), ("blur=4",),
     ("noise=0.1",), ("jpeg=20",), ("scale=0.5",), ("occlusion=0.2",), ("occlusion=0.35",), ("roll=45",), ("crop=0.5",),
+    ("saturation=0",),
 )  # fmt: skip
 BEYOND: tuple[tuple[str, ...], ...] = (
     ("occlusion=0.6",), ("occlusion=0.75",), ("blur=14",), ("noise=0.4",), ("crop=0.2",), ("crop=0.12",),

@@ -148,6 +148,12 @@ def _white_balance(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
     return replace(shot, rgb=np.clip(shot.rgb * np.array([factor, 1.0, 1.0 / factor], np.float32), 0, 1))
 
 
+def _saturation(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
+    """Of the colours, by luma (ITU-R BT.601); 0 leaves a gray picture."""
+    luma = shot.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32)
+    return replace(shot, rgb=np.clip(luma + factor * (shot.rgb - luma), 0, 1).astype(np.float32))
+
+
 def _scale(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
     """Every pixel of the new size is the mean over what it covers, or interpolated where it grows."""
     old = shot.intrinsics
@@ -216,6 +222,7 @@ MODIFICATIONS: dict[str, tuple[float, float, _Change]] = {
     "gain": (0.05, 20.0, _gain),
     "gamma": (0.1, 10.0, _gamma),
     "white_balance": (0.2, 5.0, _white_balance),
+    "saturation": (0.0, 3.0, _saturation),
     "noise": (0.0, 1.0, _noise),
     "blur": (0.0, 50.0, _blur),
     "jpeg": (1.0, 100.0, _jpeg),
