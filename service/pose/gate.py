@@ -89,7 +89,7 @@ FLOORS = {
     "gradients": 0.613, "gradients_half": 0.836, "colours": 0.662, "colours_half": 0.863, "tints": 0.935,
     "drift_px": 6.025, "inliers": 106.731, "inlier_share": 0.513, "inlier_spread": 0.437,
 }  # fmt: skip
-"""In `drift_px` a ceiling. In `tints` between right poses, which have 0.946 and more, and those that mistake a thing
+"""In `drift_px` a ceiling. In `tints` between right poses, which have 0.948 and more, and those that mistake a thing
 for its like or for its mirror image: nearly all at most 0.93."""
 LOCALIZED, UNCERTAIN = 0.8, 0.1
 """Least probabilities."""
