@@ -121,9 +121,7 @@ def gradient_agreement(blocks: Blocks) -> tuple[float, float]:
 
     def best(hidden: float) -> float:
         kept = worst_first[below > hidden * below[-1]]
-        return float(
-            blocks.correlation[kept] @ blocks.weight[kept] / max(blocks.weight[kept].sum(), 1e-6 / BLOCK_PX**2)
-        )
+        return float(blocks.correlation[kept] @ blocks.weight[kept] / max(blocks.weight[kept].sum(), SMALLEST))
 
     return best(HIDDEN_SHARE), best(HALF)
 
@@ -144,8 +142,7 @@ def tint_agreement(blocks: Blocks) -> float:
     luma = (render @ LUMA)[:, None]
     of_channel, of_luma = _shares(photo, render, luma)
     expected = of_channel * render + of_luma * luma
-    both, of_photo, of_expected = (float((u * v).sum()) for u, v in ((photo, expected), (photo,) * 2, (expected,) * 2))
-    return both / max(np.sqrt(of_photo * of_expected), 1e-6)
+    return _cosine(photo, expected)
 
 
 def _shares(
@@ -196,9 +193,11 @@ def _correlation(a: Float32[np.ndarray, "3 n"], b: Float32[np.ndarray, "3 n"], h
         misfit = np.abs(x - gain[:, None] * y).sum(0)
         count = len(kept) - int(hidden * len(kept))
         kept = (misfit <= np.partition(misfit, count - 1)[count - 1]).astype(np.float32)
-    x, y = _centred(a, kept), _centred(b, kept)
-    both, of_x, of_y = (float((u * v @ kept).sum()) for u, v in ((x, y), (x, x), (y, y)))
-    return both / max(np.sqrt(of_x * of_y), 1e-6)
+    return _cosine(_centred(a, kept) * kept, _centred(b, kept) * kept)
+
+
+def _cosine(a: Float32[np.ndarray, "*n"], b: Float32[np.ndarray, "*n"]) -> float:
+    return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-6))
 
 
 def _centred(values: Float32[np.ndarray, "3 n"], kept: Float32[np.ndarray, "n"]) -> Float32[np.ndarray, "3 n"]:
