@@ -12,9 +12,8 @@ import typer
 from rich.logging import RichHandler
 from rich.progress import track
 
-from service.bench_commands import bench_app
-from service.errors import InvalidRequest, SplatfixError
-from service.terminal import (
+from service.cli.bench_commands import bench_app
+from service.cli.terminal import (
     MatcherOption,
     err,
     loaded_scene,
@@ -25,12 +24,13 @@ from service.terminal import (
     say,
     settings_of,
 )
+from service.errors import InvalidRequest, SplatfixError
 
 if TYPE_CHECKING:
-    from service.api.intake import Body
-    from service.api.requests import LocalizeFields
-    from service.api.schemas import Result
     from service.localize import LoadedScene
+    from service.web.schemas.parsing import Body
+    from service.web.schemas.requests import LocalizeFields
+    from service.web.schemas.responses import Result
 
 # Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
 
@@ -77,7 +77,7 @@ def serve(
 
     The file is the one that SPLATFIX_CONFIG names, or ~/.config/splatfix/splatfix.toml.
     """
-    from service.serve import run
+    from service.cli.serve import run
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
     run(settings_of({name: value for name, value in given.items() if value is not None}), out, err)
@@ -105,10 +105,10 @@ def localize(
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
 ) -> None:
     """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which."""
-    from service.api.intake import Body, body_of, read_fields
-    from service.api.sequence import is_sequence
     from service.localize import DEFAULT_ESTIMATOR
+    from service.photos.sequence import is_sequence
     from service.scene_formats.discovery import find_scenes
+    from service.web.schemas.parsing import Body, body_of, read_fields
 
     given = {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every}
     nested = {"intrinsics": intrinsics, "prior": prior, "times_s": times}
@@ -136,12 +136,12 @@ def localize(
 def _localize_each(
     bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], csv_file: Path | None, as_json: bool
 ) -> None:
-    from service import answers
-    from service.anywhere import Found, localize_anywhere
-    from service.api.convert import result_out, timing_out
-    from service.api.documents import versions
-    from service.api.intake import make_task
+    from service.cli import result_tables as answers
     from service.localize import localize as run
+    from service.multi_scene import Found, localize_anywhere
+    from service.web.schemas.conversion import result_out, timing_out
+    from service.web.schemas.parsing import make_task
+    from service.web.schemas.resources import versions
 
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
@@ -168,12 +168,12 @@ def _localize_sequence(
     tum_file: Path | None,
     as_json: bool,
 ) -> None:
-    from service import answers
-    from service.api.exports import trajectory_of
-    from service.api.intake import make_task
-    from service.api.sequence import read_sequence
-    from service.api.trajectory import Trajectory
-    from service.track import localize_sequence
+    from service.cli import result_tables as answers
+    from service.jobs.trajectory import Trajectory
+    from service.photos.sequence import read_sequence
+    from service.tracking import localize_sequence
+    from service.web.schemas.exports import trajectory_of
+    from service.web.schemas.parsing import make_task
 
     task, _ = make_task(body, fields, loaded, max_frames=sys.maxsize)
     if task.reading is None:
@@ -200,9 +200,9 @@ def render(
     intrinsics: IntrinsicsOption = "",
 ) -> None:
     """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
-    from service.api.intake import read_fields
-    from service.api.pictures import picture
-    from service.api.requests import RenderIn
+    from service.scene_manager.scene_images import picture
+    from service.web.schemas.parsing import read_fields
+    from service.web.schemas.requests import RenderIn
 
     fields = read_fields({"truth": parsed_option(pose, "truth")})
     if fields.truth is None:
@@ -233,7 +233,7 @@ def inspect_scene(
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
 ) -> None:
     """Read a scene and say what is in it, and from where it would be looked at."""
-    from service.inspection import inspected, told
+    from service.cli.inspection import inspected, told
 
     with err.status(f"looking at {scene}"):
         facts = inspected(scene)
@@ -250,7 +250,7 @@ def add_key(
     role: Annotated[Literal["read", "localize", "admin"], typer.Option()] = "localize",
 ) -> None:
     """Make an API key and print it; only its hash is kept."""
-    from service.api import keys
+    from service.web import api_keys as keys
 
     print(keys.add_key(_keys_file(), name, role))
 
@@ -258,7 +258,7 @@ def add_key(
 @keys_app.command("list")
 def list_keys() -> None:
     """List names and roles."""
-    from service.api import keys
+    from service.web import api_keys as keys
 
     for key in keys.read_keys(_keys_file()):
         say(f"{key.role:9} {key.name}")
@@ -267,7 +267,7 @@ def list_keys() -> None:
 @keys_app.command("remove")
 def remove_key(name: str) -> None:
     """Forget a key; running services refuse it within a second."""
-    from service.api import keys
+    from service.web import api_keys as keys
 
     keys.remove_key(_keys_file(), name)
 
@@ -284,8 +284,8 @@ def doctor(
     warm: Annotated[bool, typer.Option("--warm", help="Compile every kernel first: a minute, once.")] = False,
 ) -> None:
     """Say what runs on this machine, and why the rest doesn't."""
-    from service.doctor import findings
-    from service.doctor import warm as compile_kernels
+    from service.cli.doctor import findings
+    from service.cli.doctor import warm as compile_kernels
 
     if warm:
         with err.status("compiling"):
@@ -305,7 +305,7 @@ def doctor(
 @app.command(hidden=True)
 def openapi() -> None:
     """Print the API's description, as openapi.yaml has it."""
-    from service.api.app import openapi_yaml
+    from service.web.app import openapi_yaml
 
     print(openapi_yaml(), end="")
 

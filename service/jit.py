@@ -19,7 +19,7 @@ def _cache_dir() -> Path:
     root = Path(__file__).parent
     digest = hashlib.sha256()
     for folder in ("render", "pose", "matchers"):
-        for source in sorted((root / folder).glob("*.py")):
+        for source in sorted((root / folder).rglob("*.py")):
             text = source.read_bytes()
             if b"service.jit" in text or source.name == "simd.py":
                 digest.update(text)

@@ -5,7 +5,7 @@ estimator: it owns the clock, the budget and the cancel flag, stamps the records
 gate behind every method. Jobs, CLI, bench and tests call `localize`; nothing else iterates an estimator.
 
     from service.localize import LoadedScene, localize
-    from service.images import read_query
+    from service.photos.images import read_query
     scene = LoadedScene.load(Path("scenes/studio"))
     estimate = localize(read_query(Path("photo.jpg").read_bytes()), scene)
     print(estimate.verdict.status, estimate.pose.world_from_camera)
@@ -27,7 +27,7 @@ from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
-from service.pose.gate import LOCALIZED, doubted, verify
+from service.pose.verification.gate import LOCALIZED, doubted, verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict

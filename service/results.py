@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from service.types import EXACT, Camera, Intrinsics, Lens, Pose, frozen
+from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class IterationRecord:
     stage: str
     pose: Pose
     """The answer that the estimator would give if it were stopped here: best so far."""
-    lens: Lens = EXACT
+    lens: IntrinsicsCorrection = NO_CORRECTION
     """What goes with the pose; other than the default only where the photo's intrinsics are approximate."""
     loss: float | None = None
     """The stage's own objective; comparable within a stage only."""
@@ -170,7 +170,7 @@ class Verdict:
     focal_sigma: float = 0.0
     """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
     signals: Mapping[str, float] = field(default_factory=dict)
-    """All that the gate measured, by name; `service/pose/gate.py` says what each is."""
+    """All that the gate measured, by name; `service/pose/verification/gate.py` says what each is."""
 
 
 @dataclass(frozen=True, slots=True)

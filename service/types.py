@@ -26,7 +26,7 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
+class IntrinsicsCorrection:
     """How a camera differs from the intrinsics that were assumed for it."""
 
     focal_factor: float = 1.0
@@ -34,12 +34,14 @@ class Lens:
     """Of the principal point, in long sides of the image: the same at every size."""
     shift_y: float = 0.0
 
-    def then(self, other: Lens) -> Lens:
+    def then(self, other: IntrinsicsCorrection) -> IntrinsicsCorrection:
         """Return the difference of a lens that differs by `other` from what this one gives."""
-        return Lens(self.focal_factor * other.focal_factor, self.shift_x + other.shift_x, self.shift_y + other.shift_y)
+        return IntrinsicsCorrection(
+            self.focal_factor * other.focal_factor, self.shift_x + other.shift_x, self.shift_y + other.shift_y
+        )
 
 
-EXACT = Lens()
+NO_CORRECTION = IntrinsicsCorrection()
 """No difference."""
 
 
@@ -92,9 +94,9 @@ class Intrinsics:
             cy=self.cy * sy,
         )
 
-    def corrected(self, lens: Lens) -> Intrinsics:
+    def corrected(self, lens: IntrinsicsCorrection) -> Intrinsics:
         """Return the same camera with another focal length and principal point."""
-        if lens == EXACT:
+        if lens == NO_CORRECTION:
             return self
         return replace(
             self,
@@ -238,7 +240,7 @@ class GaussianScene:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
+class BoxPrior:
     """The camera's centre lies in a box along the world's axes. Raises InvalidPrior."""
 
     lower_in_world: Float64[np.ndarray, "3"]
@@ -255,7 +257,7 @@ class Box:
 
 
 @dataclass(frozen=True, slots=True)
-class Gaussian:
+class GaussianPosePrior:
     """The camera's pose is normally distributed. Raises InvalidPrior."""
 
     pose: Pose
@@ -280,7 +282,7 @@ class Gaussian:
         object.__setattr__(self, "covariance", matrix)
 
 
-Region = Box | Gaussian
+PriorRegion = BoxPrior | GaussianPosePrior
 """What is known for certain of where a photo was taken; poses outside are no answers."""
 
 
@@ -306,7 +308,7 @@ class Query:
     """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
     told_focal_sigma: float | None = None
     """As `focal_sigma`, where other photos of the camera have told more than the source of the intrinsics does."""
-    region: Region | None = None
+    region: PriorRegion | None = None
     """Where the camera is for certain."""
 
     def __post_init__(self) -> None:
@@ -323,9 +325,9 @@ class Query:
             return self.told_focal_sigma
         return FOCAL_SIGMA[self.intrinsics_source]
 
-    def corrected(self, lens: Lens) -> Query:
+    def corrected(self, lens: IntrinsicsCorrection) -> Query:
         """Return the query with another focal length and principal point."""
-        if lens == EXACT:
+        if lens == NO_CORRECTION:
             return self
         return replace(
             self,

@@ -23,11 +23,11 @@ from fastapi import FastAPI
 from PIL import Image
 
 import service.estimators
-from service.api.app import create_app
-from service.api.settings import Settings
 from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
+from service.web.app import create_app
+from service.web.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)

@@ -99,7 +99,7 @@ def main() -> int:
     from api_server import fake_estimators, serving, settings, until
     from test_scenes import TRANSFORMS, ply
 
-    from service.api.app import create_app
+    from service.web.app import create_app
 
     counts, failures = Counter(), Counter()
     with tempfile.TemporaryDirectory() as name, fake_estimators():

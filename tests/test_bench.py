@@ -20,10 +20,10 @@ from service.bench.queries import find_photos, sent
 from service.bench.starts import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
 from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
-from service.images import encode_image, read_query, with_palette
 from service.interfaces import Frame
 from service.localize import LoadedScene
-from service.pose.focus import centre_depth
+from service.photos.images import encode_image, read_query, with_palette
+from service.pose.retrieval.scene_focus import centre_depth
 from service.results import PoseEstimate, Reason, Status, Verdict
 from service.types import Camera, Intrinsics, Pose
 

@@ -17,8 +17,8 @@ from fastapi.staticfiles import StaticFiles
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
-from service.api.relay import Relay
-from service.api.ui import PAGES
+from service.web.pages import PAGES
+from service.web.viewer_relay import Relay
 from viewer.app import Viewer
 from viewer.client import Service
 

@@ -291,7 +291,7 @@ def test_bench_paper_shows_how_far_it_is():
     from rich.console import Console
 
     from service.bench.paper.runs import Standing
-    from service.bench_commands import _standing_table
+    from service.cli.bench_commands import _standing_table
 
     cells = ("table2/mc_do/hard", "table2/icomma/hard", "table5/mc_do:mc/random")
     standing = Standing(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})

@@ -18,12 +18,12 @@ import pytest
 from api_server import ROOT, assert_problem, serving, settings, until
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 
-from service.api.app import create_app
-from service.api.keys import add_key
 from service.geometry import look_at, rotation_from_quat
-from service.images import encode_image
 from service.localize import LoadedScene
+from service.photos.images import encode_image
 from service.types import Camera, Intrinsics
+from service.web.api_keys import add_key
+from service.web.app import create_app
 
 TRUTH = pose_at(1.23, 0.1)
 DOCUMENT = (ROOT / "docs" / "clients.md").read_text("utf-8")
@@ -187,9 +187,9 @@ def test_a_scene_without_a_place_has_no_geopose(shared, tmp_path):
 def test_the_nearer_of_two_scenes_is_chosen():
     from types import SimpleNamespace
 
-    from service.api.gpp import GeoPoseRequest, nearest_scene
     from service.errors import NoGeoAnchor
     from service.types import GeoAnchor
+    from service.web.schemas.geopose_protocol import GeoPoseRequest, nearest_scene
 
     def entry(name: str, latitude: float, longitude: float) -> SimpleNamespace:
         anchor = GeoAnchor(latitude, longitude, 0.0, np.eye(4))

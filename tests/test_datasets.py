@@ -14,7 +14,7 @@ from service.bench import localize as bench
 from service.bench.datasets import LAYOUTS, detected, read_data_set
 from service.errors import CorruptScene, SceneNotFound, UnknownName
 from service.geometry import moved, quat_from_rotation
-from service.images import photo_size, read_query
+from service.photos.images import photo_size, read_query
 from service.types import Pose
 
 COUNT = 17

@@ -5,12 +5,18 @@ import pytest
 
 from service.errors import UnknownName
 from service.geometry import look_at, pose_distance, project, so3_exp, transformed
-from service.pose import decoupled
-from service.pose.decoupled import MatchedPoints, angle_loss, gradient_solve, least_squares_solve, length_loss
-from service.pose.focus import Focus, focus_of_scene
-from service.pose.hypotheses import around, even_points
-from service.pose.level import contributions, pruned
-from service.pose.losses import LOSSES, loss_against
+from service.pose.absolute_pose import decoupled
+from service.pose.absolute_pose.decoupled import (
+    MatchedPoints,
+    angle_loss,
+    gradient_solve,
+    least_squares_solve,
+    length_loss,
+)
+from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.hypotheses import around, even_points
+from service.pose.descent.losses import LOSSES, loss_against
+from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 

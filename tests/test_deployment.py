@@ -14,7 +14,7 @@ import promql_parser
 import pytest
 import yaml
 
-from service.api import settings
+from service.web import settings
 
 ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"

@@ -5,11 +5,11 @@ import pytest
 
 from service.estimators.icomma import match_loss
 from service.geometry import look_at, moved, pose_distance, project, transformed
-from service.pose.adam import Adam
-from service.pose.descent import Se3, So3T3
-from service.pose.focus import Focus
-from service.pose.matching import epipolar_inliers
-from service.pose.views import Correspondences
+from service.pose.descent.adam import Adam
+from service.pose.descent.gradient_descent import Se3, So3T3
+from service.pose.features.views import Correspondences
+from service.pose.matching.render_and_match import epipolar_inliers
+from service.pose.retrieval.scene_focus import Focus
 from service.types import Intrinsics, Pose
 
 LENS = Intrinsics(512, 384, 500.0, 510.0, 256.0, 192.0)

@@ -13,11 +13,11 @@ import httpx
 import pytest
 from api_server import assert_problem, events, finished, make_scene, photo, post, serving, settings, until
 
-import service.api.app
-import service.api.photos
-from service.api.app import create_app
-from service.api.store import Batch, Ending, JobFilter, JobStore, NewJob, Retention
+import service.jobs.photo_store
+import service.web.app
 from service.errors import IdempotencyConflict, StorageFailed
+from service.jobs.sqlite_store import Batch, Ending, JobFilter, JobStore, NewJob, Retention
+from service.web.app import create_app
 
 
 def app(folder: Path, **changes):
@@ -115,7 +115,7 @@ def test_a_stopped_service_finishes_or_puts_back_what_runs(stepping, tmp_path):
 
 def test_a_folder_has_one_service(stepping, tmp_path):
     used = pytest.raises(StorageFailed, match="another process uses it")
-    with serving(app(tmp_path)), used, service.api.app.data_folder(tmp_path):
+    with serving(app(tmp_path)), used, service.web.app.data_folder(tmp_path):
         pass
 
 
@@ -162,7 +162,7 @@ def test_a_photo_that_cannot_be_written_is_not_accepted(stepping, tmp_path, monk
     with serving(app(tmp_path)) as client:
         ready(client)
         with monkeypatch.context() as patch:
-            patch.setattr(service.api.photos, "write_durably", full)
+            patch.setattr(service.jobs.photo_store, "write_durably", full)
             refused = post(client)
             assert_problem(refused, 503, "storage_failed")
             assert int(refused.headers["retry-after"]) > 0

@@ -29,13 +29,13 @@ from api_server import (
 )
 from test_scenes import TRANSFORMS, ply
 
-import service.api.photos
-import service.api.uploads
-from service.api.app import create_app
-from service.api.catalog import EXAMPLES
-from service.api.keys import add_key
+import service.jobs.photo_store
+import service.scene_manager.scene_store
 from service.errors import BadInput, SceneError, SplatfixError
 from service.localize import LoadedScene
+from service.web.api_keys import add_key
+from service.web.app import create_app
+from service.web.schemas.error_examples import EXAMPLES
 
 OPERATIONS = {operation["operationId"]: (method, path, operation) for method, path, operation in operations()}
 PAIRS = [
@@ -151,9 +151,9 @@ def undeletable(path: Path, ignore_errors: bool = False) -> None:
 
 def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> httpx.Response:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(service.api.photos, "write_durably", full)
-        patch.setattr(service.api.uploads.os, "fsync", full)
-        patch.setattr(service.api.uploads.shutil, "rmtree", undeletable)
+        patch.setattr(service.jobs.photo_store, "write_durably", full)
+        patch.setattr(service.scene_manager.scene_store.os, "fsync", full)
+        patch.setattr(service.scene_manager.scene_store.shutil, "rmtree", undeletable)
         writer = s.app.state.parts.jobs._store._writer
         (pages,) = writer.execute("PRAGMA page_count").fetchone()
         writer.execute(f"PRAGMA max_page_count = {pages}")
@@ -197,7 +197,7 @@ def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
     from service.errors import Interrupted
 
     with pytest.MonkeyPatch.context() as patch:
-        import service.api.attempts as attempts
+        import service.jobs.worker as attempts
 
         def gone(*_: object) -> None:
             raise Interrupted("told to.")
@@ -293,7 +293,7 @@ def plainly(client: httpx.Client, name: str, job: str = "x", **headers: str) -> 
 
 def recovered(s: SimpleNamespace) -> str:
     """A job after a restart, whose scene isn't there yet."""
-    from service.api.live import LiveJob
+    from service.jobs.live_job import LiveJob
 
     s.app.state.parts.jobs._live[s.done] = LiveJob(s.done, "slow")
     s.client.event_hooks["response"].append(lambda _: s.app.state.parts.jobs._live.pop(s.done, None))
@@ -465,7 +465,7 @@ def test_what_belongs_to_no_operation_is_a_problem_document_too(shared):
 
 
 def test_a_viewer_that_is_gone_is_told(stepping):
-    from service.api.relay import Relay
+    from service.web.viewer_relay import Relay
 
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
-from service.anywhere import localize_anywhere
-from service.api.warmup import warm_up
 from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
 from service.geometry import moved, pose_distance
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
-from service.pose.descent import photometric
-from service.pose.losses import LOSSES, loss_against
-from service.pose.views import to_uint8
+from service.multi_scene import localize_anywhere
+from service.pose.descent.gradient_descent import photometric
+from service.pose.descent.losses import LOSSES, loss_against
+from service.pose.features.views import to_uint8
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
+from service.scene_manager.warm_up import warm_up
 from service.types import Camera, Intrinsics, Pose, Query
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -211,7 +211,9 @@ def test_a_turned_photo_is_found_by_turning_it(degrees: int, room: LoadedScene) 
     found = localize(photo_at(room, truth), room)
     assert found.verdict.status is Status.LOCALIZED
     assert_near(found.pose, truth)
-    assert degrees == 45 or "turn" in {record.stage for record in found.records}  # features stand an eighth here
+    assert degrees == 45 or "retrieve_rotated" in {
+        record.stage for record in found.records
+    }  # features stand an eighth here
 
 
 def test_what_a_small_photo_does_not_show_is_looked_for_in_its_full_size(room: LoadedScene) -> None:
@@ -222,20 +224,20 @@ def test_what_a_small_photo_does_not_show_is_looked_for_in_its_full_size(room: L
         found = localize(photo_at(room, unseen_pose(seed), zoomed), room)
         assert_near(found.pose, unseen_pose(seed))
         stages |= {record.stage for record in found.records}
-    assert "look" in stages
-    assert not stages & {"further", "turn", "sample"}
+    assert "retrieve_full_size" in stages
+    assert not stages & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 
 
 def test_an_alignment_that_does_not_settle_is_followed_by_another_match(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a photo whose lens is free: here it would settle with some more rounds."""
-    monkeypatch.setattr("service.pose.stages.ALIGNMENTS", 1)
+    monkeypatch.setattr("service.pose.matching.search_stages.ALIGNMENTS", 1)
     photo = photo_at(room, unseen_pose(4))
     lens = replace(photo.intrinsics, fx=1.05 * FOCAL, fy=1.05 * FOCAL, trust="approximate")
     found = localize(replace(photo, intrinsics=lens, photo_intrinsics=lens), room)
     stages = [record.stage for record in found.records]
-    assert stages[stages.index("align") + 1] == "rematch"
+    assert stages[stages.index("refine") + 1] == "rematch"
     assert_near(found.pose, unseen_pose(4))
 
 
@@ -260,11 +262,11 @@ def test_a_photo_of_another_place_is_not_localized(room: LoadedScene, tmp_path: 
     found = localize(photo_at(foreign, unseen_pose()), room)
     assert found.verdict.status is Status.NOT_LOCALIZED
     assert found.verdict.score < 0.25
-    assert not {record.stage for record in found.records}.isdisjoint({"turn", "further"})
+    assert not {record.stage for record in found.records}.isdisjoint({"retrieve_rotated", "retrieve_more_views"})
     for effort in ("fast", "exhaustive"):
         request = Request(options=ESTIMATORS.load(DEFAULT).Options(effort=effort), budget_renders=25)
         stages = {record.stage for record in localize(photo_at(foreign, unseen_pose()), room, request).records}
-        assert ("sample" in stages) is (effort == "exhaustive")
+        assert ("sample_poses" in stages) is (effort == "exhaustive")
 
 
 def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, tmp_path: Path) -> None:
@@ -291,7 +293,7 @@ def test_without_training_cameras_the_room_is_found_from_the_inside(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, count in (("SHELL_CANDIDATES", 20), ("VOLUME_CANDIDATES", 80), ("BEST", 20)):
-        monkeypatch.setattr(f"service.pose.placement.{name}", count)
+        monkeypatch.setattr(f"service.pose.retrieval.view_placement.{name}", count)
     bare = LoadedScene.of(replace(room.scene, cameras=()))
     half = np.array([2.0, 1.5, 1.25])
     views = bare.prepare(DEFAULT).views
@@ -347,7 +349,7 @@ def test_mc_do_leaves_out_what_is_switched_off(solver: str, room: LoadedScene) -
         found = localize(query, room, Request("mc_do", options))
         stages = {record.stage for record in found.records}
         assert kinds[left] in stages
-        assert stages <= {"start", "sample", kinds[left]}
+        assert stages <= {"start", "sample_poses", kinds[left]}
         assert all(record.matches for record in found.records if record.stage in ("hypothesis", "decouple"))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.bench.gate import GARBAGE, Sample, fitted, garbage, probabilities, summary
-from service.pose.gate import LOCALIZED, SCALES
+from service.pose.verification.gate import LOCALIZED, SCALES
 
 
 def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:

@@ -17,9 +17,9 @@ from api_server import ROOT, TURNED, assert_problem, photo, post, ready_service,
 from PIL import Image
 from test_scenes import TRANSFORMS, ply
 
-from service import images
 from service.errors import CorruptScene, InvalidImage, SceneError, UnsupportedFormat
-from service.images import read_query
+from service.photos import images
+from service.photos.images import read_query
 from service.scene_formats import load_scene
 
 HALF_PAIR = '"\\ud800"'
@@ -229,7 +229,7 @@ def test_a_bug_is_counted_as_500_and_has_our_headers(plugins):
     with ready_service() as client:
         job = post(client).json()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.api.routes.jobs.documents.job_trace", None)
+            patch.setattr("service.web.routes.jobs.documents.job_trace", None)
             answer = client.get(job["links"]["trace"])
         assert_problem(answer, 500, "internal_error")
         assert answer.headers["x-request-id"]

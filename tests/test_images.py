@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags, Image, ImageOps
 
-from service import images
 from service.errors import InvalidImage, InvalidIntrinsics
-from service.images import photo_size, read_query
-from service.intrinsics import intrinsics_from, undistorted
+from service.photos import images
+from service.photos.images import photo_size, read_query
+from service.photos.intrinsics import intrinsics_from, undistorted
 from service.types import Intrinsics, Pose
 
 DATA = Path(__file__).parent / "data"

@@ -10,16 +10,19 @@ import pytest
 
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
-from service.intrinsics import intrinsics_from
-from service.pose import alignment, covariance
-from service.pose.alignment import align, evidence
-from service.pose.focal import focal_resection, linearized
-from service.pose.views import to_uint8
-from service.types import EXACT, Camera, Intrinsics, Lens, Pose, Query
+from service.photos.intrinsics import intrinsics_from
+from service.pose.absolute_pose.unknown_focal import focal_resection, linearized
+from service.pose.features.views import to_uint8
+from service.pose.refinement import covariance
+from service.pose.refinement import photometric as alignment
+from service.pose.refinement.photometric import align, evidence
+from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose
 
 
-def planted(seed: int, lens: Lens, flat: bool, wrong_share: float) -> tuple[np.ndarray, np.ndarray, Pose]:
+def planted(
+    seed: int, lens: IntrinsicsCorrection, flat: bool, wrong_share: float
+) -> tuple[np.ndarray, np.ndarray, Pose]:
     """Matches with a pixel of noise, seen through `lens` beside LENS; some are wrong."""
     rng = np.random.default_rng(seed)
     pose = true_pose(seed)
@@ -32,7 +35,7 @@ def planted(seed: int, lens: Lens, flat: bool, wrong_share: float) -> tuple[np.n
 
 @pytest.mark.parametrize("factor", [0.45, 0.8, 1.15, 2.2])
 def test_the_focal_length_is_found_among_wrong_matches(factor: float) -> None:
-    px, points, pose = planted(3, Lens(factor), flat=False, wrong_share=0.4)
+    px, points, pose = planted(3, IntrinsicsCorrection(factor), flat=False, wrong_share=0.4)
     found = focal_resection(px, points, LENS, 0.5, 2.0)
     assert found is not None
     assert found.lens.focal_factor == pytest.approx(factor, rel=0.02)
@@ -47,7 +50,7 @@ def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
     rng = np.random.default_rng(0)
     pose = Pose(np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0] * 4, [0] * 4, [0, 0, 0, 3.0], [0] * 4]))
     points = np.concatenate([rng.uniform(-1.2, 1.2, (100, 2)), np.zeros((100, 1))], 1)
-    px = project(transformed(pose.camera_from_world, points), LENS.corrected(Lens(1.3)))
+    px = project(transformed(pose.camera_from_world, points), LENS.corrected(IntrinsicsCorrection(1.3)))
     found = focal_resection(px, points, LENS, 0.1, 2.0)
     assert found is not None
     assert found.num_inliers == 100
@@ -56,13 +59,13 @@ def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
 
 @pytest.mark.parametrize("column", range(9))
 def test_linearized_is_the_derivative_by_differences(column: int) -> None:
-    px, points, pose = planted(1, EXACT, flat=False, wrong_share=0.0)
+    px, points, pose = planted(1, NO_CORRECTION, flat=False, wrong_share=0.0)
     jacobian, _ = linearized(px, points, LENS, pose)
     step = np.zeros(9)
     step[column] = 1e-6
 
     def seen(step: np.ndarray) -> np.ndarray:
-        lens = Lens(float(np.exp(step[6])), float(step[7]), float(step[8]))
+        lens = IntrinsicsCorrection(float(np.exp(step[6])), float(step[7]), float(step[8]))
         camera = pose.world_from_camera @ se3_exp(step[:6])
         return project(transformed(np.linalg.inv(camera), points), LENS.corrected(lens))
 
@@ -71,9 +74,9 @@ def test_linearized_is_the_derivative_by_differences(column: int) -> None:
 
 
 def test_alignment_finds_the_lens_with_the_pose() -> None:
-    truth, lens = true_pose(2), Lens(1.06, 0.008, -0.005)
+    truth, lens = true_pose(2), IntrinsicsCorrection(1.06, 0.008, -0.005)
     rgb = photo_from(truth, LENS.corrected(lens)).rgb
-    pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), EXACT
+    pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), NO_CORRECTION
     for _ in range(4):
         camera = Camera(LENS.corrected(found), pose)
         result = align(rgb, PaintedWalls().render([camera])[0], camera, Camera(LENS, pose), 3, found, 0.5)
@@ -170,7 +173,7 @@ def test_the_pull_tells_how_far_a_pose_is_off() -> None:
 def test_another_focal_length_than_given_shows(factor: float) -> None:
     """The pose is the best one for the focal length given; the pixels still ask for another one."""
     truth = true_pose(1)
-    rgb = photo_from(truth, LENS.corrected(Lens(factor))).rgb
+    rgb = photo_from(truth, LENS.corrected(IntrinsicsCorrection(factor))).rgb
     pose = truth
     for _ in range(3):
         camera = Camera(LENS, pose)
@@ -186,9 +189,9 @@ def test_another_focal_length_than_given_shows(factor: float) -> None:
 
 
 def test_corrected_is_undone_by_nothing_but_its_opposite() -> None:
-    lens = Lens(1.2, 0.01, -0.02)
+    lens = IntrinsicsCorrection(1.2, 0.01, -0.02)
     there = LENS.corrected(lens)
-    back = there.corrected(Lens(1 / 1.2, -0.01, 0.02))
+    back = there.corrected(IntrinsicsCorrection(1 / 1.2, -0.01, 0.02))
     assert np.allclose([back.fx, back.fy, back.cx, back.cy], [LENS.fx, LENS.fy, LENS.cx, LENS.cy])
     big = LENS.resized(2 * LENS.width, 2 * LENS.height).corrected(lens)
     assert np.allclose([big.fx, big.cx, big.cy], 2 * np.array([there.fx, there.cx, there.cy]))

@@ -18,7 +18,7 @@ from service.geometry import moved
 from service.interfaces import Features, Frame, SceneGradients
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.results import IterationRecord, Reason, Status
-from service.types import Camera, GaussianScene, Intrinsics, Lens, Pose, Query, SceneInfo
+from service.types import Camera, GaussianScene, Intrinsics, IntrinsicsCorrection, Pose, Query, SceneInfo
 
 LENS = Intrinsics(64, 64, 60.0, 60.0, 32.0, 32.0)
 QUERY = Query(np.zeros((64, 64, 3), np.uint8), LENS, "guessed", LENS.resized(128, 128), warnings=("from the photo",))
@@ -133,7 +133,7 @@ def test_the_lens_of_the_last_record_is_the_answers(monkeypatch: pytest.MonkeyPa
     class Zoomed(Script):
         def run(self, query, tools, options):
             for record in super().run(query, tools, options):
-                yield replace(record, lens=Lens(1.25, 0.01, -0.02))
+                yield replace(record, lens=IntrinsicsCorrection(1.25, 0.01, -0.02))
 
     use(monkeypatch, Zoomed(2))
     found, photo = localize(QUERY, loaded).intrinsics, QUERY.photo_intrinsics

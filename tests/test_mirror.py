@@ -14,10 +14,10 @@ from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.geometry import project, transformed
 from service.localize import LoadedScene, localize
-from service.pose.gate import FLOORS
-from service.pose.mirror import mirrored
+from service.pose.verification.gate import FLOORS
+from service.pose.verification.mirror_images import mirrored
 from service.results import Reason, Status
-from service.types import Box, Pose, Query
+from service.types import BoxPrior, Pose, Query
 
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
@@ -38,7 +38,7 @@ def test_a_mirrored_photo_of_a_symmetric_room_is_not_localized(seed: int, symmet
     found = localize(mirrored(photo), symmetric)
     assert found.verdict.status is Status.UNCERTAIN
     assert found.verdict.reason is Reason.MIRRORED
-    assert "mirror" in [record.stage for record in found.records]
+    assert "check_mirror" in [record.stage for record in found.records]
 
 
 def test_a_mirrored_photo_is_told_also_where_the_gate_does_not_believe_it_anyway(
@@ -58,7 +58,7 @@ def test_a_noisy_photo_is_looked_for_both_ways_and_found(symmetric: LoadedScene)
     noise = np.random.default_rng(0).normal(0, 25, photo.rgb.shape)
     found = localize(replace(photo, rgb=np.clip(photo.rgb + noise, 0, 255).astype(np.uint8)), symmetric)
     assert found.verdict.status is Status.LOCALIZED
-    assert "mirror" in [record.stage for record in found.records]
+    assert "check_mirror" in [record.stage for record in found.records]
     assert_near(found.pose, truth)
 
 
@@ -66,7 +66,7 @@ def test_a_region_that_excludes_the_mirrored_place_changes_nothing(symmetric: Lo
     """It is of the photo as it was sent."""
     truth = unseen_pose()
     there = (MIRROR @ truth.world_from_camera @ MIRROR)[:3, 3]
-    query = replace(mirrored(photo_at(symmetric, truth)), region=Box(there - 0.2, there + 0.2))
+    query = replace(mirrored(photo_at(symmetric, truth)), region=BoxPrior(there - 0.2, there + 0.2))
     assert localize(query, symmetric).verdict.reason is Reason.MIRRORED
 
 

@@ -20,9 +20,9 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
 
-from service.api.app import create_app
-from service.api.keys import KeyRing
-from service.api.settings import Settings
+from service.web.api_keys import KeyRing
+from service.web.app import create_app
+from service.web.settings import Settings
 
 pytestmark = NEEDS_CHROMIUM
 STUDIO = Path(__file__).parents[1] / "scenes" / "studio"

@@ -11,10 +11,10 @@ from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
 from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
-from service.pose.index import built_index
-from service.pose.placement import coverage, find_views, floaters, search_lens, solidity
-from service.pose.space import _steps_in_the_clear
-from service.pose.thin import BEHIND, horizon, thinned
+from service.pose.retrieval.free_space import _steps_in_the_clear
+from service.pose.retrieval.index import built_index
+from service.pose.retrieval.lod_proxy import BEHIND, horizon, thinned
+from service.pose.retrieval.view_placement import coverage, find_views, floaters, search_lens, solidity
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
 
@@ -31,7 +31,7 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
         ("BEST", 20),
         ("AT_LEAST", 16),
     ):
-        monkeypatch.setattr(f"service.pose.placement.{name}", count)
+        monkeypatch.setattr(f"service.pose.retrieval.view_placement.{name}", count)
 
 
 def test_steps_end_before_what_is_filled_and_nothing_is_outside() -> None:
@@ -153,7 +153,7 @@ def test_coverage_is_the_share_that_is_seen() -> None:
 
 
 def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.pose.thin.ENOUGH", 8000)
+    monkeypatch.setattr("service.pose.retrieval.lod_proxy.ENOUGH", 8000)
     scene = closed_room(40_000)
     whole = CpuRasterizer(scene)
     thin = thinned(scene, whole, np.random.default_rng(0))
@@ -199,8 +199,8 @@ class Watched(CpuRasterizer):
 
 def test_views_of_a_large_scene_show_all_that_is_seen_but_not_what_walls_hide(monkeypatch: pytest.MonkeyPatch) -> None:
     """A room with a second one behind its wall, of whose Gaussians not one has to be drawn."""
-    monkeypatch.setattr("service.pose.thin.ENOUGH", 20_000)
-    monkeypatch.setattr("service.pose.thin.LARGE", 30_000)
+    monkeypatch.setattr("service.pose.retrieval.lod_proxy.ENOUGH", 20_000)
+    monkeypatch.setattr("service.pose.retrieval.lod_proxy.LARGE", 30_000)
     room = closed_room(30_000)
     scene = joined(room, changed(room, 1.0, (2.2 * ROOM[0], 0.0, 0.0)))
     eye, up = np.array([-0.5, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])

@@ -14,14 +14,8 @@ from hypothesis import strategies as st
 
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
-from service.pose.alignment import align
-from service.pose.appearance import Blocks, Pair, colour_agreement, gradient_agreement, tint_agreement
-from service.pose.gate import SCALES, Scale, clear, probability, verify
-from service.pose.index import built_index, prepared_index
-from service.pose.pnp import reprojection_error_px, resection
-from service.pose.retrieval import top, vote
-from service.pose.viewpoints import farthest_points, spread
-from service.pose.views import (
+from service.pose.absolute_pose.pnp import reprojection_error_px, resection
+from service.pose.features.views import (
     PHOTO_PX,
     correspondences,
     lifted,
@@ -32,6 +26,12 @@ from service.pose.views import (
     sized,
     to_uint8,
 )
+from service.pose.refinement.photometric import align
+from service.pose.retrieval.index import built_index, prepared_index
+from service.pose.retrieval.scores import top, vote
+from service.pose.retrieval.viewpoints import farthest_points, spread
+from service.pose.verification.appearance import Blocks, Pair, colour_agreement, gradient_agreement, tint_agreement
+from service.pose.verification.gate import SCALES, Scale, clear, probability, verify
 from service.results import Reason, Status
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, Query, SceneInfo
 
@@ -551,7 +551,7 @@ def test_spread_takes_all_of_few_cameras_and_covers_many() -> None:
 
 @pytest.fixture
 def walls_with_cameras(monkeypatch: pytest.MonkeyPatch) -> GaussianScene:
-    monkeypatch.setattr("service.pose.viewpoints.INDEX_PX", 96)
+    monkeypatch.setattr("service.pose.retrieval.viewpoints.INDEX_PX", 96)
     return replace(a_scene(), cameras=tuple(NamedCamera(f"{i}.png", Camera(LENS, true_pose(i))) for i in range(3)))
 
 

@@ -13,9 +13,9 @@ from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
-from service.pose.region import admits, excess, loosened
+from service.pose.absolute_pose.prior_region import admits, excess, loosened
 from service.results import PoseEstimate, Reason, Status
-from service.types import Box, Gaussian, Pose, Region
+from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion
 
 TRUTH = unseen_pose()
 FAST = Request(options=Options(effort="fast"))
@@ -28,25 +28,27 @@ def repeated(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
     return LoadedScene.load(write_room(folder / "room", repeated=True), cache_dir=folder / "cache")
 
 
-def box_around(pose: Pose, size: float) -> Box:
-    return Box(pose.position_in_world - size, pose.position_in_world + size)
+def box_around(pose: Pose, size: float) -> BoxPrior:
+    return BoxPrior(pose.position_in_world - size, pose.position_in_world + size)
 
 
-def gaussian_at(pose: Pose, degrees: float, units: float) -> Gaussian:
-    return Gaussian(pose, np.diag(np.repeat([np.radians(degrees), units], 3) ** 2))
+def gaussian_at(pose: Pose, degrees: float, units: float) -> GaussianPosePrior:
+    return GaussianPosePrior(pose, np.diag(np.repeat([np.radians(degrees), units], 3) ** 2))
 
 
 @pytest.mark.parametrize("place", [TRUTH, TWIN])
 @pytest.mark.parametrize("kind", ["box", "gaussian"])
 def test_a_region_decides_between_places_that_look_alike(kind: str, place: Pose, repeated: LoadedScene) -> None:
-    region: Region = box_around(place, 0.3) if kind == "box" else gaussian_at(moved(place, np.full(6, 0.05)), 5, 0.1)
+    region: PriorRegion = (
+        box_around(place, 0.3) if kind == "box" else gaussian_at(moved(place, np.full(6, 0.05)), 5, 0.1)
+    )
     found = localize(replace(photo_at(repeated, TRUTH), region=region), repeated)
     assert found.verdict.status is Status.LOCALIZED
     assert_near(found.pose, place)
 
 
 @pytest.mark.parametrize("region", [box_around(Pose(np.diag([1.0, -1, -1, 1])), 0.1), gaussian_at(TWIN, 2, 0.05)])
-def test_where_the_photo_was_not_taken_nothing_is_localized(region: Region, repeated: LoadedScene) -> None:
+def test_where_the_photo_was_not_taken_nothing_is_localized(region: PriorRegion, repeated: LoadedScene) -> None:
     elsewhere = moved(TRUTH, np.array([0.0, 1.5, 0, 0, 0, 0]))
     found = localize(replace(photo_at(repeated, elsewhere), region=region), repeated, FAST)
     assert found.verdict.status is not Status.LOCALIZED
@@ -70,7 +72,7 @@ def test_from_a_prior_nothing_is_looked_for_elsewhere(repeated: LoadedScene) -> 
     known = gaussian_at(prior, 3, 0.1)
     found = localize(replace(photo_at(repeated, TRUTH), prior=prior, region=known), repeated, FAST)
     assert found.verdict.status is Status.LOCALIZED
-    assert stages(found) == {"align", "verify"}
+    assert stages(found) == {"refine", "verify"}
     assert_near(found.pose, TRUTH)
 
 
@@ -91,14 +93,14 @@ def test_a_wrong_guess_costs_nothing_but_time(repeated: LoadedScene) -> None:
 def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(
     repeated: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("service.pose.gate.MAX_SIGMA_SHARE", 0.0)
+    monkeypatch.setattr("service.pose.verification.gate.MAX_SIGMA_SHARE", 0.0)
     found = localize(photo_at(repeated, TRUTH), repeated, FAST)
     assert found.verdict.reason is Reason.PLACE_UNCERTAIN
-    assert not stages(found) & {"further", "turn", "sample"}
+    assert not stages(found) & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 
 
 def test_regions_end_where_they_say() -> None:
-    box = Box(np.zeros(3), np.array([1.0, 2.0, 3.0]))
+    box = BoxPrior(np.zeros(3), np.array([1.0, 2.0, 3.0]))
     inside, outside = np.eye(4), np.eye(4)
     inside[:3, 3], outside[:3, 3] = [0.5, 2.0, 0.0], [1.3, 2.4, 1.0]
     assert admits(box, Pose(inside))
@@ -107,7 +109,7 @@ def test_regions_end_where_they_say() -> None:
     # 99.9 % of a chi-square with 6 degrees of freedom, by drawn twists.
     covariance = np.diag(np.repeat([0.01, 0.2], 3) ** 2)
     covariance[0, 4] = covariance[4, 0] = 0.0015
-    region = Gaussian(TRUTH, covariance)
+    region = GaussianPosePrior(TRUTH, covariance)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 4_000)
     kept = np.mean([admits(region, moved(TRUTH, twist)) for twist in draws])
     assert kept == pytest.approx(0.999, abs=0.0015)  # three standard deviations
@@ -118,10 +120,10 @@ def test_regions_end_where_they_say() -> None:
 @pytest.mark.parametrize("corners", [([0, 0, 0], [1, 1, 0]), ([0, 0, np.nan], [1, 1, 1])])
 def test_an_empty_box_is_refused(corners: tuple[list, list]) -> None:
     with pytest.raises(InvalidPrior, match="corners"):
-        Box(*map(np.array, corners))
+        BoxPrior(*map(np.array, corners))
 
 
 @pytest.mark.parametrize("matrix", [np.zeros((6, 6)), -np.eye(6), np.eye(5), np.full((6, 6), np.nan), np.ones((6, 6))])
 def test_what_is_no_covariance_is_refused(matrix: np.ndarray) -> None:
     with pytest.raises(InvalidPrior, match="positive definite"):
-        Gaussian(TRUTH, matrix)
+        GaussianPosePrior(TRUTH, matrix)

@@ -15,11 +15,11 @@ from service.estimators.view_index import Options
 from service.geometry import look_at
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
-from service.pose.alignment import align
-from service.pose.gate import verify
-from service.pose.mirror import mirrored
+from service.pose.refinement.photometric import align
+from service.pose.verification.gate import verify
+from service.pose.verification.mirror_images import mirrored
 from service.results import HINTS, Reason, Status, Verdict
-from service.types import Box, Camera, Pose, Query
+from service.types import BoxPrior, Camera, Pose, Query
 
 TRUTH = unseen_pose()
 UP = np.array([0.0, 0.0, 1.0])
@@ -68,7 +68,7 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
         localize(photo_at(room, TRUTH), room, replace(FAST, budget_s=1e-9)).verdict
     ),
 }
-ELSEWHERE = Box(np.array([0.0, 0, 0]), np.array([0.01, 0.01, 0.01]))
+ELSEWHERE = BoxPrior(np.array([0.0, 0, 0]), np.array([0.01, 0.01, 0.01]))
 
 
 def with_swapped_colours(query: Query) -> Query:

@@ -26,9 +26,9 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Response
 
-from service.api import problems
-from service.api.relay import Relay
-from service.api.viewer_child import ViewerChild
+from service.web import problems
+from service.web.viewer_process import ViewerChild
+from service.web.viewer_relay import Relay
 
 PAGE = b"<html><head></head>the one page</html>"
 
@@ -201,7 +201,7 @@ def test_the_viewer_ends_when_its_parent_is_killed(tmp_path):
         [
             sys.executable,
             "-c",
-            "import asyncio; from service.api.viewer_child import ViewerChild\n"
+            "import asyncio; from service.web.viewer_process import ViewerChild\n"
             "asyncio.run(ViewerChild('http://127.0.0.1:1', 'key').supervise())",
         ],
         cwd=Path(__file__).parents[1],

@@ -9,14 +9,14 @@ import pytest
 from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
-from service.api.convert import result_out
-from service.api.schemas import Timing
 from service.geometry import pose_distance
 from service.localize import LoadedScene, Request, localize
-from service.pose.rivals import ranked
+from service.pose.verification.ambiguity import ranked
 from service.results import IterationRecord, Reason, Status
-from service.track import Tracker
+from service.tracking import Tracker
 from service.types import Pose
+from service.web.schemas.conversion import result_out
+from service.web.schemas.responses import Timing
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,9 @@ def test_a_camera_is_not_followed_from_where_it_may_not_be(repeated: LoadedScene
 
 def test_answers_are_ranked_by_what_they_leave_unexplained() -> None:
     poses = [Pose(np.eye(4)), unseen_pose(0), unseen_pose(1)]
-    records = [IterationRecord("align", pose, loss=loss) for pose, loss in zip(poses, (0.021, 0.02, 0.04), strict=True)]
+    records = [
+        IterationRecord("refine", pose, loss=loss) for pose, loss in zip(poses, (0.021, 0.02, 0.04), strict=True)
+    ]
     best, others = ranked(records)
     assert best is records[1]
     assert others is not None

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 from api_server import assert_problem, finished, make_scene, post, serving, settings, until
 
-from service.api.app import create_app
-from service.api.scenes import Scenes
-from service.api.warmup import overview
 from service.errors import BadInput
 from service.localize import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
+from service.scene_manager.manager import Scenes
+from service.scene_manager.warm_up import overview
 from service.types import GaussianScene, GeoAnchor
+from service.web.app import create_app
 
 
 def write_ply(path: Path, scene: GaussianScene) -> None:
@@ -70,7 +70,7 @@ def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
             assert {each["id"] for each in job["result"]["considered"]} == expected
             assert job["scene"] == job["result"]["scene"]["id"] in expected
             assert job["result"]["status"] == "not_localized"  # the stand-ins see nothing
-            assert [t["stage"] for t in job["result"]["timings"]][:2] == ["decode", "which"]
+            assert [t["stage"] for t in job["result"]["timings"]][:2] == ["decode", "scene_ranking"]
         one = post(client, scene=["cellar"]).json()
         assert (one["scene"], one["result"]["considered"]) == ("cellar", [])
         assert_problem(post(client, scene=["hall", "pantry"]), 404, "scene_not_found", "scene")

@@ -21,14 +21,14 @@ from rich.console import Console
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from service.api.admission import Admission
-from service.api.app import create_app
-from service.api.edge import Edge
-from service.api.gate import needed_role
-from service.api.keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
-from service.api.metrics import Metrics
+from service.cli.serve import run
 from service.errors import InvalidRequest, QueueFull
-from service.serve import run
+from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
+from service.web.app import create_app
+from service.web.metrics import Metrics
+from service.web.middleware.authentication import needed_role
+from service.web.middleware.limits import Admission
+from service.web.middleware.proxy import Edge
 
 
 @pytest.fixture
@@ -155,8 +155,8 @@ def test_serve_beyond_this_machine_makes_a_key_and_prints_it_in_the_url(stepping
             super().__init__(config)
             servers.append(self)
 
-    monkeypatch.setattr("service.serve.uvicorn.Server", Server)
-    for place in ("service.serve", "service.api.app"):
+    monkeypatch.setattr("service.cli.serve.uvicorn.Server", Server)
+    for place in ("service.cli.serve", "service.web.app"):
         monkeypatch.setattr(f"{place}.is_loopback", lambda host: False)
     chosen = settings(port=0, keys_file=tmp_path / "none.json", data_dir=tmp_path / "data", log_json=False)
     consoles = Console(file=out, width=200), Console(file=io.StringIO())

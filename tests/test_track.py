@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
-from service import track
+from service import tracking as track
 from service.bench import track as bench
 from service.bench.metrics import Units
 from service.errors import SceneNotFound
 from service.geometry import moved, pose_distance
-from service.images import encode_image, query_of, read_query
 from service.localize import Cancelled, LoadedScene, Request
-from service.pose.gate import verify
+from service.photos.images import encode_image, query_of, read_query
+from service.photos.sequence import SequencePhoto
+from service.pose.verification.gate import verify
 from service.results import Status
-from service.track import SequencePhoto, Tracker, localize_sequence
+from service.tracking import Tracker, localize_sequence
 from service.types import Camera, Intrinsics, Pose, Query
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -148,7 +149,7 @@ def test_the_gate_is_asked_in_doubt_and_now_and_then(room, monkeypatch):
     for i, pose in enumerate(truth):
         tracker.track(query(room, pose, i))
     assert len(asked) == 2  # photos 3 and 6 after the first
-    monkeypatch.setattr("service.track.clear", lambda signals: False)
+    monkeypatch.setattr("service.tracking.clear", lambda signals: False)
     asked.clear()
     estimate = tracker.track(query(room, path(8)[7], 7))
     assert asked

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from service.pose.turn import PHOTO_CORNERS, Corners, corners, turns_to_upright
+from service.pose.features.in_plane_rotation import PHOTO_CORNERS, Corners, corners, turns_to_upright
 
 PHOTOS = sorted((Path(__file__).parent.parent / "scenes" / "studio" / "photos").glob("*.jpg"))
 

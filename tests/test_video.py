@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from service import video
 from service.errors import InvalidImage
-from service.video import frame_count, is_video, read_video
+from service.photos import video
+from service.photos.video import frame_count, is_video, read_video
 
 KINDS = [("mp4", "mp4v"), ("avi", "MJPG"), ("mkv", "FFV1"), ("webm", "VP80")]
 

@@ -16,11 +16,11 @@ from fake_service import PHOTO, FakeService, orbit, records, render_rgb, threads
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.api.convert import record_out
-from service.api.splats import importance, packed_splats
 from service.geometry import look_at, project, transformed
 from service.results import IterationRecord, MatchVectors, Reason, Status
+from service.scene_manager.splat_sample import importance, packed_splats
 from service.types import Camera, Intrinsics
+from service.web.schemas.conversion import record_out
 from viewer import charts, draw, measure, shapes
 from viewer.client import Answer, JobView, Service, ServiceTrouble, parsed_record, parsed_splats, sse_events
 from viewer.feed import JobFeed, Library
@@ -374,9 +374,9 @@ def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
     titles = ("loss", "turned by the step", "moved by the step", "matches and inliers", "error of rotation")
     assert all(title in drawn for title in titles)
     loss = drawn.split("</svg>")[0]
-    # Stage `retrieve` has one value, `align` those of the steps 1, 2, 4 and 5: a line begins anew after the gap.
+    # Stage `retrieve` has one value, `refine` those of the steps 1, 2, 4 and 5: a line begins anew after the gap.
     assert re.findall(r"<path d='(M[^']*)' fill='none'", loss)[1].count("M") == 2
-    assert loss.count("<title>retrieve</title>") == loss.count("<title>align</title>") == 1
+    assert loss.count("<title>retrieve</title>") == loss.count("<title>refine</title>") == 1
     assert re.findall(r"<title>step (\d): ([^<]*)</title>", loss) == [
         (str(k), f"{1 / (k + 1):.4g}") for k in (0, 1, 2, 4, 5)
     ]

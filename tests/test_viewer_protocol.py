@@ -25,7 +25,7 @@ from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
 from service.results import Reason, Status
-from service.types import Lens
+from service.types import IntrinsicsCorrection
 from viewer import app, draw, private, session, shapes
 from viewer.app import Viewer, job_of
 from viewer.client import Service, ServiceTrouble
@@ -246,7 +246,7 @@ def _click(browser: FakeBrowser, origin: np.ndarray, direction: np.ndarray) -> N
 
 def test_a_camera_is_drawn_with_the_lens_that_its_step_found(fake: FakeService, viewer: Viewer) -> None:
     job = fake.job("j", 1)
-    job.add(replace(records(2)[1], lens=Lens(focal_factor=2.0)))
+    job.add(replace(records(2)[1], lens=IntrinsicsCorrection(focal_factor=2.0)))
     job.finish()
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: browser.widget("step")["value"] == 1 and "agree" in browser.text(), "the last step")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from service.results import Candidates, IterationRecord, MatchVectors
-from service.types import Camera, Intrinsics, Lens, NamedCamera, Pose, frozen
+from service.types import Camera, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, frozen
 
 FINISHED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 _JOBS_LISTED = 50
@@ -229,7 +229,7 @@ def parsed_record(raw: dict[str, Any]) -> IterationRecord:
     return IterationRecord(
         stage=raw["stage"],
         pose=_pose(raw),
-        lens=Lens(**raw["lens"]),
+        lens=IntrinsicsCorrection(**raw["lens"]),
         matches=matches
         and MatchVectors(
             frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),

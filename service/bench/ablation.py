@@ -21,10 +21,14 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose import alignment, appearance, pyramid, sight, stages
-from service.pose.index import ViewIndex
-from service.pose.pnp import Resection
-from service.pose.views import Correspondences
+from service.pose.absolute_pose.pnp import Resection
+from service.pose.features.views import Correspondences
+from service.pose.matching import search_stages as stages
+from service.pose.refinement import photometric as alignment
+from service.pose.refinement import pyramid
+from service.pose.retrieval import image_variant as sight
+from service.pose.retrieval.index import ViewIndex
+from service.pose.verification import appearance
 from service.render import cpu
 from service.results import IterationRecord
 from service.types import Query
@@ -182,7 +186,7 @@ def _upright(upright: Any, query: Any, tools: Any) -> Any:
 
 
 def _as_found(found: Resection, query: Any, tools: Any) -> Iterator[IterationRecord]:
-    yield IterationRecord("align", found.pose, found.lens, num_inliers=found.num_inliers)
+    yield IterationRecord("refine", found.pose, found.lens, num_inliers=found.num_inliers)
 
 
 def _without_look(columns: np.ndarray, *others: Any) -> np.ndarray:

@@ -23,7 +23,7 @@ from jaxtyping import Float64
 
 from service.bench.queries import HOLD_OUT_EVERY, BenchPhoto, find_photos, moved_camera
 from service.errors import CorruptScene, InvalidImage, InvalidPrior, SceneNotFound, UnknownName
-from service.images import photo_size
+from service.photos.images import photo_size
 from service.scene_formats.colmap import read_cameras
 from service.scene_formats.folder import COLMAP_FOLDER
 from service.scene_formats.manifest import MANIFEST, read_manifest

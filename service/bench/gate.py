@@ -11,8 +11,8 @@ bound. Wrong ones are made by stress:
     followed    the same, as the tracker does it: judged by its glance alone, with the weights that are in use
 
 Weights and floors are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a
-result is of those tests. Those in `service/pose/gate.py` were fitted on all, from such a run. Floors are of right poses
-within reason.
+result is of those tests. Those in `service/pose/verification/gate.py` were fitted on all, from such a run. Floors are
+of right poses within reason.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ from service.bench.metrics import COARSE, errors, nees
 from service.bench.queries import BenchPhoto, sent
 from service.estimators.view_index import Options
 from service.geometry import moved
-from service.images import encode_image, read_query, resized
 from service.interfaces import Tools
 from service.localize import Request, localize
-from service.pose.alignment import align
-from service.pose.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
-from service.pose.mirror import mirrored
-from service.pose.stages import GOOD_MATCH
-from service.pose.views import photo_at, rendered_frame
+from service.photos.images import encode_image, read_query, resized
+from service.pose.features.views import photo_at, rendered_frame
+from service.pose.matching.search_stages import GOOD_MATCH
+from service.pose.refinement.photometric import align
+from service.pose.verification.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
+from service.pose.verification.mirror_images import mirrored
 from service.results import Reason, Status, Verdict
-from service.track import aligned_from, glance
+from service.tracking import aligned_from, glance
 from service.types import Camera, Intrinsics, Pose, Query
 
 WITHIN_REASON: tuple[tuple[str, ...], ...] = (
@@ -224,7 +224,7 @@ def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | 
     estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
     weighed = nees(estimate, truth) if truth else None
     verdict = replace(estimate.verdict, signals=verify(query, estimate.pose, _tools(one)).signals)
-    matched = any(r.stage == "align" and (r.num_inliers or 0) >= GOOD_MATCH for r in estimate.records)
+    matched = any(r.stage == "refine" and (r.num_inliers or 0) >= GOOD_MATCH for r in estimate.records)
     return replace(_sample(one, kind, photo, truth, estimate.pose, verdict, weighed), matched=matched)
 
 

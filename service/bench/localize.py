@@ -24,9 +24,9 @@ from service.bench.queries import BenchPhoto, sent
 from service.bench.starts import require_kind, start_pose
 from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
-from service.images import read_query
 from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
-from service.pose.focus import centre_depth
+from service.photos.images import read_query
+from service.pose.retrieval.scene_focus import centre_depth
 from service.results import PoseEstimate
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest

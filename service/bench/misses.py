@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from service.bench.localize import Subject, Trial
-from service.images import encode_image, read_query, resized
+from service.photos.images import encode_image, read_query, resized
 from service.results import PoseEstimate
 from service.types import Camera
 

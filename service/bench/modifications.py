@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from service.errors import InvalidOptions, UnknownName
 from service.geometry import so3_exp
-from service.images import encode_image, read_query, resized
+from service.photos.images import encode_image, read_query, resized
 from service.types import Intrinsics, Pose
 
 

@@ -13,8 +13,8 @@ from jaxtyping import Float32, Float64
 
 from service.bench.modifications import Shot, modified
 from service.errors import CorruptScene, SceneNotFound, SplatfixError
-from service.images import encode_image, read_query
-from service.intrinsics import intrinsics_from
+from service.photos.images import encode_image, read_query
+from service.photos.intrinsics import intrinsics_from
 from service.scene_formats.colmap import read_cameras
 from service.scene_formats.folder import COLMAP_FOLDER
 from service.scene_formats.manifest import read_manifest

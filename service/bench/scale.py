@@ -22,9 +22,9 @@ import numpy as np
 from service.bench.metrics import COARSE, FINE, Outcome, errors, units_of
 from service.bench.queries import find_photos
 from service.errors import BackendMissing, InvalidRequest
-from service.images import read_query
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
-from service.pose.focus import centre_depth
+from service.photos.images import read_query
+from service.pose.retrieval.scene_focus import centre_depth
 from service.scene_formats import load_scene
 from service.types import Camera, GaussianScene
 

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from service.geometry import so3_exp
 from service.interfaces import Rasterizer
-from service.pose.level import contributions
+from service.pose.descent.contribution_pruning import contributions
 from service.scene_formats.gaussians import SH_C0, RawGaussians
 from service.scene_formats.manifest import MANIFEST
 from service.scene_formats.similarity import moved_gaussians, moved_pose

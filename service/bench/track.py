@@ -21,13 +21,14 @@ from jaxtyping import Float64
 from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, nees, units_of
 from service.errors import SceneNotFound
 from service.geometry import pose_distance, quat_from_rotation, rotation_from_quat
-from service.images import encode_image, read_query
 from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request
-from service.pose.focus import centre_depth
+from service.photos.images import encode_image, read_query
+from service.photos.sequence import PHOTO_LONG_SIDE
+from service.pose.retrieval.scene_focus import centre_depth
 from service.results import PoseEstimate, Status
 from service.scene_formats import load_scene
-from service.track import PHOTO_LONG_SIDE, Tracker
+from service.tracking import Tracker
 from service.types import Camera, Intrinsics, Pose
 
 STEP_DEG, STEP_UNITS = 0.7, 0.02

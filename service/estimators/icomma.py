@@ -24,12 +24,12 @@ from jaxtyping import Float64
 from service.estimators.inerf import required_prior
 from service.geometry import project, transformed
 from service.interfaces import Tools
-from service.pose.adam import Adam
-from service.pose.descent import Se3, photometric, require_within
-from service.pose.focus import Focus, focus_of_scene
-from service.pose.losses import loss_against, require_loss
-from service.pose.matching import epipolar_inliers, match_record, render_and_match
-from service.pose.views import RENDER_PX, Correspondences, known_at, photo_at, sized
+from service.pose.descent.adam import Adam
+from service.pose.descent.gradient_descent import Se3, photometric, require_within
+from service.pose.descent.losses import loss_against, require_loss
+from service.pose.features.views import RENDER_PX, Correspondences, known_at, photo_at, sized
+from service.pose.matching.render_and_match import epipolar_inliers, match_record, render_and_match
+from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Camera, Intrinsics, Pose, Query
 

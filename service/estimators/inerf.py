@@ -19,11 +19,11 @@ from jaxtyping import Float32, UInt8
 
 from service.errors import InvalidPrior
 from service.interfaces import Tools
-from service.pose.adam import Adam
-from service.pose.descent import Se3, photometric, require_within
-from service.pose.focus import Focus, focus_of_scene
-from service.pose.losses import Loss, interest_region, loss_against, require_loss
-from service.pose.views import RENDER_PX, known_at, photo_at, sized
+from service.pose.descent.adam import Adam
+from service.pose.descent.gradient_descent import Se3, photometric, require_within
+from service.pose.descent.losses import Loss, interest_region, loss_against, require_loss
+from service.pose.features.views import RENDER_PX, known_at, photo_at, sized
+from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Pose, Query
 

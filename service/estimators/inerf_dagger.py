@@ -8,9 +8,9 @@ from typing import ClassVar
 
 from service.estimators import inerf
 from service.interfaces import Tools
-from service.pose.descent import require_within
-from service.pose.losses import require_loss
-from service.pose.views import RENDER_PX
+from service.pose.descent.gradient_descent import require_within
+from service.pose.descent.losses import require_loss
+from service.pose.features.views import RENDER_PX
 from service.results import IterationRecord
 from service.types import Query
 

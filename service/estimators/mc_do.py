@@ -7,7 +7,8 @@ From the supplement: the three stages and their order; matches as the score; 10 
 between match vectors, translation by their lengths; L1 as the loss. Ours, because it is silent: the hypotheses'
 number, range and resampling, which goes on from what the best ones' matches are solved to; the score (the weight of
 the matches that one turn about the scene's centre and one shift explain: where it is high, DO can go on); the
-second-order solver (`service.pose.decoupled` has both); XFeat where the paper most likely had LoFTR; small renders.
+second-order solver (`service.pose.absolute_pose.decoupled` has both); XFeat where the paper most likely had LoFTR;
+small renders.
 
 Deviations: DO's matches are of rendered points with a depth, and stay fixed while a solver works on them; best so
 far, not last, is the answer of MC and DO.
@@ -25,15 +26,15 @@ import numpy as np
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Rasterizer, Tools
-from service.pose.decoupled import MatchedPoints, Solved, gradient_solve, least_squares_solve
-from service.pose.descent import refine, require_within
-from service.pose.focus import Focus, focus_of_scene
-from service.pose.hypotheses import around
-from service.pose.level import contributions, pruned
-from service.pose.losses import loss_against, require_loss
-from service.pose.matching import match_record, render_and_match
-from service.pose.viewpoints import index_cameras
-from service.pose.views import RENDER_PX, Correspondences, View, known_at, photo_at, sized
+from service.pose.absolute_pose.decoupled import MatchedPoints, Solved, gradient_solve, least_squares_solve
+from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.gradient_descent import refine, require_within
+from service.pose.descent.hypotheses import around
+from service.pose.descent.losses import loss_against, require_loss
+from service.pose.features.views import RENDER_PX, Correspondences, View, known_at, photo_at, sized
+from service.pose.matching.render_and_match import match_record, render_and_match
+from service.pose.retrieval.scene_focus import Focus, focus_of_scene
+from service.pose.retrieval.viewpoints import index_cameras
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.results import Candidates, IterationRecord
@@ -164,7 +165,7 @@ def _sampled(start: Pose, query: Query, tools: Tools, options: Options) -> Gener
                 break
         scored.sort(key=lambda h: -h.support)
         best = scored[: 8 * PARENTS]
-        yield IterationRecord("sample", best[0].pose, candidates=_candidates(best))
+        yield IterationRecord("sample_poses", best[0].pose, candidates=_candidates(best))
         parents = [h.solved.pose for h in best[:PARENTS] if h.solved]
         if best[0].support > ENOUGH or not parents:
             break

@@ -23,11 +23,11 @@ from jaxtyping import Float64
 
 from service.estimators.inerf import required_prior
 from service.interfaces import Tools
-from service.pose.adam import Adam
-from service.pose.descent import So3T3, photometric, require_within
-from service.pose.focus import Focus, focus_of_scene
-from service.pose.losses import loss_against, require_loss
-from service.pose.views import known_at, photo_at, sized
+from service.pose.descent.adam import Adam
+from service.pose.descent.gradient_descent import So3T3, photometric, require_within
+from service.pose.descent.losses import loss_against, require_loss
+from service.pose.features.views import known_at, photo_at, sized
+from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import Candidates, IterationRecord
 from service.types import Pose, Query
 

@@ -8,7 +8,8 @@
 At first the photo is looked at in a small size. Only if the gate doesn't accept the answer the dearer searches are
 tried: in its full size, turned as its corners tell; larger still, with further views; then poses sampled near views.
 From a prior pose alignment is tried at once; where that fails it is one more candidate view. What a search does is in
-`service/pose/stages.py`. Sizes and rounds are the research's; numbers that were measured stand beside the constants.
+`service/pose/matching/search_stages.py`. Sizes and rounds are the research's; numbers that were measured stand beside
+the constants.
 """
 
 from __future__ import annotations
@@ -24,25 +25,9 @@ import numpy as np
 
 from service.errors import InvalidOptions
 from service.interfaces import Tools
-from service.pose.appearance import appearance
-from service.pose.gate import UNCERTAIN, glance, verify
-from service.pose.hypotheses import poses_near_views
-from service.pose.index import ViewIndex, prepared_index
-from service.pose.matching import render_and_match
-from service.pose.mirror import BEYOND_DOUBT, OUT_OF_REACH, mirrored, unlikeness
-from service.pose.pnp import Resection
-from service.pose.retrieval import top
-from service.pose.rivals import apart, ranked, rivals, whole
-from service.pose.sight import (
-    GLANCE_PX,
-    GLIMPSE_SHARE,
-    SECOND_LOOK,
-    Sight,
-    first_sight,
-    turned_sight,
-)
-from service.pose.stages import GOOD_MATCH, aligned, match_record, matched, refined, rematched, resected
-from service.pose.views import (
+from service.pose.absolute_pose.pnp import Resection
+from service.pose.descent.hypotheses import poses_near_views
+from service.pose.features.views import (
     MATCH_ERROR_PX,
     PHOTO_PX,
     known_at,
@@ -51,6 +36,22 @@ from service.pose.views import (
     rendered_view,
     sized,
 )
+from service.pose.matching.render_and_match import render_and_match
+from service.pose.matching.search_stages import GOOD_MATCH, aligned, match_record, matched, refined, rematched, resected
+from service.pose.retrieval.image_variant import (
+    GLANCE_PX,
+    GLIMPSE_SHARE,
+    SECOND_LOOK,
+    Sight,
+    first_sight,
+    turned_sight,
+)
+from service.pose.retrieval.index import ViewIndex, prepared_index
+from service.pose.retrieval.scores import top
+from service.pose.verification.ambiguity import apart, ranked, rivals, whole
+from service.pose.verification.appearance import appearance
+from service.pose.verification.gate import UNCERTAIN, glance, verify
+from service.pose.verification.mirror_images import BEYOND_DOUBT, OUT_OF_REACH, mirrored, unlikeness
 from service.results import Candidates, IterationRecord, Reason, Status
 from service.types import Camera, Query
 
@@ -150,7 +151,7 @@ class _Hunt:
         for last in search:
             self.recognised |= last.stage == "rematch"
             yield self._with_answer(last)
-        if last is None or last.stage != "align":
+        if last is None or last.stage != "refine":
             return  # the search gave up
         known = self.query.corrected(last.lens)
         agreeing = last.num_inliers or 0
@@ -181,8 +182,8 @@ class _Hunt:
         tools = replace(self.tools, memo={})
         worst, last = OUT_OF_REACH * (self.answer.loss or np.inf), None
         for last in _reflected(replace(self.sight, eighths=-self.sight.eighths % 8), query, tools, worst):
-            yield self._with_answer(replace(last, stage="mirror", matches=None))
-        if last is None or last.stage != "align":
+            yield self._with_answer(replace(last, stage="check_mirror", matches=None))
+        if last is None or last.stage != "refine":
             return
         known = query.corrected(last.lens)
         if not self.accepted and verify(known, last.pose, tools).status is not Status.LOCALIZED:
@@ -191,7 +192,7 @@ class _Hunt:
         size = camera.intrinsics
         there = appearance(photo_at(query, tools, size), frame, known_at(query, tools, size))
         self.mirrored = unlikeness(there) < unlikeness(own)
-        yield replace(self.answer, stage="mirror", mirrored=self.mirrored)
+        yield replace(self.answer, stage="check_mirror", mirrored=self.mirrored)
 
     def contest(self) -> Iterator[IterationRecord]:
         """Look for other answers that the gate accepts; the best becomes the answer, and the last record has all.
@@ -219,14 +220,14 @@ class _Hunt:
                 continue
             for last in refined(rival, self.query, self.tools):
                 yield self._with_answer(last)
-            if last is None or last.stage != "align" or not all(apart(last.pose, a.pose, distance) for a in answers):
+            if last is None or last.stage != "refine" or not all(apart(last.pose, a.pose, distance) for a in answers):
                 continue
             verdict = verify(self.query.corrected(last.lens), last.pose, self.tools)
             if verdict.status is Status.LOCALIZED:
                 answers.append(last)
         if len(answers) > 1:
             self.answer, others = ranked(answers)
-            yield replace(self.answer, stage="contest", rivals=others)
+            yield replace(self.answer, stage="check_ambiguity", rivals=others)
 
     def _with_answer(self, record: IterationRecord) -> IterationRecord:
         return replace(record, pose=self.answer.pose, lens=self.answer.lens) if self.answer else record
@@ -244,15 +245,15 @@ def _searches(
         hunt.glimpsing = True
         yield _search(stage, glimpse, deque(likeliest), query, tools), glimpse
         hunt.glimpsing = False
-        stage = "look"
+        stage = "retrieve_full_size"
     sight = turned_sight(sight, query, tools)
     likeliest = top(sight.votes(query, tools), options.candidates)
-    yield _search("turn" if sight.eighths else stage, sight, deque(likeliest), query, tools), sight
+    yield _search("retrieve_rotated" if sight.eighths else stage, sight, deque(likeliest), query, tools), sight
     sight = sight.sized(SECOND_LOOK)
     votes = sight.votes(query, tools)
     untried = deque(top(votes, len(votes))[options.candidates :][: max(options.candidates, len(votes) // FURTHER)])
     while untried:
-        yield _search("further", sight, untried, query, tools), sight
+        yield _search("retrieve_more_views", sight, untried, query, tools), sight
     if options.effort == "fast" or (options.effort == "normal" and not hunt.recognised):
         return
     for _ in range(SAMPLE_ROUNDS if options.effort == "normal" else MOST_ROUNDS):
@@ -321,6 +322,6 @@ def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationReco
         found = resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found
-        yield match_record("sample", best or pose, matches, found, view.camera)
+        yield match_record("sample_poses", best or pose, matches, found, view.camera)
     if best and best.num_inliers >= PROMISING:
         yield from refined(best, query, tools)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from service.errors import CorruptScene, InvalidImage, InvalidIntrinsics, InvalidPrior
-from service.images import photo_size
+from service.photos.images import photo_size
 from service.scene_formats.manifest import Manifest, colour, numbers, read_json
 from service.types import Camera, Intrinsics, NamedCamera, Pose
 

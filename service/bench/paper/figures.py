@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from service.images import with_palette
+from service.photos.images import with_palette
 
 DPI, PICTURES_DPI = 110, 80
 MARGIN = 0.05

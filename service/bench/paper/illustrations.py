@@ -15,8 +15,8 @@ from service.bench.paper.plan import MAIN
 from service.bench.paper.tables import Line
 from service.estimators import ESTIMATORS
 from service.geometry import pose_distance, so3_exp
-from service.images import read_query, resized
 from service.localize import Request, localize
+from service.photos.images import read_query, resized
 from service.results import IterationRecord, PoseEstimate
 from service.types import Camera, Pose, Query
 

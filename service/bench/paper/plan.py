@@ -15,7 +15,7 @@ from typing import Any
 from service.bench.starts import require_kind
 from service.errors import UnknownName
 from service.estimators import ESTIMATORS
-from service.pose.losses import LOSSES
+from service.pose.descent.losses import LOSSES
 
 SLOW = ("inerf", "inerf_dagger", "pnerf", "icomma")
 """Methods that get few trials."""

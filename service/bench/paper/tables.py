@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from service.bench.paper.plan import ABLATION, MAIN, RANGES_DEG, RESOLUTIONS_PX, STEPS_OF_TABLE_1
-from service.pose.losses import LOSSES
+from service.pose.descent.losses import LOSSES
 
 Line = Mapping[str, Any]
 PUBLISHED_AS = {
@@ -26,7 +26,7 @@ PUBLISHED_AS = {
     "mc_do": "paper",
 }
 """Our methods' names in the published tables."""
-STAGES = {"MC": ("start", "hypothesis", "sample"), "DO": ("decouple",), "refinement": ("refine",)}
+STAGES = {"MC": ("start", "hypothesis", "sample_poses"), "DO": ("decouple",), "refinement": ("refine",)}
 STARTS = {
     "near": "near the truth: world frame, per axis 0..2 deg and 0..0.05 units",
     "easy": "world frame, per axis 0..30 deg and 0..0.5 units",

@@ -1,0 +1,117 @@
+"""What `splatfix scenes inspect` tells: what a scene has, what of it is unknown, and from where it is looked at."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from service.localize import ASSUMED_TRAINING_PX, choose_rasterizer
+from service.pose.retrieval.view_placement import coverage, find_views, floaters
+from service.pose.retrieval.viewpoints import index_cameras
+from service.render import RASTERIZERS
+from service.scene_formats import load_scene
+from service.scene_formats.manifest import read_manifest
+from service.types import GaussianScene
+
+
+def inspected(path: Path) -> dict[str, Any]:
+    """Return the facts as JSON has them; lengths in scene units. Renders some hundred small views: seconds.
+
+    Raises SceneError.
+    """
+    scene = load_scene(path)
+    rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(scene)
+    info = scene.info
+    low, high = np.quantile(scene.means, [0.01, 0.99], axis=0)
+    facts: dict[str, Any] = {
+        "id": info.id,
+        "name": info.name,
+        "format": info.format,
+        "sha256": info.sha256,
+        "gaussians": scene.count,
+        "sh_degree": scene.sh_degree,
+        "render_mode": info.render_mode,
+        "memory_bytes": {"scene": scene.nbytes, "renderer": rasterizer.nbytes},
+        "bounds": [scene.means.min(0).tolist(), scene.means.max(0).tolist()],
+        "middle_98_percent": [low.tolist(), high.tolist()],
+        "extent": float(np.linalg.norm(high - low)),
+        "floaters": floaters(scene),
+        "up": list(info.up_in_world) if info.up_in_world else None,
+        "metres_per_unit": info.metres_per_unit,
+        "background": list(info.background_rgb),
+        "on_earth": info.geo_anchor is not None,
+        "training_cameras": len(scene.cameras),
+        "training_size": _training_size(path, scene),
+        "index": _index(scene, rasterizer),
+    }
+    warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
+    if not info.up_in_world:
+        warnings.append("up is unknown: z is assumed where views are placed or shown")
+    return facts | {"warnings": warnings}
+
+
+def _training_size(path: Path, scene: GaussianScene) -> dict[str, Any]:
+    """Return the long side of the training photos in pixels, and who says so."""
+    said = read_manifest(path).training_size if path.is_dir() else None
+    if said:
+        return {"px": max(said), "source": "manifest"}
+    if scene.info.training_long_side_px:
+        return {"px": scene.info.training_long_side_px, "source": "training cameras"}
+    low, high = ASSUMED_TRAINING_PX
+    return {"px": None, "source": f"unknown: each photo's own, within {low} to {high}"}
+
+
+def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
+    """Return from where the view index would be rendered."""
+    rng = np.random.default_rng(0)  # as `LoadedScene.prepare` has it
+    if scene.cameras:
+        cameras = index_cameras(scene, rasterizer, rng)
+        return {
+            "placed_by": "training cameras",
+            "views": len(cameras),
+            "coverage": coverage(scene, rasterizer, cameras),
+        }
+    found = find_views(scene, rasterizer, rng)
+    return {
+        "placed_by": "the scene itself",
+        "views": len(found.cameras),
+        "coverage": found.coverage,
+        "candidates": found.candidates,
+        "good_candidates": found.good,
+        "typical_distance": found.typical_distance,
+        "interior": found.interior,
+    }
+
+
+def told(facts: dict[str, Any]) -> dict[str, str]:
+    """Return the facts for people: one line each."""
+    index, size, memory = facts["index"], facts["training_size"], facts["memory_bytes"]
+    placed = f"{index['views']} views, placed by {index['placed_by']}"
+    if "candidates" in index:
+        kind = "an interior" if index["interior"] else "seen from outside or open"
+        placed += f" ({kind}; {index['good_candidates']} good ones of {index['candidates']} tried; "
+        placed += f"typical distance {index['typical_distance']:.3g})"
+    lines = {
+        "name": f"{facts['name']} (id {facts['id']})",
+        "format": facts["format"] + ("" if facts["render_mode"] == "default" else f", {facts['render_mode']}"),
+        "gaussians": f"{facts['gaussians']:,}, SH degree {facts['sh_degree']}",
+        "memory": f"{memory['scene'] / 1e6:.0f} MB, and {memory['renderer'] / 1e6:.0f} MB for the renderer",
+        "bounds": " to ".join(_point(p) for p in facts["bounds"]),
+        "middle 98 %": " to ".join(_point(p) for p in facts["middle_98_percent"]) + f"; diagonal {facts['extent']:.3g}",
+        "floaters": f"{facts['floaters']:.1%} of the opaque Gaussians",
+        "up": _point(facts["up"]) if facts["up"] else "unknown",
+        "metres per unit": str(facts["metres_per_unit"] or "unknown"),
+        "on Earth": "yes" if facts["on_earth"] else "no",
+        "training cameras": str(facts["training_cameras"]),
+        "training size": f"{size['px']} px (from the {size['source']})" if size["px"] else size["source"],
+        "index": placed,
+        "coverage": f"{index['coverage']:.1%} of the opaque Gaussians are seen by these views",
+        "sha256": facts["sha256"],
+    }
+    return lines | {f"warning {i}": text for i, text in enumerate(facts["warnings"], 1)}
+
+
+def _point(values: list[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

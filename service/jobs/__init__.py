@@ -1,0 +1,1 @@
+"""Jobs: accepted, stored, queued, run. Knows neither HTTP nor pydantic."""

@@ -1,0 +1,100 @@
+"""The answer to several photos, or a video, as the API gives it; `sequence` reads them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from service.localize import Clock
+from service.results import PoseEstimate, StageTiming, Status
+from service.tracking import SequencePose
+from service.types import GeoAnchor
+from service.web.schemas.conversion import covariance_out, record_out, result_out, timing_out, transform_out
+from service.web.schemas.resources import versions
+from service.web.schemas.responses import FrameOut, Record, Result
+
+
+class Trajectory:
+    """What a sequence's photos told, as the API gives it."""
+
+    def __init__(self) -> None:
+        self._clock = Clock()
+        self._frames: list[FrameOut] = []
+        self._spent: dict[str, StageTiming] = {}
+        self._warnings: dict[str, None] = {}
+        self.renders = 0
+        self._exhausted = False
+        self.shown: PoseEstimate | None = None
+        """The last that was localized; before there is one, the last."""
+
+    def add(self, found: SequencePose) -> Record:
+        """Take a photo's answer; return its record, whose pose is the last that was localized."""
+        estimate = found.estimate
+        last = estimate.records[-1]
+        if not _localized(self.shown) or _localized(estimate):
+            self.shown = estimate
+        assert self.shown
+        shown = self.shown.records[-1]
+        frame = _frame_out(len(self._frames), found)
+        self._frames.append(frame)
+        for timing in estimate.timings:
+            before = self._spent.get(timing.stage, StageTiming(timing.stage, 0.0, 0.0))
+            wall_s, cpu_s = before.wall_s + timing.wall_s, before.cpu_s + timing.cpu_s
+            self._spent[timing.stage] = StageTiming(timing.stage, wall_s, cpu_s)
+        self._warnings |= dict.fromkeys(estimate.warnings)
+        self.renders += estimate.renders
+        self._exhausted |= found.exhausted
+        record = replace(
+            last,
+            stage="track" if frame.followed else "localize",
+            pose=shown.pose,
+            lens=shown.lens,
+            index=frame.index,
+            elapsed_s=self._clock.wall_s,
+            cpu_s=self._clock.cpu_s,
+        )
+        return record_out(record).model_copy(update={"frame": frame})
+
+    def result(self, anchor: GeoAnchor | None) -> Result:
+        """Answer for the whole: the shown photo's result with all frames, and the time that all took.
+
+        Needs one photo. Time that no stage took is the reading of the photos.
+        """
+        assert self.shown
+        spent = self._spent.values()
+        wall_s = self._clock.wall_s - sum(timing.wall_s for timing in spent)
+        cpu_s = self._clock.cpu_s - sum(timing.cpu_s for timing in spent)
+        decode = timing_out(StageTiming("decode", wall_s, cpu_s))
+        missed = sum(frame.status is not Status.LOCALIZED for frame in self._frames)
+        warnings = [
+            *self._warnings,
+            *([f"{missed} of {len(self._frames)} photos were not localized."] if missed else []),
+        ]
+        if self._exhausted:
+            warnings.append(f"The budget ended after {len(self._frames)} photos.")
+        shown = replace(
+            self.shown,
+            timings=tuple(spent),
+            warnings=tuple(warnings),
+            budget_exhausted=self._exhausted,
+            renders=self.renders,
+        )
+        return result_out(shown, decode, versions(), anchor).model_copy(update={"frames": self._frames})
+
+
+def _localized(estimate: PoseEstimate | None) -> bool:
+    return estimate is not None and estimate.verdict.status is Status.LOCALIZED
+
+
+def _frame_out(index: int, found: SequencePose) -> FrameOut:
+    estimate, verdict = found.estimate, found.estimate.verdict
+    return FrameOut(
+        index=index,
+        name=found.photo.name,
+        time_s=found.photo.time_s,
+        status=verdict.status,
+        reason=verdict.reason,
+        score=verdict.score,
+        followed=estimate.records[-1].stage == "track",
+        world_from_camera=transform_out(estimate.pose.world_from_camera),
+        covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
+    )

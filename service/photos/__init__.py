@@ -1,0 +1,1 @@
+"""Photos, videos and sequences: encoded bytes to `Query`."""

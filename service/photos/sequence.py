@@ -1,0 +1,144 @@
+"""Several photos, or a video, in one job: how they are kept together and read one by one; `trajectory` answers."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import UInt8
+
+from service.errors import InvalidImage, InvalidRequest
+from service.photos.images import photo_size, query_of, read_query
+from service.photos.video import frame_count, is_video, read_video
+from service.types import Intrinsics, Pose, PriorRegion, Query
+
+PHOTO_LONG_SIDE = 832
+"""Photos of a sequence needn't be decoded larger."""
+_ZIP = b"PK\x03\x04"
+
+
+@dataclass(frozen=True, slots=True)
+class SequencePhoto:
+    """One of several photos of a camera, in the order in which they were taken."""
+
+    name: str
+    time_s: float
+    """Since any moment; ascending."""
+    query: Query
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """How a sequence is to be read."""
+
+    limit: int
+    """More photos or frames are refused."""
+    every: int = 1
+    times_s: Sequence[float] | None = None
+    """Of all photos, those that are left out as well; None: they come once a second, a video's at its own pace."""
+    intrinsics: Intrinsics | None = None
+    prior: Pose | None = None
+    """Of the first; so is the region."""
+    region: PriorRegion | None = None
+    background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def is_packed(data: bytes) -> bool:
+    """Return whether it is what `packed` makes, or another ZIP."""
+    return data.startswith(_ZIP)
+
+
+def is_sequence(data: bytes) -> bool:
+    """Return whether it is what `packed` makes, or a video."""
+    return is_packed(data) or is_video(data)
+
+
+def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
+    """Return (name, photo) in one piece: the same for the same photos."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for index, (name, data) in enumerate(files):
+            archive.writestr(zipfile.ZipInfo(f"{index}/{name}"), data)
+    return file.getvalue()
+
+
+def check_sequence(data: bytes, reading: Reading) -> None:
+    """Refuse what the heads of the files show to be wrong. Raises InvalidImage, InvalidRequest."""
+    if is_video(data):
+        if reading.times_s is not None:
+            raise InvalidRequest("a video tells its times itself.", where="times_s")
+        _check_count(-(-frame_count(data) // reading.every), reading)
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        entries = archive.infolist()
+        _check_count(-(-len(entries) // reading.every), reading)
+        if reading.times_s is not None and len(reading.times_s) != len(entries):
+            raise InvalidRequest(f"{len(reading.times_s)} times for {len(entries)} photos.", where="times_s")
+        sizes: list[tuple[int, int]] = []
+        for index in range(0, len(entries), reading.every):
+            with _at_photo(index):
+                sizes.append(photo_size(archive.read(entries[index])))
+                _check_size(sizes[-1], sizes[0])
+
+
+def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, None, None]:
+    """Decode one photo after the other. Raises InvalidImage, InvalidIntrinsics."""
+    given = {"intrinsics": reading.intrinsics, "long_side": PHOTO_LONG_SIDE}
+    first: tuple[int, int] | None = None
+    for count, (index, name, time_s, source) in enumerate(_sources(data, reading), 1):
+        _check_count(count, reading)
+        with _at_photo(index):
+            prior = reading.prior if first is None else None
+            if isinstance(source, bytes):
+                query = read_query(source, prior=prior, background_rgb=reading.background_rgb, **given)
+            else:
+                query = query_of(source, prior=prior, **given)
+            if first is None:
+                query = replace(query, region=reading.region)
+            size = query.photo_intrinsics.width, query.photo_intrinsics.height
+            first = first or size
+            _check_size(size, first)
+        yield SequencePhoto(name, time_s, query)
+
+
+def _sources(data: bytes, reading: Reading) -> Iterator[tuple[int, str, float, bytes | UInt8[np.ndarray, "h w 3"]]]:
+    """Yield number, name, time, and the file or the decoded frame."""
+    if is_video(data):
+        for frame in read_video(data, reading.every):
+            yield frame.number, f"frame {frame.number}", frame.time_s, frame.rgb
+        return
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        for index, entry in list(enumerate(archive.infolist()))[:: reading.every]:
+            time_s = float(index) if reading.times_s is None else reading.times_s[index]
+            yield index, entry.filename.partition("/")[2], time_s, archive.read(entry)
+
+
+def _check_count(count: int, reading: Reading) -> None:
+    if count > reading.limit:
+        raise InvalidImage(
+            f"a sequence may have {reading.limit} photos or frames; these are more.",
+            where="photo",
+            hint="Send every=N to use each Nth, or several jobs.",
+        )
+
+
+def _check_size(size: tuple[int, int], first: tuple[int, int]) -> None:
+    if size != first:
+        raise InvalidImage(
+            f"has {size[0]} x {size[1]} pixels, the first one {first[0]} x {first[1]}.",
+            hint="A sequence is one camera's: send photos of another size as a job of their own.",
+        )
+
+
+@contextmanager
+def _at_photo(index: int) -> Iterator[None]:
+    """Say which photo an error is about."""
+    try:
+        yield
+    except InvalidImage as error:
+        error.where = f"photo.{index}"
+        raise

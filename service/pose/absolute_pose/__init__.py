@@ -1,0 +1,1 @@
+"""Camera poses from 2D-3D correspondences."""

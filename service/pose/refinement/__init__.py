@@ -1,0 +1,1 @@
+"""Photometric refinement of a pose on a rendered RGB-D frame, and its covariance."""

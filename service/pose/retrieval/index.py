@@ -1,0 +1,136 @@
+"""The view index: renders of the scene from well spread places, made once, that a photo is recognised in."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+import zipfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from service.interfaces import Features, Tools
+from service.pose.features.in_plane_rotation import MOST_CORNERS, VIEW_CORNERS, Corners, corners
+from service.pose.features.views import VIEW_FEATURES, View, lifted, to_uint8
+from service.pose.retrieval.lod_proxy import Rough
+from service.pose.retrieval.scores import vote
+from service.pose.retrieval.viewpoints import INDEX_PX, index_cameras
+from service.pose.verification.ambiguity import repeats_itself
+from service.pose.verification.mirror_images import like_its_mirror_image
+from service.types import Camera, Intrinsics, Pose
+
+VERSION = 8
+"""Raise it with any change that makes stored indexes differ from fresh ones."""
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class ViewIndex:
+    views: tuple[View, ...]
+    corners: Corners
+    """Of views from everywhere; see pose/features/in_plane_rotation.py."""
+    like_its_mirror_image: bool = False
+    """Whether a mirrored photo of the scene may pass for one of the scene; see pose/verification/mirror_images.py."""
+    repeats_itself: bool = True
+    """Whether a photo that fits one place may fit another one; see pose/verification/ambiguity.py."""
+
+    def votes(self, descriptors: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "views"]:
+        """Return how much each view is like a photo with these features."""
+        return vote(descriptors, [view.features.descriptors for view in self.views])
+
+
+def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
+    """Read the scene's index from the cache, or build it and store it there."""
+    path = cache_dir / f"view-index-{_key(tools)}.npz" if cache_dir else None
+    if path and path.exists():
+        try:
+            return _read(path)
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
+    index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
+    if path:
+        _write(index, path)
+    return index
+
+
+def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
+    """Render the views and find their features, one camera a core.
+
+    The threads end with the building, and with them their working memory, which grows with the scene.
+    """
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
+        every = -(-len(cameras) * VIEW_CORNERS // MOST_CORNERS)
+        rough = Rough(tools.scene, tools.rasterizer, tools.rng)
+
+        def seen(number: int) -> tuple[View, Corners | None]:
+            frame = rough.render(cameras[number])
+            rgb = to_uint8(frame.rgb)
+            view = lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
+            return view, corners(rgb) if number % every == 0 else None
+
+        found = list(pool.map(seen, range(len(cameras))))
+        views = tuple(view for view, _ in found)
+        mirrored, repeated = like_its_mirror_image(views, tools, pool), repeats_itself(views, tools.matcher, pool)
+    log.info("view index of %s: %d views", tools.scene.info.name, len(views))
+    return ViewIndex(views, Corners.pooled([own for _, own in found if own]), mirrored, repeated)
+
+
+def _key(tools: Tools) -> str:
+    """Everything that the index depends on; the scene's digest covers its training cameras."""
+    parts = (
+        VERSION,
+        tools.scene.info.sha256,
+        tools.matcher.name,
+        INDEX_PX,
+        VIEW_FEATURES,
+        len(tools.scene.cameras),
+    )
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
+
+
+def _write(index: ViewIndex, path: Path) -> None:
+    """Write to the side and rename, so that no reader sees half a file."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    cameras = [view.camera for view in index.views]
+    arrays = {
+        "like_its_mirror_image": np.array(index.like_its_mirror_image),
+        "repeats_itself": np.array(index.repeats_itself),
+        "corner_directions_deg": index.corners.directions_deg,
+        "corner_descriptors": index.corners.descriptors,
+        "counts": np.array([len(view.points_in_world) for view in index.views]),
+        "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
+        "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
+        "world_from_camera": np.stack([c.pose.world_from_camera for c in cameras]),
+        "points_px": np.concatenate([view.features.points_px for view in index.views]),
+        "scores": np.concatenate([view.features.scores for view in index.views]),
+        "descriptors": np.concatenate([view.features.descriptors for view in index.views]),
+        "points_in_world": np.concatenate([view.points_in_world for view in index.views]),
+    }
+    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def _read(path: Path) -> ViewIndex:
+    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
+        stored = {name: file[name] for name in file.files}
+    stops = np.cumsum(stored["counts"])
+    views = []
+    for i, (start, stop) in enumerate(zip(stops - stored["counts"], stops, strict=True)):
+        (width, height), (fx, fy, cx, cy) = stored["sizes"][i].tolist(), stored["pinholes"][i].tolist()
+        features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
+        camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
+        views.append(View(camera, features, stored["points_in_world"][start:stop]))
+    pooled = Corners(stored["corner_directions_deg"], stored["corner_descriptors"])
+    return ViewIndex(tuple(views), pooled, bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"]))

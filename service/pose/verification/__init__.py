@@ -1,0 +1,1 @@
+"""Whether a pose is right: calibrated gate, appearance, ambiguity, mirror images."""

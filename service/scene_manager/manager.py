@@ -1,0 +1,325 @@
+"""The scenes of a running service: loaded in the background, shared by all jobs, and dropped when memory is short.
+
+    unloaded -> loading -> preparing -> ready -> (unloading ->) unloaded
+                   `-----------`-> failed
+
+A scene that was dropped for want of memory, or isn't in the preload list, is loaded when it is asked for; one that
+somebody unloaded stays away until somebody loads it.
+"""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from service.errors import BadInput, NoRoom, SceneNotFound, SceneNotReady, SceneUnloaded, SplatfixError
+from service.localize import DEFAULT_MATCHER, LoadedScene
+from service.scene_formats.discovery import find_scenes
+from service.scene_manager.warm_up import warm_up
+from service.web.schemas.responses import Readiness, SceneState
+
+_log = logging.getLogger(__name__)
+
+_GRACE_S = 5.0
+AUTO = "auto"
+"""Asks for all scenes that are ready; so no scene is called that."""
+
+
+def several(asked: str | Sequence[str] | None) -> bool:
+    """Whether a request asks for more than a certain scene."""
+    return asked == AUTO or (asked is not None and not isinstance(asked, str))
+
+
+@dataclass(slots=True)
+class Entry:
+    """One scene and how far it has come."""
+
+    id: str
+    path: Path | None
+    """None: it was given to the service in memory, and can't be loaded again."""
+    state: SceneState = "unloaded"
+    loaded: LoadedScene | None = None
+    error: Exception | None = None
+    wanted: bool = True
+    """Load it when it is asked for."""
+    awaited: bool = False
+    """The service isn't ready without it."""
+    uploaded: bool = False
+    jobs: int = 0
+    """That use it, waiting or running: while there are any it stays."""
+    used: float = 0.0
+    """When it was last asked for, on the monotonic clock."""
+    waiting: list[Callable[[], object]] = field(default_factory=list)
+    """To call when it is loaded, or failed to."""
+
+
+class Scenes:
+    """All scenes of the service. Safe to use from several threads."""
+
+    def __init__(
+        self,
+        paths: Iterable[Path],
+        estimator: str,
+        cache_dir: Path | None,
+        *,
+        matcher: str = DEFAULT_MATCHER,
+        preload: list[str] | None = None,
+        memory_bytes: int | None = None,
+        rasterizer: str | None = None,
+    ) -> None:
+        """Find the scenes, without reading them. Raises SceneNotFound, BadInput.
+
+        `estimator` is the one that they are made ready for. `preload` names those to load at start, None all.
+        """
+        self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
+        self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
+        self._entries: dict[str, Entry] = {}
+        self._lock = threading.RLock()
+        self._stop = threading.Event()
+        self._tasks: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
+        for path in (scene for given in paths for scene in find_scenes(given)):
+            self.add(path.resolve().stem if path.is_file() else path.resolve().name, path)
+        for name in preload if preload is not None else self._entries:
+            if name not in self._entries:
+                raise SceneNotFound(f"there is no scene '{name}' to preload.", where="preload")
+            self._entries[name].awaited = True
+
+    @classmethod
+    def of(cls, loaded: Mapping[str, LoadedScene], estimator: str) -> Scenes:
+        """Take scenes that are in memory already."""
+        scenes = cls((), estimator, None)
+        scenes._entries = {k: Entry(k, None, loaded=v, awaited=True) for k, v in loaded.items()}
+        return scenes
+
+    def start(self) -> None:
+        self._thread.start()
+        for entry in self.entries():
+            if entry.awaited:
+                self._request(entry)
+
+    def close(self) -> None:
+        """Stop loading, between two scenes; return then, or soon anyway."""
+        self._stop.set()
+        self._tasks.put(None)
+        if self._thread.is_alive():
+            self._thread.join(_GRACE_S)
+
+    # ------------------------------------------------------------------ the list
+
+    def entries(self) -> list[Entry]:
+        with self._lock:
+            return list(self._entries.values())
+
+    def entry(self, scene_id: str | None) -> Entry:
+        """Return a scene; None: the only one. Raises SceneNotFound, which names the scenes that are there."""
+        with self._lock:
+            known = ", ".join(self._entries) or "none"
+            if scene_id is None and len(self._entries) == 1:
+                return next(iter(self._entries.values()))
+            if scene_id is None:
+                raise SceneNotFound(f"say which scene; known: {known}.", where="scene")
+            if scene_id not in self._entries:
+                raise SceneNotFound(f"there is no scene '{scene_id}'; known: {known}.", where="scene")
+            return self._entries[scene_id]
+
+    def add(self, scene_id: str, path: Path, *, uploaded: bool = False) -> Entry:
+        """Add a scene without loading it. Raises BadInput if there is one of that name."""
+        with self._lock:
+            if scene_id == AUTO:
+                raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
+            if scene_id in self._entries:
+                raise BadInput(f"two scenes are called '{scene_id}'.", where=str(path))
+            entry = self._entries[scene_id] = Entry(scene_id, path, uploaded=uploaded)
+            return entry
+
+    def add_uploaded(self, paths: Iterable[Path]) -> None:
+        """Add the scenes that were uploaded before; one that the operator names wins."""
+        for path in paths:
+            if path.name in self._entries:
+                _log.warning("the uploaded scene %s is hidden by another of that name", path.name)
+            else:
+                self.add(path.name, path, uploaded=True)
+
+    def remove(self, entry: Entry) -> None:
+        """Take a scene out of the list; jobs that use it keep it until they end."""
+        with self._lock:
+            self._entries.pop(entry.id, None)
+            entry.wanted = False
+
+    # ------------------------------------------------------------------ use
+
+    def get(self, scene_id: str | None) -> LoadedScene:
+        """Return a scene in memory. Raises SceneError: also why it failed to load."""
+        entry = self.entry(scene_id)
+        with self._lock:
+            entry.used = time.monotonic()
+            if entry.error:
+                raise entry.error
+            if entry.loaded is not None and entry.state != "unloading":
+                return entry.loaded
+            if not entry.wanted:
+                raise SceneUnloaded(
+                    f"scene '{entry.id}' was unloaded.", where="scene", hint=f"Load it: POST /scenes/{entry.id}/load."
+                )
+            if entry.state == "unloaded":
+                self._request(entry)
+        raise SceneNotReady(f"scene '{entry.id}' is {entry.state}.", where="scene", hint="Try again later.")
+
+    def chosen(self, asked: str | Sequence[str] | None) -> list[str]:
+        """Return the ids of the scenes that a request names: one, several, or all that are ready (`auto`).
+
+        Raises SceneNotFound, SceneNotReady.
+        """
+        if asked == AUTO:
+            ready = [entry.id for entry in self.entries() if entry.state == "ready"]
+            if not ready:
+                raise SceneNotReady("no scene is ready.", where="scene", hint="Try again later.")
+            return ready
+        if asked is None or isinstance(asked, str):
+            return [self.entry(asked).id]
+        return list(dict.fromkeys(self.entry(scene_id).id for scene_id in asked))
+
+    def acquire(self, ids: Sequence[str]) -> tuple[LoadedScene, ...]:
+        """Return scenes that stay in memory until they are released as often. Raises SceneError."""
+        with self._lock:
+            loaded = tuple(self.get(scene_id) for scene_id in ids)
+            for scene_id in ids:
+                self.entry(scene_id).jobs += 1
+            return loaded
+
+    def id_of(self, loaded: LoadedScene) -> str | None:
+        """Return the name under which a scene is served; None if it was removed meanwhile."""
+        return next((entry.id for entry in self.entries() if entry.loaded is loaded), None)
+
+    def release(self, held: Collection[LoadedScene]) -> None:
+        with self._lock:
+            for entry in self._entries.values():
+                if any(entry.loaded is loaded for loaded in held):
+                    entry.jobs -= 1
+                    if entry.state == "unloading" and not entry.jobs:
+                        _drop(entry)
+
+    def load(self, entry: Entry) -> None:
+        """Load a scene, if it isn't there; also one that failed to load."""
+        with self._lock:
+            entry.wanted = True
+            if entry.state in ("unloaded", "failed"):
+                self._request(entry)
+            elif entry.state == "unloading":
+                entry.state = "ready"
+
+    def unload(self, entry: Entry) -> None:
+        """Drop a scene from memory as soon as no job uses it; none may start to. Raises BadInput."""
+        if entry.path is None:
+            raise BadInput("it has no file to be loaded from again.", where="scene")
+        with self._lock:
+            entry.wanted = False
+            if entry.state == "ready":
+                entry.state = "unloading"
+            if entry.state == "unloading" and not entry.jobs:
+                _drop(entry)
+
+    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+        """Call `do` as soon as the scene is in memory, or certain not to come there."""
+        with self._lock:
+            entry = self._entries.get(scene_id)
+            if entry is not None and entry.loaded is None and entry.error is None:
+                entry.waiting.append(do)
+                if entry.state == "unloaded":
+                    self._request(entry)
+                return
+        do()
+
+    def memory(self) -> dict[tuple[str, ...], float]:
+        """Return the bytes of each scene in memory, by (id,)."""
+        return {(e.id,): float(e.loaded.nbytes) for e in self.entries() if e.loaded}
+
+    def readiness(self) -> Readiness:
+        entries = self.entries()
+        awaited = [f"scene {e.id}: {e.state}" for e in entries if e.awaited and e.state in _UNDER_WAY]
+        failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
+        usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
+        loaded = [e.loaded for e in entries if e.loaded]
+        return Readiness(
+            ready=usable and not awaited,
+            awaited=awaited,
+            failed=failed,
+            rasterizers=sorted({scene.rasterizer.name for scene in loaded}),
+            passed_over=sorted({scene.passed_over for scene in loaded if scene.passed_over}),
+        )
+
+    # ------------------------------------------------------------------ on the loading thread
+
+    def _request(self, entry: Entry) -> None:
+        entry.error, entry.state = None, "loading" if entry.loaded is None else "preparing"
+        self._tasks.put(entry)
+
+    def _work(self) -> None:
+        while (entry := self._tasks.get()) is not None:
+            try:
+                self._load(entry)
+            except Exception as error:  # one bad scene must not take the others with it
+                if self._stop.is_set():
+                    return
+                unexpected = not isinstance(error, SplatfixError)
+                _log.error("scene %s can't be used: %s", entry.id, error, exc_info=unexpected)
+                if isinstance(error, SplatfixError) and entry.path:  # the operator's folders are nobody's business
+                    error.where = error.where.replace(str(entry.path), entry.id)
+                entry.error, entry.state = error, "failed"
+            self._settle(entry)
+
+    def _load(self, entry: Entry) -> None:
+        if entry.loaded is None and entry.path is not None:
+            tools = {"matcher": self._matcher, "rasterizer": self._rasterizer}
+            loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, **tools)
+            self._make_room(entry, loaded.nbytes)
+            entry.loaded, entry.state = loaded, "preparing"
+            self._settle(entry)
+        if entry.loaded is not None and not self._stop.is_set():
+            entry.loaded.prepare(self._estimator)
+            warm_up(entry.loaded, self._estimator)
+        with self._lock:
+            entry.state = "ready"
+            if not entry.wanted:  # unloaded in the meantime
+                self.unload(entry)
+
+    def _make_room(self, entry: Entry, needed: int) -> None:
+        """Drop the scenes that were not asked for longest. Raises NoRoom."""
+        if self._memory_bytes is None:
+            return
+        with self._lock:
+            there = [e for e in self._entries.values() if e.loaded and e is not entry]
+            total = sum(e.loaded.nbytes for e in there if e.loaded)
+            idle = [e for e in there if e.state == "ready" and not e.jobs and e.path]
+            for other in sorted(idle, key=lambda e: e.used):
+                if total + needed <= self._memory_bytes:
+                    return
+                total -= other.loaded.nbytes if other.loaded else 0
+                _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
+                _drop(other)
+            if total + needed > self._memory_bytes:
+                raise NoRoom(
+                    f"scene '{entry.id}' takes {needed / 1e6:.0f} MB, {total / 1e6:.0f} of "
+                    f"{self._memory_bytes / 1e6:.0f} MB are in use.",
+                    where="scene",
+                    hint="Unload another scene, or raise SPLATFIX_SCENE_MEMORY_BYTES.",
+                )
+
+    def _settle(self, entry: Entry) -> None:
+        with self._lock:
+            waiting, entry.waiting = entry.waiting, []
+        for do in waiting:
+            do()
+
+
+_UNDER_WAY = ("unloaded", "loading", "preparing")
+
+
+def _drop(entry: Entry) -> None:
+    entry.loaded, entry.state = None, "unloaded"

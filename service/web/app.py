@@ -1,0 +1,231 @@
+"""The HTTP service: `create_app` puts scenes, jobs, routes and the viewer's relay together.
+
+One process, one port, paths without a version. Behind a proxy that shows the service under a sub-path,
+links are right if the proxy sends `X-Forwarded-Prefix` or `SPLATFIX_ROOT_PATH` is set, whether or not the
+proxy strips the sub-path from what it hands on.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import anyio
+import yaml
+from anyio import to_thread
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
+from starlette.middleware.cors import CORSMiddleware
+
+from service import __version__
+from service.errors import InvalidRequest, StorageFailed
+from service.estimators import ESTIMATORS
+from service.jobs.service import Jobs
+from service.localize import LoadedScene
+from service.matchers import MATCHERS
+from service.render import RASTERIZERS
+from service.scene_manager.manager import Scenes
+from service.scene_manager.scene_store import Uploads
+from service.web.api_keys import KeyRing
+from service.web.metrics import Metrics
+from service.web.middleware.authentication import Door, Gate, allowed_hosts, is_loopback
+from service.web.middleware.limits import Admission
+from service.web.middleware.proxy import Edge
+from service.web.pages import add_pages
+from service.web.problems import install
+from service.web.routes import router
+from service.web.routes.dependencies import Parts
+from service.web.schemas.error_examples import example_components
+from service.web.schemas.openapi_links import add_links
+from service.web.schemas.requests import LocalizeIn
+from service.web.schemas.responses import Problem, Record
+from service.web.settings import Settings
+from service.web.viewer_process import ViewerChild
+from service.web.viewer_relay import Relay
+
+
+def create_app(
+    settings: Settings | None = None,
+    scenes: Mapping[str, LoadedScene] | None = None,
+    keys: KeyRing | None = None,
+) -> FastAPI:
+    """Make the app. Scenes are found here and loaded after start-up; `scenes` are in memory already.
+
+    Without `keys` those of the settings' file count. Raises SceneNotFound, BadInput or BackendMissing if the
+    settings name what is not there, InvalidRequest if they would let everybody in without saying so.
+    """
+    settings = settings or Settings()
+    for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
+        kind.load(name)  # an unknown name shall be told now, not in each job
+    if settings.rasterizer:
+        RASTERIZERS.load(settings.rasterizer)
+    if scenes is None:
+        known = Scenes(
+            settings.scenes,
+            settings.estimator,
+            settings.cache_dir,
+            matcher=settings.matcher,
+            preload=settings.preload,
+            memory_bytes=settings.scene_memory_bytes,
+            rasterizer=settings.rasterizer,
+        )
+    else:
+        known = Scenes.of(scenes, settings.estimator)
+    keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
+    viewer = ViewerChild(settings.loopback_url, keys.make_passing("viewer", "read")) if settings.viewer else None
+    relay = Relay(viewer) if viewer else None
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        async with AsyncExitStack() as stack:
+            folder = stack.enter_context(data_folder(settings.data_dir))
+            uploads = Uploads(folder / "scenes", settings.max_scene_bytes)
+            known.add_uploaded(uploads.scenes())
+            jobs = Jobs(settings, known, folder, metrics)
+            stack.push_async_callback(to_thread.run_sync, jobs.close)
+            await to_thread.run_sync(jobs.start)
+            known.start()
+            stack.push_async_callback(to_thread.run_sync, known.close)
+            limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
+            app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
+            _show(metrics, known, jobs, settings.workers)
+            if viewer and relay:
+                stack.push_async_callback(relay.close)
+                stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
+            yield
+
+    app = FastAPI(
+        title="splatfix",
+        version=__version__,
+        lifespan=lifespan,
+        generate_unique_id_function=lambda route: route.name,
+    )
+    install(app)
+    app.include_router(router)
+    add_pages(app)
+    if relay:
+        app.include_router(relay.router)
+    # The last one added is the first one that a request meets.
+    app.add_middleware(
+        Admission, settings=settings, room=lambda *who: to_thread.run_sync(app.state.parts.jobs.room, *who)
+    )
+    app.add_middleware(Gate, door=door(settings, keys))
+    if settings.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["*"],
+            allow_headers=["*"],
+            expose_headers=["Location", "Retry-After"],
+        )
+    app.add_middleware(Edge, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
+    app.openapi = lambda: openapi(app)
+    return app
+
+
+@contextmanager
+def data_folder(path: Path | None) -> Iterator[Path]:
+    """Hold a folder for this process alone; None: a temporary one. Raises StorageFailed."""
+    with ExitStack() as stack:
+        folder = path or Path(stack.enter_context(TemporaryDirectory(prefix="splatfix-")))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = stack.enter_context((folder / "lock").open("w"))
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            told = "another process uses it" if isinstance(error, BlockingIOError) else error.strerror
+            raise StorageFailed(
+                f"{folder} can't be used: {told}.", where="data_dir", hint="Name another one: SPLATFIX_DATA_DIR."
+            ) from error
+        yield folder
+
+
+def door(settings: Settings, keys: KeyRing) -> Door:
+    """Return who may come in. Raises InvalidRequest for an open service that nobody asked for."""
+    is_open = not keys
+    if is_open and not is_loopback(settings.host) and not settings.open:
+        raise InvalidRequest(
+            f"everybody who reaches {settings.host} could use the service.",
+            where="host",
+            hint="Make a key (splatfix keys add NAME), or say SPLATFIX_OPEN=true.",
+        )
+    hosts = allowed_hosts(settings.host, settings.allowed_hosts, open_to_all=is_open)
+    return Door(keys, is_open, hosts, settings.cors_origins)
+
+
+def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
+    """Put the service's state among the metrics."""
+    metrics.gauge("jobs_queued", "Jobs that wait", (), lambda: {(): jobs.waiting()})
+    metrics.gauge("jobs_running", "Jobs that run", (), lambda: {(): jobs.running()})
+    metrics.gauge("workers", "Threads that run jobs", (), lambda: {(): workers})
+    metrics.gauge("workers_stuck", "Abandoned workers", (), lambda: {(): jobs.stuck_workers()})
+    metrics.gauge("scene_bytes", "Memory of a scene", ("scene",), scenes.memory)
+
+
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+
+
+def openapi(app: FastAPI) -> dict[str, Any]:
+    """Return the API's description; with the models that no route names by itself."""
+    if not app.openapi_schema:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=_SUMMARY,
+            description=_DESCRIPTION,
+            routes=app.routes,
+        )
+        _, extra = models_json_schema(
+            [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
+            ref_template="#/components/schemas/{model}",
+        )
+        models = schema.setdefault("components", {}).setdefault("schemas", {})
+        models |= {name: model for name, model in extra["$defs"].items() if name not in models}
+        schema["components"]["examples"] = example_components()
+        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
+        schema["security"] = [{"key": []}, {}]
+        _drop_default_validation(schema)
+        add_links(schema)
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _drop_default_validation(schema: dict[str, Any]) -> None:
+    """Take out what FastAPI says of its own validation: ours answers with a problem document of 400."""
+    for operations in schema["paths"].values():
+        for operation in operations.values():
+            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schema["components"]["schemas"].pop(name, None)
+
+
+def openapi_yaml() -> str:
+    """Return the text of openapi.yaml; it doesn't depend on any setting."""
+    return yaml.safe_dump(
+        create_app(Settings(scenes=[], viewer=False)).openapi(),
+        sort_keys=False,
+        width=100,
+        allow_unicode=True,
+    )
+
+
+_KEYS = "An API key, or a token from `/tokens`; a service without keys needs none."
+_SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
+_DESCRIPTION = """
+Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
+camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
+are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
+Every error is a problem document (RFC 9457) with a stable `code`; each operation lists those it may give, each with
+an example. An address that isn't here is answered with `not_found`, another method with `method_not_allowed`.
+A job that ended without a result has a problem document as its `error`.
+"""

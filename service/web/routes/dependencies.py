@@ -1,0 +1,68 @@
+"""What the routes share: the app's parts as dependencies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import anyio
+from anyio import to_thread
+from fastapi import Depends, Path, Request
+
+from service.jobs.service import Jobs
+from service.jobs.sqlite_store import StoredJob
+from service.scene_manager.manager import Scenes
+from service.scene_manager.scene_store import Uploads
+from service.web.api_keys import Caller, KeyRing
+from service.web.metrics import Metrics
+from service.web.settings import Settings
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """What the routes work with; one per app."""
+
+    settings: Settings
+    scenes: Scenes
+    jobs: Jobs
+    uploads: Uploads
+    keys: KeyRing
+    metrics: Metrics
+    decoding: anyio.CapacityLimiter
+    """Photos decoded at once: each may take 450 MB for a moment."""
+    rendering: anyio.CapacityLimiter
+    """Pictures rendered at once for looking at: a renderer's thread keeps working memory."""
+
+    async def drawn(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
+        """Render something for looking at, off the event loop."""
+        began = time.perf_counter()
+        picture = await to_thread.run_sync(draw, limiter=self.rendering)
+        self.metrics.rendered(scene_id, time.perf_counter() - began)
+        return picture
+
+
+def _parts(request: Request) -> Parts:
+    return request.app.state.parts
+
+
+def _root(request: Request) -> str:
+    return request.scope.get("root_path", "")
+
+
+def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id.")]) -> StoredJob:
+    return parts.jobs.get(job_id)  # not async: reads the disk
+
+
+def _caller(request: Request) -> Caller | None:
+    return request.state.caller
+
+
+PartsOf = Annotated[Parts, Depends(_parts)]
+CallerOf = Annotated[Caller | None, Depends(_caller)]
+RootOf = Annotated[str, Depends(_root)]
+JobOf = Annotated[StoredJob, Depends(_job)]
+
+
+JPEG = {200: {"description": "JPEG", "content": {"image/jpeg": {}}}}

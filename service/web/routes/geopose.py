@@ -1,0 +1,82 @@
+"""AR clients that speak GeoPoseProtocol: `POST /geopose`."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Query, Request, Response
+
+from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
+from service.jobs.service import Order
+from service.photos.sequence import is_sequence
+from service.web.middleware.limits import client_of
+from service.web.problems import problem_answer
+from service.web.routes.dependencies import PartsOf
+from service.web.schemas import geopose_protocol as gpp
+from service.web.schemas import resources as documents
+from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.parsing import Body
+from service.web.schemas.requests import LocalizeFields
+from service.web.schemas.responses import Problem
+
+GEOPOSE = "application/geopose+json"
+
+router = APIRouter()
+
+
+@router.post(
+    "/geopose",
+    tags=["localize"],
+    responses={200: {"model": gpp.GeoPoseResponse, "description": "The pose", "content": {GEOPOSE: {}}}}
+    | errors(
+        *("invalid_request", "bad_request", "request_timeout", *SCENE, "no_geo_anchor"),
+        *(
+            "invalid_image",
+            "invalid_intrinsics",
+            "no_pose",
+            "deadline_exceeded",
+            "interrupted",
+            "estimator_fault",
+            "storage_failed",
+        ),
+        body=True,
+    ),
+)
+async def geopose(
+    wanted: gpp.GeoPoseRequest,
+    request: Request,
+    parts: PartsOf,
+    scene: Annotated[str | None, Query(description="Left out: the nearest that has a place on Earth.")] = None,
+    accept: Annotated[str, Header(description=f"`{GEOPOSE}`: only the pose, as OGC GeoPose 1.0 has it")] = "",
+) -> Response:
+    """Find where a photo was taken, in Open AR Cloud's GeoPoseProtocol: one request, one answer, on Earth.
+
+    Camera axes are +x right, +y up, +z backwards (WebXR's). The search is a job like any other; it takes at most
+    as long as `Prefer: wait` may.
+    """
+    photo, intrinsics = gpp.image_of(wanted)
+    if is_sequence(photo):
+        raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
+    entry = parts.scenes.entry(scene or gpp.nearest_scene(parts.scenes.entries(), wanted))
+    anchor = parts.scenes.get(entry.id).scene.info.geo_anchor
+    if anchor is None:
+        raise NoGeoAnchor(f"scene '{entry.id}' has no place on Earth.", where="scene")
+    wait_s = parts.settings.max_wait_s
+    fields = LocalizeFields(scene=entry.id, intrinsics=intrinsics, deadline_s=wait_s)
+    order = Order(Body(photo, "", {}), fields, client_of(request.scope), None, hashlib.sha256(photo).hexdigest())
+    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
+    if live := parts.jobs.live(job.id):
+        await live.wait(wait_s)
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    if not job.ended:
+        await to_thread.run_sync(parts.jobs.cancel, job)
+        raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
+    if job.error:
+        return problem_answer(Problem.model_validate_json(job.error), request.url.path)
+    _, _, result = documents.answer(job)
+    answer = gpp.response_of(wanted, result, anchor)
+    if GEOPOSE in accept:
+        return Response(answer.geopose.model_dump_json(), media_type=GEOPOSE)
+    return Response(answer.model_dump_json(), media_type="application/json")

@@ -1,0 +1,181 @@
+"""What became of a photo: `/jobs`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import AsyncIterator
+from functools import partial
+from typing import Annotated, Literal
+from urllib.parse import urlencode
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Path, Query, Response
+from fastapi.sse import EventSourceResponse, ServerSentEvent
+from pydantic import Field
+
+from service.jobs.sqlite_store import JobFilter
+from service.localize import LoadedScene
+from service.photos.images import encode_image
+from service.results import Status
+from service.types import Camera
+from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf
+from service.web.schemas import resources as documents
+from service.web.schemas.conversion import record_camera
+from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.exports import EXPORT_TYPES, ExportFormat, exported
+from service.web.schemas.responses import JobList, JobOut, JobState, PhotoOut, Record, Trace
+
+router = APIRouter()
+
+
+@router.get("/jobs", tags=["jobs"], responses=errors("invalid_request"))
+def list_jobs(
+    parts: PartsOf,
+    root: RootOf,
+    scene: str | None = None,
+    estimator: str | None = None,
+    state: JobState | None = None,
+    status: Annotated[Status | None, Query(description="Of the result.")] = None,
+    photo: Annotated[str | None, Query(description="sha256 of the photo's file.")] = None,
+    before: Annotated[
+        int | None, Query(ge=0, lt=2**63, description="Where the page starts: take it from `next`.")
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=500)] = 100,
+) -> JobList:
+    """List the jobs that are remembered, newest first; those that fit, where a filter is given."""
+    wanted = JobFilter(scene, estimator, state, status, photo, before)
+    page = parts.jobs.page(wanted, limit + 1)
+    given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
+    query = {name: value for name, value in given.items() if value is not None}
+    more = f"{root}/jobs?{urlencode(query | {'before': page[limit - 1].number})}" if len(page) > limit else None
+    return JobList(
+        jobs=[documents.job_summary(job, root) for job in page[:limit]],
+        next=more,
+        queued=parts.jobs.waiting(),
+        running=parts.jobs.running(),
+    )
+
+
+@router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
+def get_job(job: JobOf, root: RootOf) -> JobOut:
+    """Say how a job stands; with its result or its error when it has ended."""
+    return documents.job_document(job, root)
+
+
+@router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
+def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
+    """Cancel: at once if the job waits, after its current step if it runs, without effect if it has ended."""
+    parts.jobs.cancel(job)
+    return documents.job_document(parts.jobs.get(job.id), root)
+
+
+@router.get(
+    "/jobs/{job_id}/events",
+    tags=["jobs"],
+    response_class=EventSourceResponse,
+    responses=errors("job_not_found"),
+)
+async def job_events(
+    job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
+) -> AsyncIterator[ServerSentEvent]:
+    """Follow a job: an event `record` for each step from the first on, then `result` or `error`.
+
+    A `record` has `attempt.index` as id and a `Record` as data; after a crash of the service another attempt
+    starts again at index 0. The last event has the id `end` and a `JobOut` as data: `result` if the job succeeded,
+    else `error`. `Last-Event-ID` resumes, also after a restart of the service.
+    """
+    attempt, sent = _resumed(last_event_id)
+    if live := parts.jobs.live(job.id):
+        async for _ in live.changes():
+            if live.attempt != attempt:
+                attempt, sent = live.attempt, 0
+            for record in live.records[sent:]:
+                yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
+                sent += 1
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    if job.attempt != attempt:
+        attempt, sent = job.attempt, 0
+    for record in await to_thread.run_sync(parts.jobs.records, job, sent):
+        yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
+        sent += 1
+    if job.ended:  # else the service ends: the client comes again
+        data = documents.job_document(job, root).model_dump_json()
+        yield ServerSentEvent(event="result" if job.result else "error", id="end", raw_data=data)
+
+
+def _resumed(last_event_id: str) -> tuple[int, int]:
+    """Return the attempt that a client knows, and how many of its records."""
+    found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
+    return (int(found[1]), int(found[2]) + 1) if found else (0, 0)
+
+
+@router.get(
+    "/jobs/{job_id}/photo",
+    tags=["jobs"],
+    response_class=Response,
+    responses=JPEG | errors("job_not_found", "photo_gone", "job_not_ready"),
+)
+async def job_photo(job: JobOf, parts: PartsOf) -> Response:
+    """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced. For a while, or if kept."""
+    photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
+    return Response(photo, media_type="image/jpeg")
+
+
+@router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors("job_not_found"))
+def job_trace(job: JobOf, parts: PartsOf) -> Trace:
+    """Return all records so far, of the latest attempt."""
+    return documents.job_trace(job, parts.jobs.records(job))
+
+
+@router.get(
+    "/jobs/{job_id}/iterations/{index}/render.jpg",
+    tags=["jobs"],
+    response_class=Response,
+    responses=JPEG | errors("invalid_request", "job_not_found", "record_not_found", "job_not_ready", *SCENE),
+)
+async def job_render(
+    job: JobOf,
+    parts: PartsOf,
+    index: Annotated[
+        Literal["last"] | Annotated[int, Field(ge=0)], Path(description="Of the record; `last`: the latest.")
+    ],
+    camera: Annotated[
+        Literal["pose", "matches"],
+        Query(description="The record's pose in the photo's size, or the camera that its matches refer to."),
+    ] = "pose",
+) -> Response:
+    """Render the scene as a record's camera sees it."""
+    text = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
+    photo = PhotoOut.model_validate_json(job.photo)
+    seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
+    loaded = parts.scenes.get(job.scene)
+    render = partial(_rendered_jpeg, loaded, seen_by)
+    return Response(await parts.drawn(job.scene, render), media_type="image/jpeg")
+
+
+def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
+    return encode_image(loaded.rasterizer.render([camera])[0].rgb)
+
+
+@router.get(
+    "/jobs/{job_id}/export/{format}",
+    tags=["jobs"],
+    response_class=Response,
+    responses={
+        200: {
+            "description": "Text or JSON, as the format has it",
+            "content": {kind: {} for kind in EXPORT_TYPES.values()},
+        }
+    }
+    | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
+)
+def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
+    """Return the pose as other programs read it; not of a job that found none.
+
+    `colmap`: an entry of `images.txt`, its camera in a comment. `nerfstudio`: an entry of `frames` in
+    `transforms.json`. `tum`: a line of a trajectory, stamped with the time of the job's acceptance. `geopose`: OGC
+    GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
+    an `images.txt`, a `transforms.json` or a trajectory in the photos' own times; `geopose` has the last.
+    """
+    name, created, result = documents.answer(job)
+    return Response(exported(format, name, created, result), media_type=EXPORT_TYPES[format])

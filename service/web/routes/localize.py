@@ -1,0 +1,117 @@
+"""A photo in: `POST /localize`."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Header, Request, Response
+
+from service.jobs.service import Order
+from service.web.middleware.limits import client_of
+from service.web.routes.dependencies import PartsOf, RootOf
+from service.web.schemas import resources as documents
+from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.parsing import read_body, read_fields
+from service.web.schemas.requests import LocalizeFields, LocalizeIn
+from service.web.schemas.responses import JobOut
+
+router = APIRouter()
+
+
+def _form_schema() -> dict[str, Any]:
+    """The multipart form: as the JSON body, but the photo is a file and the nested fields are JSON text."""
+    schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
+    schema.pop("$defs", None)
+    schema["description"] = "`options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text."
+    for name in ("options", "intrinsics", "prior", "truth", "times_s"):
+        described = LocalizeFields.model_fields[name].description or "See the JSON body."
+        schema["properties"][name] = {
+            "type": "string",
+            "contentMediaType": "application/json",
+            "description": described,
+        }
+    schema["properties"]["photo"] = {
+        "type": "array",
+        "items": {"type": "string", "format": "binary"},
+        "minItems": 1,
+        "description": "A photo (JPEG, PNG, WebP, HEIC); several of one camera, in the order in which they were taken; "
+        "or a video (MP4, MOV, WebM, Matroska, AVI).",
+    }
+    return schema
+
+
+_BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "multipart/form-data": {"schema": _form_schema()},
+            "application/json": {"schema": {"$ref": "#/components/schemas/LocalizeIn"}},
+        },
+    }
+}
+_ACCEPTED = {
+    200: {"description": "`Prefer: wait=N`, and the job ended in time", "model": JobOut},
+    202: {
+        "description": "Accepted",
+        "headers": {"Location": {"description": "The job", "schema": {"type": "string"}}},
+    },
+}
+
+
+@router.post(
+    "/localize",
+    status_code=202,
+    tags=["localize"],
+    response_model=JobOut,
+    responses=_ACCEPTED
+    | errors(
+        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE),
+        *("invalid_image", "invalid_intrinsics", "invalid_prior", "invalid_options", "unknown_name"),
+        *("backend_missing", "idempotency_conflict", "storage_failed"),
+        body=True,
+    ),
+    openapi_extra=_BODY,
+)
+async def localize_photo(
+    request: Request,
+    response: Response,
+    parts: PartsOf,
+    root: RootOf,
+    prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
+    idempotency_key: Annotated[
+        str | None,
+        Header(
+            min_length=1,
+            max_length=200,
+            description="Send a request again with the same key: it is the same job, not a second",
+        ),
+    ] = None,
+) -> JobOut:
+    """Find where a photo was taken. What is wrong with the request is told at once; the search is a job.
+
+    Several photos of one camera, or a video, are one job: each is followed from the one before, an event `record`
+    tells each one's answer, and the result's `frames` has them all.
+    """
+    body = await read_body(request, parts.settings.max_frames)
+    fields = read_fields(body.fields)
+    digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
+    order = Order(body, fields, client_of(request.scope), idempotency_key, digest)
+    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
+    wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
+    if wait_s:
+        if live := parts.jobs.live(job.id):
+            await live.wait(wait_s)
+        response.headers["Preference-Applied"] = f"wait={wait_s:g}"
+    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    response.headers["Location"] = f"{root}/jobs/{job.id}"
+    response.status_code = 200 if job.ended else 202
+    return documents.job_document(job, root)
+
+
+def wait_preference(header: str) -> float:
+    """Return the seconds of `wait=N` in a Prefer header (RFC 7240); 0 if it has none."""
+    found = re.search(r'(?:^|[,;])\s*wait\s*=\s*"?(\d{1,6})\b', header, re.IGNORECASE)
+    return float(found.group(1)) if found else 0.0

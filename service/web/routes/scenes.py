@@ -1,0 +1,160 @@
+"""What photos are localized in: `/scenes`."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Request, Response
+
+from service.errors import SceneExists, SceneInUse
+from service.scene_manager import splat_sample as splats
+from service.scene_manager.scene_images import PICTURE_TYPES, picture, thumbnail
+from service.web.routes.dependencies import JPEG, PartsOf, RootOf
+from service.web.schemas import resources as documents
+from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.requests import RenderIn
+from service.web.schemas.responses import SceneList, SceneOut, SceneSummary
+
+MAX_SPLATS = 2_000_000
+
+router = APIRouter()
+
+
+@router.get("/scenes", tags=["scenes"], responses=errors())
+async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
+    """List the scenes and how far they have come."""
+    return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
+
+
+@router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
+def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
+    """Describe a scene, with its training cameras."""
+    return documents.scene_document(parts.scenes.entry(scene_id), root)
+
+
+@router.put(
+    "/scenes/{scene_id}",
+    status_code=201,
+    tags=["scenes"],
+    responses=errors(
+        *("invalid_request", "request_timeout", "scene_exists", "corrupt_scene", "unsupported_format"),
+        "storage_failed",
+        body=True,
+    ),
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+        }
+    },
+)
+async def upload_scene(
+    scene_id: str,
+    request: Request,
+    parts: PartsOf,
+    root: RootOf,
+    file: Annotated[
+        str, Query(description="The file's name, for its suffix: `scene.ply`, `scene.splat`.")
+    ] = "scene.ply",
+) -> SceneOut:
+    """Add a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, then loaded."""
+    if any(entry.id == scene_id for entry in parts.scenes.entries()):
+        raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+    path = await parts.uploads.receive(scene_id, file, request.stream())
+    entry = parts.scenes.add(scene_id, path, uploaded=True)
+    parts.scenes.load(entry)
+    return documents.scene_document(entry, root)
+
+
+@router.post(
+    "/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors("scene_not_found", body=True)
+)
+def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+    """Load a scene into memory, and make it ready; again, if that failed before."""
+    entry = parts.scenes.entry(scene_id)
+    parts.scenes.load(entry)
+    return documents.scene_summary(entry, root)
+
+
+@router.post(
+    "/scenes/{scene_id}/unload",
+    status_code=202,
+    tags=["scenes"],
+    responses=errors("scene_not_found", "bad_input", body=True),
+)
+def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+    """Drop a scene from memory when the last job on it has ended; it takes no more, until it is loaded again."""
+    entry = parts.scenes.entry(scene_id)
+    parts.scenes.unload(entry)
+    return documents.scene_summary(entry, root)
+
+
+@router.delete(
+    "/scenes/{scene_id}",
+    status_code=204,
+    tags=["scenes"],
+    responses=errors("scene_not_found", "scene_in_use", "storage_failed", body=True),
+)
+def delete_scene(scene_id: str, parts: PartsOf) -> None:
+    """Delete an uploaded scene with its files; not one that the operator named, nor one that jobs use."""
+    entry = parts.scenes.entry(scene_id)
+    if not entry.uploaded or entry.path is None:
+        raise SceneInUse("the operator named this scene; it can only be unloaded.", where="scene")
+    if entry.jobs:
+        raise SceneInUse(f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
+    parts.scenes.remove(entry)
+    parts.uploads.delete(entry.path)
+
+
+@router.get(
+    "/scenes/{scene_id}/thumbnail.jpg",
+    tags=["scenes"],
+    response_class=Response,
+    responses=JPEG | errors(*SCENE),
+)
+async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
+    """Return a small picture of the scene, as its middle training camera sees it."""
+    draw = partial(thumbnail, parts.scenes.get(scene_id))
+    return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
+
+
+@router.get(
+    "/scenes/{scene_id}/splats",
+    tags=["scenes"],
+    response_class=Response,
+    responses={
+        200: {
+            "description": (splats.__doc__ or "").split("\n", 1)[1].strip(),
+            "content": {splats.BINARY: {"schema": {"type": "string", "format": "binary"}}},
+        }
+    }
+    | errors("invalid_request", *SCENE),
+)
+async def scene_splats(
+    scene_id: str,
+    parts: PartsOf,
+    limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="At most so many.")] = 200_000,
+) -> Response:
+    """Return the scene's most important Gaussians for drawing, as little-endian binary."""
+    pack = partial(splats.packed_splats, parts.scenes.get(scene_id).scene, limit)
+    return Response(await to_thread.run_sync(pack, limiter=parts.rendering), media_type=splats.BINARY)
+
+
+@router.post(
+    "/scenes/{scene_id}/render",
+    tags=["scenes"],
+    response_class=Response,
+    responses={
+        200: {"description": "The picture", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
+    }
+    | errors(
+        *("invalid_request", "bad_request", "request_timeout", *SCENE, "invalid_intrinsics", "invalid_prior"),
+        body=True,
+    ),
+)
+async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
+    """Render a scene from any pose: a picture, or the depth of what is seen there."""
+    draw = partial(picture, parts.scenes.get(scene_id), wanted)
+    return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])

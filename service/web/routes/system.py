@@ -1,0 +1,64 @@
+"""The service itself: what it can do, and whether it is well."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response
+
+from service.errors import NoKeys
+from service.web.metrics import METRICS_TYPE
+from service.web.routes.dependencies import CallerOf, PartsOf
+from service.web.schemas import resources as documents
+from service.web.schemas.error_examples import errors
+from service.web.schemas.responses import Capabilities, Liveness, Readiness, Token
+
+TOKEN_S = 300.0
+_CANNOT_FAIL = ("unauthorized", "forbidden")
+
+router = APIRouter()
+
+
+@router.get("/capabilities", tags=["service"], responses=errors())
+def get_capabilities(parts: PartsOf) -> Capabilities:
+    """Say which estimators, matchers, renderers and formats there are, and the estimators' options."""
+    return documents.capabilities(parts.settings)
+
+
+@router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))
+def get_version() -> dict[str, str]:
+    """Return the versions of this service and of what its results depend on."""
+    return documents.versions()
+
+
+@router.get("/livez", tags=["service"], responses=errors(always=_CANNOT_FAIL))
+async def live() -> Liveness:
+    """Answer, as long as the process can."""
+    return Liveness()
+
+
+@router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
+async def ready(parts: PartsOf, response: Response) -> Readiness:
+    """Say whether photos can be localized at full speed: scenes loaded and ready, workers and disk at work."""
+    readiness = parts.scenes.readiness()
+    ill = parts.jobs.ailments()
+    readiness = readiness.model_copy(update={"ready": readiness.ready and not ill, "failed": readiness.failed + ill})
+    response.status_code = 200 if readiness.ready else 503
+    return readiness
+
+
+@router.get(
+    "/metrics",
+    tags=["service"],
+    response_class=Response,
+    responses={200: {"description": "Prometheus's text form", "content": {"text/plain": {}}}} | errors(),
+)
+def get_metrics(parts: PartsOf) -> Response:
+    """Return what there is to watch: requests, queue, jobs by stage and outcome, memory by scene, workers."""
+    return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
+
+
+@router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))
+def make_token(parts: PartsOf, caller: CallerOf) -> Token:
+    """Make a token that stands for the caller's key for some minutes, to open a page with: `/viewer/?token=…`."""
+    if caller is None:
+        raise NoKeys("the service has no keys: its pages are open.", where="header.authorization")
+    return Token(token=parts.keys.token(caller, TOKEN_S), seconds=TOKEN_S)

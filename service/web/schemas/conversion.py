@@ -1,0 +1,195 @@
+"""How domain values become the models of `schemas`."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+
+from service.geometry import quat_from_rotation
+from service.results import HINTS, IterationRecord, PoseEstimate, StageTiming
+from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, PriorRegion
+from service.web.schemas.geodesy import geographic
+from service.web.schemas.responses import (
+    Alternative,
+    Axes,
+    CameraOut,
+    CandidatesOut,
+    Considered,
+    Covariance,
+    GeoPose,
+    GeoPosition,
+    GeoQuaternion,
+    IntrinsicsOut,
+    LensOut,
+    MatchesOut,
+    Matrix,
+    NamedCameraOut,
+    PoseOut,
+    Record,
+    RegionOut,
+    Result,
+    SceneRef,
+    Timing,
+    Transform,
+)
+
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Camera axes: OpenGL's y points up and its z backwards. Its own inverse."""
+
+
+def rows(matrix: np.ndarray) -> Matrix:
+    """Return nested lists of Python floats."""
+    return np.asarray(matrix, np.float64).tolist()
+
+
+def transform_out(target_from_source: np.ndarray) -> Transform:
+    """Spell out a target_from_source."""
+    return Transform(
+        matrix=rows(target_from_source),
+        translation=target_from_source[:3, 3].tolist(),
+        quaternion_wxyz=quat_from_rotation(target_from_source[:3, :3]).tolist(),
+    )
+
+
+def pose_out(pose: Pose) -> PoseOut:
+    """Spell out a pose in both conventions of camera axes."""
+    opengl = Pose(pose.world_from_camera @ OPENCV_FROM_OPENGL)
+    return PoseOut(
+        position=pose.position_in_world.tolist(),
+        world_from_camera=transform_out(pose.world_from_camera),
+        camera_from_world=transform_out(pose.camera_from_world),
+        opengl=Axes(
+            world_from_camera=transform_out(opengl.world_from_camera),
+            camera_from_world=transform_out(opengl.camera_from_world),
+        ),
+    )
+
+
+def geopose_out(anchor: GeoAnchor, pose: Pose) -> GeoPose:
+    """Spell out a pose on Earth."""
+    (latitude, longitude, height), (w, x, y, z) = geographic(anchor, pose)
+    position = GeoPosition(lat=latitude, lon=longitude, h=height)
+    return GeoPose(position=position, quaternion=GeoQuaternion(x=x, y=y, z=z, w=w))
+
+
+def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
+    """Spell out a camera model."""
+    return IntrinsicsOut(
+        model=intrinsics.model,
+        width=intrinsics.width,
+        height=intrinsics.height,
+        fx=intrinsics.fx,
+        fy=intrinsics.fy,
+        cx=intrinsics.cx,
+        cy=intrinsics.cy,
+        distortion=list(intrinsics.distortion),
+        trust=intrinsics.trust,
+    )
+
+
+def camera_out(camera: Camera) -> CameraOut:
+    """Spell out a camera."""
+    return CameraOut(
+        intrinsics=intrinsics_out(camera.intrinsics), world_from_camera=rows(camera.pose.world_from_camera)
+    )
+
+
+def named_camera_out(named: NamedCamera) -> NamedCameraOut:
+    """Spell out a training camera."""
+    return NamedCameraOut(name=named.name, **camera_out(named.camera).model_dump())
+
+
+def record_out(record: IterationRecord) -> Record:
+    """Spell out one step of a job."""
+    matches, candidates = record.matches, record.candidates
+    return Record(
+        index=record.index,
+        stage=record.stage,
+        world_from_camera=rows(record.pose.world_from_camera),
+        lens=LensOut(**asdict(record.lens)),
+        elapsed_s=record.elapsed_s,
+        cpu_s=record.cpu_s,
+        loss=record.loss,
+        num_matches=record.num_matches,
+        num_inliers=record.num_inliers,
+        step_deg=record.step_deg,
+        step_units=record.step_units,
+        matches=matches
+        and MatchesOut(
+            photo_px=rows(matches.photo_px),
+            render_px=rows(matches.render_px),
+            inlier=matches.inlier.tolist(),
+            render_camera=camera_out(matches.render_camera),
+        ),
+        candidates=candidates
+        and CandidatesOut(world_from_camera=candidates.world_from_camera.tolist(), scores=candidates.scores.tolist()),
+    )
+
+
+def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> Camera:
+    """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
+    if of_matches and record.matches is not None:
+        camera = record.matches.render_camera
+        return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
+    lens = IntrinsicsCorrection(**record.lens.model_dump())
+    return Camera(_intrinsics_in(photo).corrected(lens), Pose(np.array(record.world_from_camera)))
+
+
+def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
+    return Intrinsics(**{**intrinsics.model_dump(), "distortion": tuple(intrinsics.distortion)})
+
+
+def covariance_out(matrix: np.ndarray) -> Covariance:
+    """Spell out the covariance of a pose, with its two standard deviations."""
+    return Covariance(
+        matrix=rows(matrix),
+        sigma_deg=float(np.degrees(np.sqrt(np.trace(matrix[:3, :3])))),
+        sigma_units=float(np.sqrt(np.trace(matrix[3:, 3:]))),
+    )
+
+
+def region_out(region: PriorRegion) -> RegionOut:
+    """Spell out what a prior admits."""
+    if isinstance(region, BoxPrior):
+        return RegionOut(box=[region.lower_in_world.tolist(), region.upper_in_world.tolist()])
+    return RegionOut(covariance=covariance_out(region.covariance))
+
+
+def timing_out(timing: StageTiming) -> Timing:
+    """Spell out the time that a stage took."""
+    return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
+
+
+def result_out(
+    estimate: PoseEstimate, decode: Timing, versions: dict[str, str], anchor: GeoAnchor | None = None
+) -> Result:
+    """Spell out a finished estimate; `decode` is what reading the photo took, `anchor` the scene's."""
+    verdict = estimate.verdict
+    return Result(
+        status=verdict.status,
+        reason=verdict.reason,
+        hint=HINTS[verdict.reason],
+        score=verdict.score,
+        pose=pose_out(estimate.pose),
+        alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
+        geopose=anchor and geopose_out(anchor, estimate.pose),
+        intrinsics=intrinsics_out(estimate.intrinsics),
+        intrinsics_source=estimate.intrinsics_source,
+        focal_sigma_px=verdict.focal_sigma * estimate.intrinsics.fx if verdict.focal_sigma else None,
+        inliers=verdict.inliers,
+        agreement=verdict.agreement,
+        coverage=verdict.coverage,
+        signals=dict(verdict.signals),
+        covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
+        timings=[decode, *map(timing_out, estimate.timings)],
+        budget_exhausted=estimate.budget_exhausted,
+        seed=estimate.seed,
+        estimator=estimate.estimator,
+        matcher=estimate.matcher,
+        rasterizer=estimate.rasterizer,
+        scene=SceneRef(id=estimate.scene_id, sha256=estimate.scene_sha256),
+        considered=[Considered(id=scene, matches=matches) for scene, matches in estimate.considered],
+        versions=versions,
+        warnings=list(estimate.warnings),
+    )

@@ -1,0 +1,166 @@
+"""Every error that a caller can meet, by code, each with an example: what `openapi.yaml` shows.
+
+An example is made of the exception that really is raised, so its status and form can't differ from the answer's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from starlette.exceptions import HTTPException
+
+from service import errors as e
+from service.web.problems import MEDIA_TYPE, RETRY_AFTER_S, problem_of
+from service.web.schemas.responses import Problem
+
+_JOB, _SCENE = "/jobs/3f9c2a7be1d04c58", "/scenes/studio"
+_AGAIN = "Try again later."
+
+_EXAMPLES: tuple[tuple[Exception, str], ...] = (
+    (e.InvalidRequest("Input should be a valid integer, unable to parse string.", where="seed"), "/localize"),
+    (e.InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo"), "/localize"),
+    (e.InvalidIntrinsics("must be a positive focal length in pixels, is 0.0.", where="intrinsics.fx"), "/localize"),
+    (e.InvalidPrior("the last row must be 0 0 0 1.", where="prior.world_from_camera"), "/localize"),
+    (
+        e.InvalidOptions("'view_index' has no such option; it has: seed_views, top_k.", where="options.topk"),
+        "/localize",
+    ),
+    (e.UnknownName("there is no 'magic'; known: mc_do, view_index.", where="estimators"), "/localize"),
+    (e.BackendMissing("'gsplat' can't run here: there is no CUDA device.", where="estimators"), "/localize"),
+    (
+        e.IdempotencyConflict(
+            "the key was used for job 3f9c2a7be1d04c58, which was another request.",
+            where="header.idempotency-key",
+            hint="Use a new key for a new request.",
+        ),
+        "/localize",
+    ),
+    (e.QueueFull("32 jobs are waiting.", hint=_AGAIN), "/localize"),
+    (e.RateLimited("more than 30/second requests of yours.", hint="Slow down.", retry_after_s=1), "/localize"),
+    (e.StorageFailed("the service can't write the photo to disk: No space left on device."), "/localize"),
+    (e.BadInput("it has no file to be loaded from again.", where="scene"), f"{_SCENE}/unload"),
+    (e.SceneNotFound("there is no scene 'attic'; known: studio.", where="scene"), "/scenes/attic"),
+    (
+        e.SceneNotReady("scene 'studio' is loading.", where="scene", hint=_AGAIN),
+        "/localize",
+    ),
+    (
+        e.SceneUnloaded("scene 'studio' was unloaded.", where="scene", hint="Load it: POST /scenes/studio/load."),
+        "/localize",
+    ),
+    (
+        e.NoRoom(
+            "scene 'studio' takes 812 MB, 1400 of 2000 MB are in use.",
+            where="scene",
+            hint="Unload another scene, or raise SPLATFIX_SCENE_MEMORY_BYTES.",
+        ),
+        "/localize",
+    ),
+    (e.SceneExists("there is a scene 'studio'.", where="scene", hint="Delete it first."), _SCENE),
+    (e.SceneInUse("2 jobs use the scene.", where="scene", hint="Unload it, and wait for them."), _SCENE),
+    (
+        e.CorruptScene(
+            "truncated: the header promises 9 of 'vertex', the file ends after 4.",
+            where="scene.ply, byte 1011",
+            hint="Copy or export it again.",
+        ),
+        "/localize",
+    ),
+    (
+        e.UnsupportedFormat("a text PLY is not read.", where="scene.ply", hint="Save it as binary."),
+        "/localize",
+    ),
+    (e.JobNotFound("there is no job '3f9c2a7be1d04c58', or it was forgotten.", where="job"), _JOB),
+    (
+        e.RecordNotFound("the job has 12 records and is succeeded.", where="iterations"),
+        f"{_JOB}/iterations/12/render.jpg",
+    ),
+    (e.JobNotReady("the job is running.", where="job"), f"{_JOB}/export/colmap"),
+    (
+        e.NoPose("the job found no pose that could be used.", where="job", hint="Its document says why."),
+        f"{_JOB}/export/colmap",
+    ),
+    (
+        e.NoGeoAnchor(
+            "scene 'studio' has no place on Earth.",
+            where="format",
+            hint="Give its scene.json a geo_anchor, and localize again.",
+        ),
+        f"{_JOB}/export/geopose",
+    ),
+    (
+        e.PhotoGone(
+            "the photo was deleted after the job.",
+            where="photo",
+            hint="Send keep_photo=true to have it kept as long as the job.",
+        ),
+        f"{_JOB}/photo",
+    ),
+    (e.DeadlineExceeded("the deadline was over before the job could start.", where="deadline_s"), _JOB),
+    (e.Interrupted("the service ended 3 times while this job ran."), _JOB),
+    (e.EstimatorFault("'view_index' ended without a record."), _JOB),
+    (
+        e.Unauthorized("an API key is needed here.", hint="Send it: Authorization: Bearer KEY."),
+        "/jobs",
+    ),
+    (e.Forbidden("the key's role is read, needed is localize."), "/localize"),
+    (e.NoKeys("the service has no keys: its pages are open.", where="header.authorization"), "/tokens"),
+    (HTTPException(400, "Missing boundary in multipart."), "/localize"),
+    (HTTPException(404, "Not Found"), "/nowhere"),
+    (HTTPException(405, "Method Not Allowed"), "/localize"),
+    (HTTPException(408, "The body took too long to arrive."), "/localize"),
+    (HTTPException(413, "The body may have 67666666 bytes."), "/localize"),
+    (HTTPException(415, "Send multipart/form-data or application/json, not 'image/jpeg'."), "/localize"),
+    (HTTPException(503, "The viewer does not answer; it may just be starting."), "/viewer/"),
+    (RuntimeError(), f"{_JOB}/photo"),
+)
+
+EXAMPLES: dict[str, Problem] = {p.code: p for p in (problem_of(error, path) for error, path in _EXAMPLES)}
+"""By code."""
+
+ALWAYS = ("unauthorized", "forbidden", "internal_error")
+"""What any operation may answer."""
+WITH_BODY = ("content_too_large", "rate_limited", "queue_full")
+"""What all that may have a body can answer, before it is read."""
+SCENE = ("scene_not_found", "scene_unloaded", "corrupt_scene", "unsupported_format", "scene_not_ready", "no_room")
+"""Why a scene isn't there to work with."""
+
+_MEANINGS = {
+    400: "The request can't be understood",
+    401: "An API key is needed, or it is not valid",
+    403: "The key's role doesn't allow it, or another site's page asks",
+    404: "There is no such thing",
+    408: "The body took too long",
+    409: "Not yet, not any more, or there is nothing to give",
+    413: "The body is too large",
+    415: "Neither a multipart form nor JSON",
+    422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",
+    429: "Too many requests of yours; see Retry-After",
+    500: "The service failed",
+    501: "What was asked for can't run on this machine",
+    503: "Too much work is waiting, the disk is full, or the scene is still loading; see Retry-After",
+    504: "There was no answer in time",
+}
+_RETRY = {"Retry-After": {"description": "Seconds", "schema": {"type": "integer"}, "example": RETRY_AFTER_S}}
+_CHALLENGE = {"WWW-Authenticate": {"schema": {"type": "string"}, "example": "Bearer"}}
+
+
+def errors(*codes: str, body: bool = False, always: tuple[str, ...] = ALWAYS) -> dict[int | str, dict[str, Any]]:
+    """Document the problem documents that an operation may answer with; `body`: it isn't a GET."""
+    found: dict[int, dict[str, Any]] = {}
+    for code in dict.fromkeys((*codes, *(WITH_BODY if body else ()), *always)):
+        status = EXAMPLES[code].status
+        response = found.setdefault(status, _response(status))
+        response["content"][MEDIA_TYPE]["examples"][code] = {"$ref": f"#/components/examples/{code}"}
+    return dict(sorted(found.items()))
+
+
+def _response(status: int) -> dict[str, Any]:
+    headers = _RETRY if status in (429, 503) else _CHALLENGE if status == 401 else None
+    content = {MEDIA_TYPE: {"schema": {"$ref": "#/components/schemas/Problem"}, "examples": {}}}
+    return {"description": _MEANINGS[status], **({"headers": headers} if headers else {}), "content": content}
+
+
+def example_components() -> dict[str, Any]:
+    """Return `components.examples`."""
+    return {code: {"summary": p.title, "value": p.model_dump()} for code, p in sorted(EXAMPLES.items())}

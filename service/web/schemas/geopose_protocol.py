@@ -1,0 +1,151 @@
+"""Open AR Cloud's GeoPoseProtocol: an AR client's words for "where am I", and the answer in the same words.
+
+One camera reading of a request is used: its image, and its camera's parameters (COLMAP's models). A scene is
+chosen by the request's geolocation, or it is the only one that has a place on Earth. What the protocol has
+besides (other sensors, prior poses) is accepted and not used.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from service.errors import InvalidIntrinsics, InvalidRequest, NoGeoAnchor
+from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
+from service.scene_manager.manager import Entry
+from service.types import GeoAnchor
+from service.web.schemas.responses import GeoPose, Model, Result
+
+_EARTH_M = 6_371_000.0
+
+
+class _Foreign(BaseModel):
+    """Of a protocol that is not ours: what we don't know is ignored."""
+
+    model_config = ConfigDict(use_attribute_docstrings=True, extra="ignore")
+
+
+class CameraParams(_Foreign):
+    model: str | None = None
+    """COLMAP's name."""
+    modelParams: list[float] = Field(default_factory=list)
+
+
+class CameraReading(_Foreign):
+    imageBytes: str
+    """base64 of a JPEG, PNG, WebP or HEIC file."""
+    size: list[int] = Field(default_factory=list)
+    """Width and height, for `params`."""
+    params: CameraParams | None = None
+    sensorId: str = ""
+
+
+class GeolocationReading(_Foreign):
+    latitude: float = Field(ge=-90, le=90)
+    longitude: float = Field(ge=-180, le=180)
+
+
+class SensorReadings(_Foreign):
+    cameraReadings: list[CameraReading] = Field(default_factory=list, max_length=16)
+    geolocationReadings: list[GeolocationReading] = Field(default_factory=list, max_length=1000)
+
+
+class GeoPoseRequest(_Foreign):
+    id: str = Field(default="", max_length=200)
+    timestamp: float = 0.0
+    """Milliseconds since 1970."""
+    type: str = "geopose"
+    sensorReadings: SensorReadings
+
+
+class GeoPoseAccuracy(Model):
+    position: float
+    """Metres, mean of the components."""
+    orientation: float
+    """Degrees, mean of the three angles."""
+
+
+class GeoPoseResponse(Model):
+    id: str
+    """The request's."""
+    timestamp: int
+    """Milliseconds since 1970."""
+    accuracy: GeoPoseAccuracy | None
+    type: str = "geopose"
+    geopose: GeoPose
+
+
+def image_of(request: GeoPoseRequest) -> tuple[bytes, dict[str, Any] | None]:
+    """Return the image file and its intrinsics, if they were sent. Raises InvalidRequest, InvalidIntrinsics."""
+    if not request.sensorReadings.cameraReadings:
+        raise InvalidRequest("at least one is required.", where="sensorReadings.cameraReadings")
+    reading = request.sensorReadings.cameraReadings[0]
+    try:
+        data = base64.b64decode(reading.imageBytes, validate=True)
+    except ValueError as error:
+        raise InvalidRequest(f"not base64: {error}.", where="cameraReadings.0.imageBytes") from error
+    return data, _intrinsics(reading)
+
+
+def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
+    params = reading.params
+    if params is None or not params.modelParams or params.model in (None, "UNKNOWN", "UNKNOWN_CAMERA"):
+        return None
+    where = "cameraReadings.0.params"
+    if params.model not in DISTORTION_COUNTS:
+        raise InvalidIntrinsics(f"there is no camera model {str(params.model)[:40]!r}.", where=f"{where}.model")
+    focals = 1 if params.model in ONE_FOCAL else 2
+    expected = focals + 2 + DISTORTION_COUNTS[params.model]
+    if len(params.modelParams) != expected or len(reading.size) != 2:
+        raise InvalidIntrinsics(
+            f"{params.model} has {expected} parameters, and needs `size`.", where=f"{where}.modelParams"
+        )
+    values, (width, height) = params.modelParams, reading.size
+    return {
+        **{"model": params.model, "width": width, "height": height, "fx": values[0], "fy": values[focals - 1]},
+        **{"cx": values[focals], "cy": values[focals + 1], "distortion": values[focals + 2 :]},
+    }
+
+
+def nearest_scene(entries: Sequence[Entry], request: GeoPoseRequest) -> str:
+    """Return the scene to look in. Raises NoGeoAnchor."""
+    anchored = [(e.id, e.loaded.scene.info.geo_anchor) for e in entries if e.loaded]
+    places = {scene_id: anchor for scene_id, anchor in anchored if anchor}
+    readings = request.sensorReadings.geolocationReadings
+    if len(places) == 1:
+        return next(iter(places))
+    if not places or not readings:
+        told = "no scene in memory has a place on Earth" if not places else "several scenes have a place on Earth"
+        raise NoGeoAnchor(f"{told}.", where="scene", hint="Name one (?scene=ID), or send a geolocation reading.")
+    return min(places, key=lambda scene_id: _distance_m(places[scene_id], readings[-1]))
+
+
+def _distance_m(anchor: GeoAnchor, reading: GeolocationReading) -> float:
+    """Along the sphere (haversine): near enough to tell which scene is nearer."""
+    lat_a, lon_a, lat_b, lon_b = map(
+        math.radians, (anchor.latitude_deg, anchor.longitude_deg, reading.latitude, reading.longitude)
+    )
+    half = math.sin((lat_b - lat_a) / 2) ** 2
+    half += math.cos(lat_a) * math.cos(lat_b) * math.sin((lon_b - lon_a) / 2) ** 2
+    return 2 * _EARTH_M * math.asin(math.sqrt(min(1.0, half)))
+
+
+def response_of(request: GeoPoseRequest, result: Result, anchor: GeoAnchor) -> GeoPoseResponse:
+    """Answer in the protocol's words; `result` has a geopose."""
+    assert result.geopose
+    accuracy = None
+    if result.covariance is not None:
+        variance = np.diag(np.array(result.covariance.matrix))
+        metres = float(np.cbrt(np.linalg.det(anchor.enu_from_world[:3, :3])))
+        accuracy = GeoPoseAccuracy(
+            position=metres * float(np.sqrt(variance[3:].mean())),
+            orientation=float(np.degrees(np.sqrt(variance[:3].mean()))),
+        )
+    now = int(1000 * time.time())
+    return GeoPoseResponse(id=request.id, timestamp=now, accuracy=accuracy, geopose=result.geopose)
