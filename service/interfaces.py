@@ -62,13 +62,14 @@ class Rasterizer(Protocol):
     def render(
         self,
         cameras: Sequence[Camera],
-        roughly: bool = False,
-        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+        approximate: bool = False,
+        occlusion_depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
     ) -> list[Frame]:
         """Render several cameras; independent ones may use idle cores.
 
-        A rough picture may lack what is behind nearly opaque surfaces, up to 3 % of a pixel's light. A horizon is a
-        coarse image, for each camera one, of the z-depths beyond which nothing need be drawn.
+        An `approximate` image may lack what is behind nearly opaque surfaces, up to 3 % of a pixel's light. Of
+        `occlusion_depths`, one coarse image for each camera, every pixel is a z-depth beyond which nothing need be
+        rendered.
         """
         ...
 

@@ -45,7 +45,7 @@ class FlatRasterizer(Rasterizer):
     def trained_at(self, long_side_px):
         return self
 
-    def render(self, cameras, **roughly):
+    def render(self, cameras, **options):
         sizes = [(c.intrinsics.height, c.intrinsics.width) for c in cameras]
         flat = [np.full(size, 0.5, np.float32) for size in sizes]
         return [Frame(np.stack([f, f, f], 2), f, f, f) for f in flat]

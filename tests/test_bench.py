@@ -130,7 +130,7 @@ def estimate(pose: Pose, status=Status.LOCALIZED) -> PoseEstimate:
 class FakeRasterizer:
     name = "fake"
 
-    def render(self, cameras, **roughly):
+    def render(self, cameras, **options):
         flat = [np.full((c.intrinsics.height, c.intrinsics.width), 2.0, np.float32) for c in cameras]
         return [Frame(np.repeat(f[:, :, None], 3, 2), f, f, f) for f in flat]
 
@@ -547,7 +547,7 @@ class TestRoom:
             def __init__(self, scene):
                 assert scene.info.training_focal_px == render_bench.room_cameras(16)[0].intrinsics.fx
 
-            def render(self, cameras, **roughly):
+            def render(self, cameras, **options):
                 self.camera = cameras[-1]
 
             def pose_gradient(self, camera, d_rgb, d_depth=None, d_alpha=None):

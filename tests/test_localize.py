@@ -34,7 +34,7 @@ class Nothing:
         self.assumed_px = long_side_px
         return self
 
-    def render(self, cameras: Sequence[Camera], **roughly: object) -> list[Frame]:
+    def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
         shape = (cameras[0].intrinsics.height, cameras[0].intrinsics.width)
         zero = np.zeros(shape, np.float32)
         return [Frame(np.zeros((*shape, 3), np.float32), zero, zero, zero) for _ in cameras]

@@ -181,7 +181,7 @@ def test_a_horizon_lies_behind_what_hides_and_nowhere_where_one_sees_through() -
 
 
 class Watched(CpuRasterizer):
-    """Keeps what it drew with horizons, and of how many Gaussians."""
+    """Keeps what it drew with occlusion depths, and of how many Gaussians."""
 
     def __init__(self, scene: GaussianScene) -> None:
         super().__init__(scene)
@@ -190,9 +190,9 @@ class Watched(CpuRasterizer):
     def of(self, scene: GaussianScene) -> CpuRasterizer:
         return CpuRasterizer(scene)
 
-    def render(self, cameras, roughly=False, horizons=None):
-        frames = super().render(cameras, roughly, horizons)
-        if horizons:
+    def render(self, cameras, approximate=False, occlusion_depths=None):
+        frames = super().render(cameras, approximate, occlusion_depths)
+        if occlusion_depths:
             self.drawn.append((frames[0].rgb, self._scratch().visible))
         return frames
 

@@ -53,7 +53,7 @@ class PaintedWalls:
     def trained_at(self, long_side_px: int) -> PaintedWalls:
         return self
 
-    def render(self, cameras: Sequence[Camera], **roughly: object) -> list[Frame]:
+    def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
         return [self._render(camera) for camera in cameras]
 
     def _render(self, camera: Camera) -> Frame:
@@ -220,7 +220,7 @@ def test_a_job_renders_and_describes_once() -> None:
     class Counting(PaintedWalls):
         renders = 0
 
-        def render(self, cameras: Sequence[Camera], **roughly: object) -> list[Frame]:
+        def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
             self.renders += 1
             return super().render(cameras)
 
@@ -557,7 +557,7 @@ def walls_with_cameras(monkeypatch: pytest.MonkeyPatch) -> GaussianScene:
 
 def test_the_index_is_the_same_from_the_cache(walls_with_cameras: GaussianScene, tmp_path: Path) -> None:
     class Refusing(PaintedWalls):
-        def render(self, cameras: Sequence[Camera], **roughly: object) -> list[Frame]:
+        def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
             raise AssertionError("the cache was not used")
 
     fresh = prepared_index(tools_for(scene=walls_with_cameras), tmp_path)
@@ -590,7 +590,7 @@ def test_another_scene_or_matcher_has_another_cache(walls_with_cameras: Gaussian
 
 def test_an_index_of_a_scene_without_features_is_empty_but_there() -> None:
     class Fog(PaintedWalls):
-        def render(self, cameras: Sequence[Camera], **roughly: object) -> list[Frame]:
+        def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
             return [Frame(np.full_like(f.rgb, 0.5), f.alpha, f.depth, f.depth) for f in super().render(cameras)]
 
     index = built_index([Camera(LENS, true_pose())], tools_for(Fog()))

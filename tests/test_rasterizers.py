@@ -114,14 +114,14 @@ def small_gaussians() -> GaussianScene:
 
 
 @pytest.mark.parametrize("depth", [1.0, 1.6, 2.2])
-def test_nothing_is_drawn_beyond_the_same_horizon_everywhere(depth):
+def test_nothing_is_drawn_beyond_a_uniform_occlusion_depth(depth):
     """Against the reference without what is farther; on the CPU, for a renderer need not leave anything out."""
     scene, camera = small_gaussians(), make_camera()
     z = scene.means @ camera.pose.camera_from_world[2, :3] + camera.pose.camera_from_world[2, 3]
     near = z <= depth
     fewer = {n: getattr(scene, n)[near] for n in ("means", "quats", "scales", "opacities", "sh")}
-    horizon = np.full((5, 7), depth, np.float32)
-    frame = CpuRasterizer(scene).render([camera], horizons=[horizon])[0]
+    depths = np.full((5, 7), depth, np.float32)
+    frame = CpuRasterizer(scene).render([camera], occlusion_depths=[depths])[0]
     truth = render_reference(replace(scene, **fewer), camera)
     assert (truth.alpha > 0.1).sum() > 200
     close(frame.rgb, truth.rgb)
@@ -131,28 +131,28 @@ def test_nothing_is_drawn_beyond_the_same_horizon_everywhere(depth):
 def test_an_open_tile_shows_everything():
     """The left half is open as far as there is something, the right half only to 0.5."""
     scene, camera = small_gaussians(), make_camera(96, 64)
-    horizon = np.full((8, 12), np.inf, np.float32)
-    horizon[:, 6:] = 0.5
-    frame = CpuRasterizer(scene).render([camera], horizons=[horizon])[0]
+    depths = np.full((8, 12), np.inf, np.float32)
+    depths[:, 6:] = 0.5
+    frame = CpuRasterizer(scene).render([camera], occlusion_depths=[depths])[0]
     truth = render_reference(scene, camera)
     close(frame.rgb[:, :48], truth.rgb[:, :48])
     assert np.abs(frame.rgb - truth.rgb.numpy())[:, 48:].mean() > 0.02
 
 
-def test_a_rough_picture_lacks_at_most_what_little_light_is_left(create):
-    """Three in a hundred of a pixel's light; and gradients are not those of a rough picture."""
+def test_an_approximate_image_lacks_at_most_what_little_light_is_left(create):
+    """Three in a hundred of a pixel's light; and gradients are not those of an approximate image."""
     scene = make_scene(3000)
     camera = make_camera()
     rasterizer = create(scene)
-    rough = rasterizer.render([camera], roughly=True)[0]
-    d_rgb = np.ones_like(rough.rgb)
-    after_rough = rasterizer.pose_gradient(camera, d_rgb)
+    approximate = rasterizer.render([camera], approximate=True)[0]
+    d_rgb = np.ones_like(approximate.rgb)
+    after_approximate = rasterizer.pose_gradient(camera, d_rgb)
     truth = render_reference(scene, camera)
-    assert np.all(rough.alpha > truth.alpha.numpy() - 0.031)
-    assert np.all(np.abs(rough.rgb - truth.rgb.numpy()) < 0.031 * max(1.0, float(truth.rgb.max())))
-    assert rasterizer.name != "cpu" or np.any(rough.alpha < truth.alpha.numpy() - 0.005)
+    assert np.all(approximate.alpha > truth.alpha.numpy() - 0.031)
+    assert np.all(np.abs(approximate.rgb - truth.rgb.numpy()) < 0.031 * max(1.0, float(truth.rgb.max())))
+    assert rasterizer.name != "cpu" or np.any(approximate.alpha < truth.alpha.numpy() - 0.005)
     rasterizer.render([camera])
-    assert np.allclose(after_rough, rasterizer.pose_gradient(camera, d_rgb), rtol=1e-6)
+    assert np.allclose(after_approximate, rasterizer.pose_gradient(camera, d_rgb), rtol=1e-6)
 
 
 def test_picture_equals_gsplats_projection_and_harmonics(create):

@@ -4,7 +4,7 @@ The steps are in `project` (ellipses and colours), `tiles` (depth order, tile li
 `backward` (gradients); `pack` has the memory layout. Semantics are gsplat's, with two additions: the 0.3 px^2
 screen-space dilation, right at the resolution the scene was trained at, is scaled by (f_render / f_train)^2, which
 takes the bias out of small renders; and whole blocks of 256 Gaussians outside 1.3 times the field of view are culled.
-Where asked, a picture ends early (`roughly`) and leaves out what lies beyond given depths (`horizons`).
+Where asked, a picture ends early (`approximate`) and leaves out what lies beyond given depths (`occlusion_depths`).
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ NEAR = 0.01
 """Scene units; gsplat's default."""
 ASSUMED_TRAINING_LONG_SIDE_PX = 1000
 """Where neither training cameras nor the manifest tell the resolution that a scene was trained at."""
-ROUGHLY = np.float32(0.03)
-"""Transmittance at which a rough picture ends; walls of trained scenes let about 0.01 through, too much for T_MIN."""
+APPROXIMATE_T_MIN = np.float32(0.03)
+"""Transmittance at which an approximate image ends: walls of trained scenes let 0.01 through, above T_MIN."""
 
-NO_HORIZONS = np.empty(0, np.float32)
+NO_OCCLUSION = np.empty(0, np.float32)
 
 _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
 
@@ -93,13 +93,13 @@ class CpuRasterizer:
     def render(
         self,
         cameras: Sequence[Camera],
-        roughly: bool = False,
-        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+        approximate: bool = False,
+        occlusion_depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
     ) -> list[Frame]:
-        enough = ROUGHLY if roughly else T_MIN
+        enough = APPROXIMATE_T_MIN if approximate else T_MIN
         if len(cameras) == 1:
-            return [self._render(cameras[0], enough, horizons[0] if horizons else None)]
-        return list(_POOL.map(self._render, cameras, repeat(enough), horizons or repeat(None)))
+            return [self._render(cameras[0], enough, occlusion_depths[0] if occlusion_depths else None)]
+        return list(_POOL.map(self._render, cameras, repeat(enough), occlusion_depths or repeat(None)))
 
     def pose_gradient(
         self,
@@ -139,11 +139,11 @@ class CpuRasterizer:
         return result
 
     def _render(
-        self, camera: Camera, enough: np.float32 = T_MIN, horizon: Float32[np.ndarray, "_ _"] | None = None
+        self, camera: Camera, enough: np.float32 = T_MIN, occlusion_depth: Float32[np.ndarray, "_ _"] | None = None
     ) -> Frame:
         s = self._scratch()
         s.camera = None  # an error on the way must not leave another camera's lists behind
-        self._bin(camera, s, horizon)
+        self._bin(camera, s, occlusion_depth)
         k = camera.intrinsics
         frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))
         blend(
@@ -153,7 +153,7 @@ class CpuRasterizer:
         )  # fmt: skip
         for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
             image.flags.writeable = False
-        if enough == T_MIN and horizon is None:  # no gradients of a rough picture
+        if enough == T_MIN and occlusion_depth is None:  # no gradients of an approximate image
             s.camera, s.info, s.frame = camera, self.scene.info, frame
         return frame
 
@@ -189,13 +189,13 @@ class CpuRasterizer:
         info = self.scene.info
         return np.float32(dilation_for(camera, info)), info.render_mode == "antialiased"
 
-    def _bin(self, camera: Camera, s: _Scratch, horizon: Float32[np.ndarray, "_ _"] | None) -> None:
+    def _bin(self, camera: Camera, s: _Scratch, occlusion_depth: Float32[np.ndarray, "_ _"] | None) -> None:
         """Project, sort and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
-        horizons = NO_HORIZONS if horizon is None else _of_tiles(horizon, k.width, k.height)
+        tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
         s.visible, count = project(
             packed.geometry, packed.sh, packed.spheres, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
-            *self._dilation(camera), np.float32(NEAR), horizons, s.records, s.depths, s.rects, s.local,
+            *self._dilation(camera), np.float32(NEAR), tile_depths, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:
@@ -212,14 +212,14 @@ def _view_and_lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return view, np.array([k.fx, k.fy, k.cx, k.cy], np.float32)
 
 
-def _of_tiles(horizon: Float32[np.ndarray, "h w"], width: int, height: int) -> Float32[np.ndarray, "_"]:
-    """Return the farthest horizon in each tile."""
+def _tile_maxima(occlusion_depth: Float32[np.ndarray, "h w"], width: int, height: int) -> Float32[np.ndarray, "_"]:
+    """Return the largest occlusion depth in each tile."""
     for axis, side in enumerate((height, width)):
-        ends = np.minimum(np.arange(0, side + TILE, TILE), side) * horizon.shape[axis] / side
+        ends = np.minimum(np.arange(0, side + TILE, TILE), side) * occlusion_depth.shape[axis] / side
         last = np.ceil(ends[1:]).astype(int) - 1
-        farthest = np.maximum.reduceat(horizon, ends[:-1].astype(int), axis)
-        horizon = np.maximum(farthest, np.take(horizon, last, axis))
-    return np.ascontiguousarray(horizon, np.float32).reshape(-1)
+        farthest = np.maximum.reduceat(occlusion_depth, ends[:-1].astype(int), axis)
+        occlusion_depth = np.maximum(farthest, np.take(occlusion_depth, last, axis))
+    return np.ascontiguousarray(occlusion_depth, np.float32).reshape(-1)
 
 
 def _flat(image: np.ndarray) -> np.ndarray:

@@ -101,8 +101,8 @@ class GsplatRasterizer:
     def render(
         self,
         cameras: Sequence[Camera],
-        roughly: bool = False,
-        horizons: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
+        approximate: bool = False,
+        occlusion_depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
     ) -> list[Frame]:
         groups: dict[tuple, list[int]] = defaultdict(list)
         for index, camera in enumerate(cameras):

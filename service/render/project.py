@@ -116,8 +116,8 @@ def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
 
 
 @inline
-def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, horizons):
-    """Whether a bounding sphere lies behind the horizons of all tiles that it may reach into."""
+def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, tile_depths):
+    """Whether a bounding sphere lies behind the occlusion depths of all tiles that it may reach into."""
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
     nearest, farthest = cz - radius, cz + radius
@@ -127,7 +127,7 @@ def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, horizons):
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
     x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, lens[0], lens[2], tiles_x)
     y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, lens[1], lens[3], tiles_y)
-    return hidden(nearest, x0, y0, x1, y1, tiles_x, horizons)
+    return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths)
 
 
 @inline
@@ -139,22 +139,22 @@ def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
 
 
 @inline
-def hidden(depth, x0, y0, x1, y1, tiles_x, horizons):
-    """Whether what is at this depth lies behind the horizons of all these tiles."""
+def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
+    """Whether what is at this depth lies behind the occlusion depths of all these tiles."""
     for ty in range(y0, y1):
         for tx in range(x0, x1):
-            if depth <= horizons[np.intp(ty * tiles_x + tx)]:
+            if depth <= tile_depths[np.intp(ty * tiles_x + tx)]:
                 return False
     return True
 
 
 @kernel
-def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, antialiased, near, horizons,
+def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, antialiased, near, tile_depths,
             records, depths, rects, scratch):  # fmt: skip
     """Write a record, a depth and a tile rectangle for every visible Gaussian; return (visible, tile entries).
 
-    `view`: camera_from_world, 12 floats row by row. `lens`: fx, fy, cx, cy. `horizons`: for each tile the depth beyond
-    which nothing is seen; empty: as far as there is something. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1
+    `view`: camera_from_world, 12 floats row by row. `lens`: fx, fy, cx, cy. `tile_depths`: for each tile the depth
+    beyond which nothing is seen; empty: unlimited. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1
     (ends excluded).
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -177,7 +177,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
     for block in range(spheres.shape[0]):
         if not in_view(spheres[block], view, fx, fy, low_x, high_x, low_y, high_y, near):
             continue
-        if len(horizons) and block_hidden(spheres[block], view, lens, near, tiles_x, tiles_y, horizons):
+        if len(tile_depths) and block_hidden(spheres[block], view, lens, near, tiles_x, tiles_y, tile_depths):
             continue
         for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
             at = chunk * 160
@@ -250,7 +250,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
                 if (mask >> np.uint32(lane)) & np.uint32(1):
                     x0, y0 = integers[512 + lane], integers[528 + lane]
                     x1, y1 = integers[544 + lane], integers[560 + lane]
-                    if len(horizons) and hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, horizons):
+                    if len(tile_depths) and hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, tile_depths):
                         continue
                     store(records, visible * 16, load(scratch, 256 + lane * 16))
                     depths[visible] = scratch[96 + lane]

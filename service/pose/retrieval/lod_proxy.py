@@ -65,8 +65,8 @@ class Rough:
         self._thinned = thinned(scene, rasterizer, rng) if scene.count > LARGE else None
 
     def render(self, camera: Camera) -> Frame:
-        horizons = None
+        depths = None
         if self._thinned:
             small = Camera(camera.intrinsics.with_long_side(GLANCE_PX), camera.pose)
-            horizons = [horizon(frame) for frame in self._thinned.render([small], roughly=True)]
-        return self._rasterizer.render([camera], roughly=True, horizons=horizons)[0]
+            depths = [horizon(frame) for frame in self._thinned.render([small], approximate=True)]
+        return self._rasterizer.render([camera], approximate=True, occlusion_depths=depths)[0]

@@ -174,7 +174,7 @@ class _Views:
 
     def add(self, cameras: Sequence[Camera]) -> None:
         nearest = NEAREST * self._space.distance
-        for camera, frame in zip(cameras, self._rasterizer.render(cameras, roughly=True), strict=True):
+        for camera, frame in zip(cameras, self._rasterizer.render(cameras, approximate=True), strict=True):
             height, width = frame.alpha.shape
             row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
             solid = _solid(frame, nearest)
