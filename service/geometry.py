@@ -129,6 +129,18 @@ def transformed(
     return points_in_source @ target_from_source[:3, :3].T + target_from_source[:3, 3]
 
 
+def reprojection_error_px(
+    photo_px: Float[np.ndarray, "m 2"],
+    points_in_world: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+    pose: Pose,
+) -> Float[np.ndarray, "m"]:
+    """Return the distances in pixels between observations and projected points; infinite behind the camera."""
+    points = transformed(pose.camera_from_world, points_in_world)
+    distance = np.linalg.norm(project(points, intrinsics) - photo_px, axis=1)
+    return np.where(points[:, 2] > 1e-9, distance, np.inf)
+
+
 def pose_distance(a: Pose, b: Pose) -> tuple[float, float]:
     """Return the angle in degrees and the distance of the camera centres in scene units."""
     rotation = a.world_from_camera[:3, :3].T @ b.world_from_camera[:3, :3]

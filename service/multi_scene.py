@@ -18,7 +18,7 @@ import numpy as np
 
 from service.interfaces import Tools
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request, localize
-from service.pose.absolute_pose.pnp import resection
+from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.views import PHOTO_PX, correspondences, photo_features
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top
@@ -102,6 +102,6 @@ def _support(query: Query, loaded: LoadedScene, quarter_turns: int, memo: dict[A
     most = 0
     for i in top(index.votes(photo.descriptors), VIEWS):
         matches = correspondences(photo, index.views[i], loaded.matcher)
-        agreed = resection(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, TRIALS)
+        agreed = estimate_absolute_pose(matches.photo_px, matches.points_in_world, query.intrinsics, pixels, TRIALS)
         most = max(most, agreed.num_inliers if agreed else 0)
     return most

@@ -25,7 +25,7 @@ from service.interfaces import Frame, RenderTally, Tools
 from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
 from service.photos.sequence import SequencePhoto
 from service.pose.features.views import known_at, photo_at, sized
-from service.pose.refinement.photometric import Evidence, align, evidence
+from service.pose.refinement.photometric import PoseUncertainty, pose_uncertainty, refine_photometric
 from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import clear, geometry_signals, judged, verify
 from service.render.counted import Counted
@@ -206,7 +206,7 @@ class _Aligned:
     seen: _Seen
     """From nearby."""
     loss: float
-    evidence: Evidence
+    uncertainty: PoseUncertainty
 
 
 def aligned_from(query: Query, expected: Pose, seen: _Seen | None, tools: Tools) -> _Aligned | None:
@@ -216,17 +216,17 @@ def aligned_from(query: Query, expected: Pose, seen: _Seen | None, tools: Tools)
     if seen is None or seen.size != (size.width, size.height):
         seen = _Seen.of(Camera(size, expected), tools)
     known = known_at(query, tools, size)
-    first = align(photo, seen.frame, seen.camera, Camera(size, expected), LEVELS, known=known)
+    first = refine_photometric(photo, seen.frame, seen.camera, Camera(size, expected), LEVELS, known=known)
     if not np.isfinite(first.loss):
         return None
     pose, weighed = first.pose, None
     for _ in range(ROUNDS):
         seen = _Seen.of(Camera(size, pose), tools)
-        weighed = evidence(photo, seen.frame, seen.camera, seen.camera, query.focal_sigma, known)
+        weighed = pose_uncertainty(photo, seen.frame, seen.camera, seen.camera, query.focal_sigma, known)
         if weighed is None:
             return None
-        pose = moved(pose, weighed.pull)
-        turn, way = np.linalg.norm(weighed.pull[:3]), np.linalg.norm(weighed.pull[3:])
+        pose = moved(pose, weighed.last_step)
+        turn, way = np.linalg.norm(weighed.last_step[:3]), np.linalg.norm(weighed.last_step[3:])
         if size.fx * (turn + way / seen.typical_depth) < SETTLED_PX:
             break
     return None if weighed is None else _Aligned(pose, seen, first.loss, weighed)
@@ -236,12 +236,12 @@ def glance(query: Query, found: _Aligned, tools: Tools) -> Verdict | None:
     """Judge a pose as the gate does, by the pixels alone: matches cost most; None where these don't make it clear."""
     size = found.seen.camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)
-    signals = appearance(photo, found.seen.frame, known) | geometry_signals(found.seen.frame, size, found.evidence)
+    signals = appearance(photo, found.seen.frame, known) | geometry_signals(found.seen.frame, size, found.uncertainty)
     if not clear(signals):
         return None
     # The last pull is in the pose already. A shared lens is not one photo's to doubt.
-    focal_pull = 0.0 if query.focal_sigma else found.evidence.focal_pull
-    return judged(signals, replace(found.evidence, pull=np.zeros(6), focal_pull=focal_pull), query.focal_sigma)
+    focal_step = 0.0 if query.focal_sigma else found.uncertainty.focal_step
+    return judged(signals, replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step), query.focal_sigma)
 
 
 @dataclass(slots=True)
@@ -274,10 +274,12 @@ class _SharedLens:
         photo = photo_at(query, tools, camera.intrinsics)
         start = Camera(camera.intrinsics, seen.pose)
         known = known_at(query, tools, camera.intrinsics)
-        found = align(photo, seen.seen.frame, camera, start, 1, NO_CORRECTION, query.focal_sigma, known)
+        found = refine_photometric(photo, seen.seen.frame, camera, start, 1, NO_CORRECTION, query.focal_sigma, known)
         if not np.isfinite(found.loss):
             return
         share = 1 / (self.photos + 1)  # of the principal point, whose mean is taken
-        step = IntrinsicsCorrection(found.lens.focal_factor, share * found.lens.shift_x, share * found.lens.shift_y)
-        sigma = float(np.sqrt(seen.evidence.covariance[6, 6]))
+        step = IntrinsicsCorrection(
+            found.correction.focal_factor, share * found.correction.shift_x, share * found.correction.shift_y
+        )
+        sigma = float(np.sqrt(seen.uncertainty.covariance[6, 6]))
         self.found(found.pose, self.lens.then(step), sigma)

@@ -9,7 +9,7 @@ from service.bench import ablation
 from service.bench.ablation import CONDITIONS, removals, run, table
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
-from service.pose.absolute_pose.pnp import Resection
+from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.views import Correspondences
 from service.pose.matching import search_stages as stages
 from service.types import Intrinsics, Query
@@ -34,7 +34,7 @@ def test_the_decoupled_solver_and_its_stand_in_find_the_planted_pose_among_wrong
     px = project(transformed(truth.camera_from_world, points.astype(np.float64)), LENS)
     px[:60] = rng.uniform(0, [512, 384], (60, 2))
     matches = Correspondences(px.astype(np.float32), px.astype(np.float32), points)
-    near = Resection(moved(truth, np.array([0.03, -0.02, 0.02, 0.1, 0.05, -0.1])), np.ones(200, bool))
+    near = AbsolutePose(moved(truth, np.array([0.03, -0.02, 0.02, 0.1, 0.05, -0.1])), np.ones(200, bool))
     query = Query(
         rgb=np.zeros((384, 512, 3), np.uint8), intrinsics=LENS, photo_intrinsics=LENS, intrinsics_source="given"
     )

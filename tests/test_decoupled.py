@@ -78,14 +78,14 @@ def test_the_two_gradients_are_decoupled_and_right() -> None:
     by_turn, by_shift = np.empty(3), np.empty(3)
     for i in range(3):
         step = 1e-6 * np.eye(3)[i]
-        ahead, back = (decoupled.turned_about(pose, CENTRE, sign * step) for sign in (1, -1))
+        ahead, back = (decoupled.rotate_about(pose, CENTRE, sign * step) for sign in (1, -1))
         by_turn[i] = (angle_loss(matched, ahead, weights)[0] - angle_loss(matched, back, weights)[0]) / 2e-6
-        ahead, back = (decoupled.shifted(pose, sign * step) for sign in (1, -1))
+        ahead, back = (decoupled.translate_in_camera(pose, sign * step) for sign in (1, -1))
         by_shift[i] = (length_loss(matched, ahead, weights)[0] - length_loss(matched, back, weights)[0]) / 2e-6
     assert np.allclose(angle_loss(matched, pose, weights)[1], by_turn, rtol=1e-4, atol=1e-7)
     assert np.allclose(length_loss(matched, pose, weights)[1], by_shift, rtol=1e-4, atol=1e-7)
     # What a solver does with a gradient: turning leaves the centre where it is seen, shifting leaves the axes.
-    turned, moved = decoupled.turned_about(pose, CENTRE, by_turn), decoupled.shifted(pose, by_shift)
+    turned, moved = decoupled.rotate_about(pose, CENTRE, by_turn), decoupled.translate_in_camera(pose, by_shift)
     seen = [transformed(p.camera_from_world, CENTRE[None]) for p in (pose, turned)]
     assert np.allclose(*seen, atol=1e-9)
     assert np.allclose(moved.world_from_camera[:3, :3], pose.world_from_camera[:3, :3])

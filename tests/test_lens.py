@@ -11,11 +11,11 @@ import pytest
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
 from service.photos.intrinsics import intrinsics_from
-from service.pose.absolute_pose.unknown_focal import focal_resection, linearized
+from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearized
 from service.pose.features.views import to_uint8
 from service.pose.refinement import covariance
 from service.pose.refinement import photometric as alignment
-from service.pose.refinement.photometric import align, evidence
+from service.pose.refinement.photometric import pose_uncertainty, refine_photometric
 from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose
 
@@ -36,9 +36,9 @@ def planted(
 @pytest.mark.parametrize("factor", [0.45, 0.8, 1.15, 2.2])
 def test_the_focal_length_is_found_among_wrong_matches(factor: float) -> None:
     px, points, pose = planted(3, IntrinsicsCorrection(factor), flat=False, wrong_share=0.4)
-    found = focal_resection(px, points, LENS, 0.5, 2.0)
+    found = absolute_pose_unknown_focal(px, points, LENS, 0.5, 2.0)
     assert found is not None
-    assert found.lens.focal_factor == pytest.approx(factor, rel=0.02)
+    assert found.correction.focal_factor == pytest.approx(factor, rel=0.02)
     angle, distance = pose_distance(found.pose, pose)
     assert angle < 1.5
     assert distance < 0.03 * 3.2
@@ -51,10 +51,10 @@ def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
     pose = Pose(np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0] * 4, [0] * 4, [0, 0, 0, 3.0], [0] * 4]))
     points = np.concatenate([rng.uniform(-1.2, 1.2, (100, 2)), np.zeros((100, 1))], 1)
     px = project(transformed(pose.camera_from_world, points), LENS.corrected(IntrinsicsCorrection(1.3)))
-    found = focal_resection(px, points, LENS, 0.1, 2.0)
+    found = absolute_pose_unknown_focal(px, points, LENS, 0.1, 2.0)
     assert found is not None
     assert found.num_inliers == 100
-    assert found.lens.focal_factor == pytest.approx(1.0, abs=0.05)
+    assert found.correction.focal_factor == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("column", range(9))
@@ -79,8 +79,8 @@ def test_alignment_finds_the_lens_with_the_pose() -> None:
     pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), NO_CORRECTION
     for _ in range(4):
         camera = Camera(LENS.corrected(found), pose)
-        result = align(rgb, PaintedWalls().render([camera])[0], camera, Camera(LENS, pose), 3, found, 0.5)
-        pose, found = result.pose, result.lens
+        result = refine_photometric(rgb, PaintedWalls().render([camera])[0], camera, Camera(LENS, pose), 3, found, 0.5)
+        pose, found = result.pose, result.correction
     assert found.focal_factor == pytest.approx(1.06, rel=0.004)
     assert found.shift_x == pytest.approx(0.008, abs=0.003)
     assert found.shift_y == pytest.approx(-0.005, abs=0.003)
@@ -119,10 +119,10 @@ def test_the_covariance_predicts_how_alignments_scatter(
     for _ in range(60):
         image = bent(frame.rgb, soft_px, rng) if soft_px else frame.rgb
         photo = to_uint8((image + rng.normal(0, noise, image.shape)).astype(np.float32))
-        pose = align(photo, frame, camera, camera, 1).pose
-        found = evidence(photo, frame, camera, Camera(LENS, pose), 0.0)
+        pose = refine_photometric(photo, frame, camera, camera, 1).pose
+        found = pose_uncertainty(photo, frame, camera, Camera(LENS, pose), 0.0)
         assert found is not None
-        assert np.abs(found.pull).max() < 2e-4  # a hundredth of a pixel; seen: 1.2e-4
+        assert np.abs(found.last_step).max() < 2e-4  # a hundredth of a pixel; seen: 1.2e-4
         assert np.linalg.eigvalsh(found.covariance).min() > 0
         twist = se3_log(pose.camera_from_world @ truth.world_from_camera)
         weighed.append(twist @ np.linalg.solve(found.covariance, twist))
@@ -164,9 +164,9 @@ def test_the_pull_tells_how_far_a_pose_is_off() -> None:
     truth = true_pose()
     off = np.array([0.004, -0.003, 0.002, 0.01, 0.005, -0.01])
     camera = Camera(LENS, moved(truth, off))
-    found = evidence(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 0.0)
+    found = pose_uncertainty(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 0.0)
     assert found is not None
-    assert np.allclose(found.pull, -off, atol=2e-3)
+    assert np.allclose(found.last_step, -off, atol=2e-3)
 
 
 @pytest.mark.parametrize("factor", [1.0, 1.05])
@@ -178,14 +178,14 @@ def test_another_focal_length_than_given_shows(factor: float) -> None:
     for _ in range(3):
         camera = Camera(LENS, pose)
         frame = PaintedWalls().render([camera])[0]
-        pose = align(rgb, frame, camera, camera, 3).pose
-    found = evidence(rgb, frame, camera, Camera(LENS, pose), 0.0)
+        pose = refine_photometric(rgb, frame, camera, camera, 3).pose
+    found = pose_uncertainty(rgb, frame, camera, Camera(LENS, pose), 0.0)
     assert found is not None
     if factor == 1.0:
-        assert abs(found.focal_pull) < 0.002
+        assert abs(found.focal_step) < 0.002
     else:
-        assert found.focal_pull > 0.02
-        assert found.focal_pull > found.focal_sigma
+        assert found.focal_step > 0.02
+        assert found.focal_step > found.focal_sigma
 
 
 def test_corrected_is_undone_by_nothing_but_its_opposite() -> None:

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.geometry import look_at, moved, pose_distance, project, transformed
+from service.geometry import look_at, moved, pose_distance, project, reprojection_error_px, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
-from service.pose.absolute_pose.pnp import reprojection_error_px, resection
+from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.views import (
     PHOTO_PX,
     correspondences,
@@ -26,7 +26,7 @@ from service.pose.features.views import (
     sized,
     to_uint8,
 )
-from service.pose.refinement.photometric import align
+from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.index import built_index, prepared_index
 from service.pose.retrieval.scores import top, vote
 from service.pose.retrieval.viewpoints import farthest_points, spread
@@ -138,7 +138,7 @@ def test_resection_finds_the_planted_pose_among_wrong_matches(seed: int, wrong_s
     px = project(transformed(pose.camera_from_world, points), LENS)
     wrong = rng.random(150) < wrong_share
     px[wrong] += rng.uniform(20, 90, (wrong.sum(), 2)) * rng.choice([-1, 1], (wrong.sum(), 2))
-    found = resection(px, points, LENS, 3.0, 2000)
+    found = estimate_absolute_pose(px, points, LENS, 3.0, 2000)
     assert found is not None
     angle, distance = pose_distance(found.pose, pose)
     assert angle < 1e-3  # exact data: seen 1e-6
@@ -148,9 +148,9 @@ def test_resection_finds_the_planted_pose_among_wrong_matches(seed: int, wrong_s
 
 
 def test_resection_of_too_few_or_no_agreeing_points_is_none() -> None:
-    assert resection(np.zeros((3, 2)), np.zeros((3, 3)), LENS, 4.0, 100) is None
+    assert estimate_absolute_pose(np.zeros((3, 2)), np.zeros((3, 3)), LENS, 4.0, 100) is None
     rng = np.random.default_rng(0)
-    found = resection(rng.uniform(0, 150, (40, 2)), rng.normal(size=(40, 3)), LENS, 0.01, 100)
+    found = estimate_absolute_pose(rng.uniform(0, 150, (40, 2)), rng.normal(size=(40, 3)), LENS, 0.01, 100)
     assert found is None or found.num_inliers < 8
 
 
@@ -286,7 +286,7 @@ def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
     pose = moved(truth, offset)
     for _ in range(2):
         camera = Camera(LENS, pose)
-        result = align(query.rgb, PaintedWalls().render([camera])[0], camera, camera, 3)
+        result = refine_photometric(query.rgb, PaintedWalls().render([camera])[0], camera, camera, 3)
         pose = result.pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.06  # seen: 0.01 to 0.03; the board's edge is not antialiased
@@ -297,7 +297,7 @@ def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
 def test_alignment_at_the_truth_stays_there() -> None:
     truth = true_pose()
     camera = Camera(LENS, truth)
-    result = align(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 2)
+    result = refine_photometric(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 2)
     angle, distance = pose_distance(result.pose, truth)
     assert angle < 0.003  # the photo's 8 bits: seen 0.0005
     assert distance < 0.0003
@@ -310,7 +310,7 @@ def test_alignment_ignores_what_a_fifth_of_the_photo_hides() -> None:
     pose = moved(truth, np.array([0.01, -0.008, 0.01, 0.03, -0.02, 0.02]))
     for _ in range(2):
         camera = Camera(LENS, pose)
-        pose = align(rgb, PaintedWalls().render([camera])[0], camera, camera, 3).pose
+        pose = refine_photometric(rgb, PaintedWalls().render([camera])[0], camera, camera, 3).pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.4  # seen: 0.17
     assert distance < 0.03  # of 3.2
@@ -321,7 +321,10 @@ def test_alignment_starts_from_any_pose_near_the_render() -> None:
     truth = true_pose(4)
     camera = Camera(LENS, moved(truth, np.array([0.01, 0.01, 0, 0.02, 0, 0])))
     frame = PaintedWalls().render([camera])[0]
-    a, b = (align(photo_from(truth).rgb, frame, camera, Camera(LENS, start), 3).pose for start in (camera.pose, truth))
+    a, b = (
+        refine_photometric(photo_from(truth).rgb, frame, camera, Camera(LENS, start), 3).pose
+        for start in (camera.pose, truth)
+    )
     angle, distance = pose_distance(a, b)
     assert angle < 0.01
     assert distance < 0.001
@@ -349,7 +352,9 @@ def test_alignment_sees_through_the_look_of_a_photo(spoil: str) -> None:
     pose = moved(truth, np.array([0.02, -0.02, 0.01, 0.03, 0.03, 0.06]))
     for _ in range(2):
         camera = Camera(lens, pose)
-        pose = align(to_uint8(rgb), PaintedWalls().render([camera])[0], camera, camera, 3, known=known).pose
+        pose = refine_photometric(
+            to_uint8(rgb), PaintedWalls().render([camera])[0], camera, camera, 3, known=known
+        ).pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.1
     assert distance < 0.006
@@ -359,9 +364,9 @@ def test_alignment_without_overlap_has_infinite_loss() -> None:
     camera = Camera(LENS, true_pose())
     frame = PaintedWalls().render([camera])[0]
     away = moved(camera.pose, np.array([0.0, 2.5, 0, 0, 0, 0]))
-    assert align(photo_from(true_pose()).rgb, frame, camera, Camera(LENS, away), 2).loss == np.inf
+    assert refine_photometric(photo_from(true_pose()).rgb, frame, camera, Camera(LENS, away), 2).loss == np.inf
     empty = Frame(frame.rgb, 0 * frame.alpha, 0 * frame.depth, 0 * frame.depth)
-    assert align(photo_from(true_pose()).rgb, empty, camera, camera, 2).loss == np.inf
+    assert refine_photometric(photo_from(true_pose()).rgb, empty, camera, camera, 2).loss == np.inf
 
 
 # --- the gate

@@ -13,7 +13,7 @@ from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
-from service.pose.absolute_pose.prior_region import admits, excess, loosened
+from service.pose.absolute_pose.prior_region import distance_outside, inside_prior, widened_prior
 from service.results import PoseEstimate, Reason, Status
 from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion
 
@@ -103,18 +103,18 @@ def test_regions_end_where_they_say() -> None:
     box = BoxPrior(np.zeros(3), np.array([1.0, 2.0, 3.0]))
     inside, outside = np.eye(4), np.eye(4)
     inside[:3, 3], outside[:3, 3] = [0.5, 2.0, 0.0], [1.3, 2.4, 1.0]
-    assert admits(box, Pose(inside))
-    assert excess(box, Pose(outside)) == pytest.approx(0.5)
-    assert admits(None, Pose(outside))
+    assert inside_prior(box, Pose(inside))
+    assert distance_outside(box, Pose(outside)) == pytest.approx(0.5)
+    assert inside_prior(None, Pose(outside))
     # 99.9 % of a chi-square with 6 degrees of freedom, by drawn twists.
     covariance = np.diag(np.repeat([0.01, 0.2], 3) ** 2)
     covariance[0, 4] = covariance[4, 0] = 0.0015
     region = GaussianPosePrior(TRUTH, covariance)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 4_000)
-    kept = np.mean([admits(region, moved(TRUTH, twist)) for twist in draws])
+    kept = np.mean([inside_prior(region, moved(TRUTH, twist)) for twist in draws])
     assert kept == pytest.approx(0.999, abs=0.0015)  # three standard deviations
-    assert not admits(gaussian_at(TRUTH, 1, 1), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
-    assert admits(loosened(gaussian_at(TRUTH, 1, 1), 1.0), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
+    assert not inside_prior(gaussian_at(TRUTH, 1, 1), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
+    assert inside_prior(widened_prior(gaussian_at(TRUTH, 1, 1), 1.0), moved(TRUTH, np.array([0.1, 0, 0, 0, 0, 0])))
 
 
 @pytest.mark.parametrize("corners", [([0, 0, 0], [1, 1, 0]), ([0, 0, np.nan], [1, 1, 1])])

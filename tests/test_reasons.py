@@ -15,7 +15,7 @@ from service.estimators.view_index import Options
 from service.geometry import look_at
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
-from service.pose.refinement.photometric import align
+from service.pose.refinement.photometric import refine_photometric
 from service.pose.verification.gate import verify
 from service.pose.verification.mirror_images import mirrored
 from service.results import HINTS, Reason, Status, Verdict
@@ -85,7 +85,7 @@ def with_a_wrong_lens(room: LoadedScene) -> tuple[Query, Pose]:
     lens, pose = replace(LENS, fx=1.04 * LENS.fx, fy=1.04 * LENS.fy), TRUTH
     for _ in range(3):
         camera = Camera(lens, pose)
-        pose = align(query.rgb, room.rasterizer.render([camera])[0], camera, camera, 2).pose
+        pose = refine_photometric(query.rgb, room.rasterizer.render([camera])[0], camera, camera, 2).pose
     return replace(query, intrinsics=lens, photo_intrinsics=lens), pose
 
 

@@ -21,7 +21,7 @@ from service.bench.metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose.absolute_pose.pnp import Resection
+from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.views import Correspondences
 from service.pose.matching import search_stages as stages
 from service.pose.refinement import photometric as alignment
@@ -185,8 +185,8 @@ def _upright(upright: Any, query: Any, tools: Any) -> Any:
     return upright
 
 
-def _as_found(found: Resection, query: Any, tools: Any) -> Iterator[IterationRecord]:
-    yield IterationRecord("refine", found.pose, found.lens, num_inliers=found.num_inliers)
+def _as_found(found: AbsolutePose, query: Any, tools: Any) -> Iterator[IterationRecord]:
+    yield IterationRecord("refine", found.pose, found.correction, num_inliers=found.num_inliers)
 
 
 def _without_look(columns: np.ndarray, *others: Any) -> np.ndarray:
@@ -228,7 +228,7 @@ def _nothing(*others: Any) -> Iterator[IterationRecord]:
     return iter(())
 
 
-def _resected_again(near: Resection, matches: Correspondences, query: Query) -> Resection | None:
+def _resected_again(near: AbsolutePose, matches: Correspondences, query: Query) -> AbsolutePose | None:
     """Solve the matches with a render at a pose as if they were with a view, where the lens is known."""
     if query.focal_sigma:
         return _SOLVED_NEAR(near, matches, query)

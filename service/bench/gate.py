@@ -35,7 +35,7 @@ from service.localize import Request, localize
 from service.photos.images import encode_image, read_query, resized
 from service.pose.features.views import photo_at, rendered_frame
 from service.pose.matching.search_stages import GOOD_MATCH
-from service.pose.refinement.photometric import align
+from service.pose.refinement.photometric import refine_photometric
 from service.pose.verification.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
 from service.pose.verification.mirror_images import mirrored
 from service.results import Reason, Status, Verdict
@@ -147,7 +147,7 @@ def _of_photo(
         frame, camera = rendered_frame(pose, query, tools)
         size = camera.intrinsics
         start = Camera(query.intrinsics.resized(size.width, size.height), pose)
-        found = align(photo_at(query, tools, size), frame, camera, start, 2)
+        found = refine_photometric(photo_at(query, tools, size), frame, camera, start, 2)
         if np.isfinite(found.loss):
             verdict = verify(query, found.pose, _tools(one))
             yield _sample(one, "drifted", photo.name, photo.camera.pose, found.pose, verdict)

@@ -22,7 +22,7 @@ from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
-from service.pose.refinement.photometric import align
+from service.pose.refinement.photometric import refine_photometric
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
@@ -60,7 +60,7 @@ def warm() -> None:
     frame = rasterizer.render([camera])[0]
     rasterizer.pose_gradient(camera, frame.rgb)
     rasterizer.scene_gradients(camera, frame.rgb)
-    align((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera, 2)
+    refine_photometric((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera, 2)
 
 
 def processor() -> str:

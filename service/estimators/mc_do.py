@@ -26,7 +26,7 @@ import numpy as np
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Rasterizer, Tools
-from service.pose.absolute_pose.decoupled import MatchedPoints, Solved, gradient_solve, least_squares_solve
+from service.pose.absolute_pose.decoupled import DecoupledSolution, MatchedPoints, gradient_solve, least_squares_solve
 from service.pose.descent.contribution_pruning import contributions, pruned
 from service.pose.descent.gradient_descent import refine, require_within
 from service.pose.descent.hypotheses import around
@@ -136,7 +136,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
 @dataclass(frozen=True, slots=True)
 class _Hypothesis:
     pose: Pose
-    solved: Solved | None
+    solved: DecoupledSolution | None
 
     @property
     def support(self) -> float:
@@ -216,7 +216,7 @@ def _descended(start: Pose, query: Query, tools: Tools, options: Options) -> Ite
 
 def _solved(
     matches: Correspondences, pose: Pose, query: Query, tools: Tools, gradient_round: int | None
-) -> Solved | None:
+) -> DecoupledSolution | None:
     """Solve one render's matches; None where they are too few."""
     if len(matches.photo_px) < 6:
         return None
@@ -231,7 +231,9 @@ def _solved(
     return gradient_solve(matched, pose, gradient_round)
 
 
-def _record(stage: str, pose: Pose, matches: Correspondences, solved: Solved | None, view: View) -> IterationRecord:
+def _record(
+    stage: str, pose: Pose, matches: Correspondences, solved: DecoupledSolution | None, view: View
+) -> IterationRecord:
     inlier = solved.weights >= 0.5 if solved else np.zeros(len(matches.photo_px), bool)
     loss = -solved.support if solved else None
     return match_record(stage, pose, matches, inlier, view.camera, loss)

@@ -25,7 +25,7 @@ import numpy as np
 
 from service.errors import InvalidOptions
 from service.interfaces import Tools
-from service.pose.absolute_pose.pnp import Resection
+from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
 from service.pose.features.views import (
     MATCH_ERROR_PX,
@@ -214,7 +214,7 @@ class _Hunt:
             self.tools.prepared.views, self.sight.votes(self.query, self.tools), self.tools.matcher, pixels,
         )  # fmt: skip
         for rival in suspected:
-            rival, last = replace(rival, lens=self.answer.lens), None
+            rival, last = replace(rival, correction=self.answer.lens), None
             first = next(aligned(rival, self.query, self.tools), None)
             if first is None or (first.loss or 0.0) > OUT_OF_QUESTION * (self.answer.loss or np.inf):
                 continue
@@ -263,7 +263,7 @@ def _searches(
 def _from_prior(query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Align from the prior pose, which may be some ten degrees off; end early where nothing fits."""
     assert query.prior is not None
-    for record in aligned(Resection(query.prior, np.zeros(0, bool)), query, tools):
+    for record in aligned(AbsolutePose(query.prior, np.zeros(0, bool)), query, tools):
         if (record.loss or 0.0) > MISFIT:
             return
         yield replace(record, num_inliers=None)
@@ -316,7 +316,7 @@ def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationReco
     votes = sight.votes(query, tools)
     poses = poses_near_views(index.views, votes, -0.25 * np.pi * sight.eighths, SAMPLES, tools.rng)
     lens = sized(query.intrinsics, SAMPLE_PX)
-    best: Resection | None = None
+    best: AbsolutePose | None = None
     for pose in poses:
         matches, view = render_and_match(Camera(lens, pose), tools.rasterizer, query, tools)
         found = resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)

@@ -48,7 +48,7 @@ MAX_ANGLE_VECTORS = 200
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
+class DecoupledSolution:
     pose: Pose
     weights: Float64[np.ndarray, "n"]
     """0..1, of the matches at the pose; a half or more is an inlier."""
@@ -79,7 +79,7 @@ class MatchedPoints:
         return self.intrinsics.long_side / 512
 
 
-def turned_about(pose: Pose, centre_in_world: Float64[np.ndarray, "3"], turn: Float64[np.ndarray, "3"]) -> Pose:
+def rotate_about(pose: Pose, centre_in_world: Float64[np.ndarray, "3"], turn: Float64[np.ndarray, "3"]) -> Pose:
     """Carry the camera about the centre by a rotation vector given in its own axes."""
     matrix = pose.world_from_camera.copy()
     rotation = matrix[:3, :3] @ so3_exp(turn)
@@ -90,14 +90,14 @@ def turned_about(pose: Pose, centre_in_world: Float64[np.ndarray, "3"], turn: Fl
     return Pose(matrix)
 
 
-def shifted(pose: Pose, shift: Float64[np.ndarray, "3"]) -> Pose:
+def translate_in_camera(pose: Pose, shift: Float64[np.ndarray, "3"]) -> Pose:
     """Move the camera along its own axes."""
     matrix = pose.world_from_camera.copy()
     matrix[:3, 3] += matrix[:3, :3] @ shift
     return Pose(matrix)
 
 
-def least_squares_solve(matched: MatchedPoints, start: Pose, steps: int = INNER_STEPS) -> Solved:
+def least_squares_solve(matched: MatchedPoints, start: Pose, steps: int = INNER_STEPS) -> DecoupledSolution:
     """Alternate the rotation's and the translation's least-squares step; see the module."""
     pose, scale = start, np.inf
     for _ in range(steps):
@@ -105,12 +105,12 @@ def least_squares_solve(matched: MatchedPoints, start: Pose, steps: int = INNER_
         weights, scale = _robust(vectors, scale, matched.px, about_median=True)
         turn = _centred_step(turning, vectors, weights)
         length = float(np.linalg.norm(turn))
-        pose = turned_about(pose, matched.centre_in_world, turn * min(1.0, MAX_TURN_RAD / max(length, 1e-9)))
+        pose = rotate_about(pose, matched.centre_in_world, turn * min(1.0, MAX_TURN_RAD / max(length, 1e-9)))
         vectors, _, shifting = _linearized(matched, pose)
         weights, _ = _robust(vectors, scale, matched.px, about_median=False)
-        pose = shifted(pose, _step(shifting, vectors, weights))
+        pose = translate_in_camera(pose, _step(shifting, vectors, weights))
     vectors, _, _ = _linearized(matched, pose)
-    return Solved(pose, _weights(vectors, AGREEMENT_PX * matched.px))
+    return DecoupledSolution(pose, _weights(vectors, AGREEMENT_PX * matched.px))
 
 
 def _linearized(
@@ -200,7 +200,7 @@ def length_loss(
     return float(share @ np.sum(vectors**2, 1)), -2.0 * np.einsum("n,ni,nij->j", share, vectors, shifting)
 
 
-def gradient_solve(matched: MatchedPoints, start: Pose, round_number: int = 0) -> Solved:
+def gradient_solve(matched: MatchedPoints, start: Pose, round_number: int = 0) -> DecoupledSolution:
     """Descend both losses, each by its own motion; the rate falls from one render to the next."""
     distance = float(np.linalg.norm(start.position_in_world - matched.centre_in_world))
     rate = GRADIENT_RATE * GRADIENT_DECAY**round_number
@@ -212,7 +212,7 @@ def gradient_solve(matched: MatchedPoints, start: Pose, round_number: int = 0) -
         length = np.linalg.norm(vectors, axis=1)
         _, by_turn = angle_loss(matched, pose, sound * length / (length + SHORT_PX * matched.px))
         _, by_shift = length_loss(matched, pose, sound.astype(float))
-        pose = turned_about(pose, matched.centre_in_world, -turner.step(by_turn))
-        pose = shifted(pose, -shifter.step(by_shift))
+        pose = rotate_about(pose, matched.centre_in_world, -turner.step(by_turn))
+        pose = translate_in_camera(pose, -shifter.step(by_shift))
     vectors, _, _ = _linearized(matched, pose)
-    return Solved(pose, _weights(vectors, AGREEMENT_PX * matched.px))
+    return DecoupledSolution(pose, _weights(vectors, AGREEMENT_PX * matched.px))

@@ -8,17 +8,16 @@ import numpy as np
 import poselib
 from jaxtyping import Bool, Float
 
-from service.geometry import project, transformed
 from service.types import NO_CORRECTION, Intrinsics, IntrinsicsCorrection, Pose
 
 MIN_POINTS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Resection:
+class AbsolutePose:
     pose: Pose
     inlier: Bool[np.ndarray, "m"]
-    lens: IntrinsicsCorrection = NO_CORRECTION
+    correction: IntrinsicsCorrection = NO_CORRECTION
     """Beside the intrinsics that were given."""
 
     @property
@@ -26,13 +25,13 @@ class Resection:
         return int(self.inlier.sum())
 
 
-def resection(
+def estimate_absolute_pose(
     photo_px: Float[np.ndarray, "m 2"],
     points_in_world: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
     max_error_px: float,
     max_trials: int,
-) -> Resection | None:
+) -> AbsolutePose | None:
     """Return the pose that most of the matches agree with, refined on them; None if there is none.
 
     Matches come surest first: the sampler begins with those (PROSAC, Chum and Matas, CVPR 2005). Without that, 500
@@ -63,16 +62,4 @@ def resection(
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = found.R.T
     world_from_camera[:3, 3] = -found.R.T @ found.t
-    return Resection(Pose(world_from_camera), np.array(info["inliers"], bool))
-
-
-def reprojection_error_px(
-    photo_px: Float[np.ndarray, "m 2"],
-    points_in_world: Float[np.ndarray, "m 3"],
-    intrinsics: Intrinsics,
-    pose: Pose,
-) -> Float[np.ndarray, "m"]:
-    """Return the distances in pixels; infinite for points behind the camera."""
-    points = transformed(pose.camera_from_world, points_in_world)
-    distance = np.linalg.norm(project(points, intrinsics) - photo_px, axis=1)
-    return np.where(points[:, 2] > 1e-9, distance, np.inf)
+    return AbsolutePose(Pose(world_from_camera), np.array(info["inliers"], bool))

@@ -13,12 +13,12 @@ LOOSE_DEG, LOOSE_SHARE = 3.0, 0.05
 """How far a pose may be off before it is aligned: per axis, and as a share of the distance to what is seen."""
 
 
-def admits(region: PriorRegion | None, pose: Pose) -> bool:
+def inside_prior(region: PriorRegion | None, pose: Pose) -> bool:
     """Tell whether the region holds the pose; no region holds all."""
-    return region is None or excess(region, pose) <= 0.0
+    return region is None or distance_outside(region, pose) <= 0.0
 
 
-def excess(region: PriorRegion, pose: Pose) -> float:
+def distance_outside(region: PriorRegion, pose: Pose) -> float:
     """Return how far the pose is outside, 0 inside: of a box in scene units, of a Gaussian in standard deviations."""
     if isinstance(region, BoxPrior):
         position = pose.position_in_world
@@ -29,7 +29,7 @@ def excess(region: PriorRegion, pose: Pose) -> float:
     return max(float(np.sqrt(squared) - np.sqrt(LIMIT)), 0.0)
 
 
-def loosened(region: PriorRegion | None, distance: float) -> PriorRegion | None:
+def widened_prior(region: PriorRegion | None, distance: float) -> PriorRegion | None:
     """Return the region for poses that are not aligned yet; `distance` (scene units) is that to what is seen."""
     slack = LOOSE_SHARE * distance
     if region is None:

@@ -1,4 +1,4 @@
-"""Resection with an approximate lens: the focal length is searched along one dimension, then all is refined.
+"""AbsolutePose with an approximate lens: the focal length is searched along one dimension, then all is refined.
 
 A minimal solver for pose and focal length fails on the planes that rooms are made of, so the focal length is searched
 in steps: a robust resection at each, the best of them refined together with focal length and principal point. What is
@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float, Float64
 
-from service.geometry import se3_exp, transformed
-from service.pose.absolute_pose.pnp import Resection, reprojection_error_px, resection
+from service.geometry import reprojection_error_px, se3_exp, transformed
+from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.types import Intrinsics, IntrinsicsCorrection, Pose
 
 CENTRE_SIGMA = 0.007
@@ -34,21 +34,21 @@ ROUNDS = 10
 SETTLED = 1e-6
 
 
-def focal_resection(
+def absolute_pose_unknown_focal(
     photo_px: Float[np.ndarray, "m 2"],
     points_in_world: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
     focal_sigma: float,
     max_error_px: float,
-) -> Resection | None:
+) -> AbsolutePose | None:
     """Return the pose, with its lens, that most of the matches agree with."""
     steps = int(np.ceil(REACH * focal_sigma / STEP))
-    found: list[Resection] = []
+    found: list[AbsolutePose] = []
     for log_focal in STEP * np.arange(-steps, steps + 1):
         lens = IntrinsicsCorrection(float(np.exp(log_focal)))
         camera = intrinsics.corrected(lens)
-        if one := resection(photo_px, points_in_world, camera, WIDER * max_error_px, SEARCH_TRIALS):
-            found.append(replace(one, lens=lens))
+        if one := estimate_absolute_pose(photo_px, points_in_world, camera, WIDER * max_error_px, SEARCH_TRIALS):
+            found.append(replace(one, correction=lens))
     found.sort(key=lambda one: -one.num_inliers)
     if not found or found[0].num_inliers < WORTH:
         return found[0] if found else None
@@ -60,13 +60,13 @@ def refine(
     photo_px: Float[np.ndarray, "m 2"],
     points_in_world: Float[np.ndarray, "m 3"],
     intrinsics: Intrinsics,
-    start: Resection,
+    start: AbsolutePose,
     focal_sigma: float,
     max_error_px: float,
-) -> Resection:
+) -> AbsolutePose:
     """Refine pose and lens on all matches, with Cauchy's weights; count the inliers afresh."""
-    pose, lens = start.pose, start.lens
-    precision = lens_precision(focal_sigma)
+    pose, lens = start.pose, start.correction
+    precision = correction_precision(focal_sigma)
     for _ in range(ROUNDS):
         jacobian, residual = linearized(photo_px, points_in_world, intrinsics.corrected(lens), pose)
         weight = 1.0 / (1.0 + (residual**2).sum(1) / (0.5 * max_error_px) ** 2)
@@ -75,22 +75,22 @@ def refine(
         right = np.einsum("nij,ni->j", weighted, residual)
         # One pixel is taken as the matches' standard deviation.
         normal[range(6, 9), range(6, 9)] += precision
-        right[6:] -= precision * lens_state(lens)
+        right[6:] -= precision * correction_vector(lens)
         step = np.linalg.lstsq(normal, right, rcond=1e-12)[0]
         pose = Pose(pose.world_from_camera @ se3_exp(step[:6]))
         lens = stepped(lens, step[6:], focal_sigma)
         if np.abs(step).max() < SETTLED:
             break
     error = reprojection_error_px(photo_px, points_in_world, intrinsics.corrected(lens), pose)
-    return Resection(pose, error < max_error_px, lens)
+    return AbsolutePose(pose, error < max_error_px, lens)
 
 
-def lens_precision(focal_sigma: float) -> Float64[np.ndarray, "3"]:
-    """Return the inverse variances of `lens_state`."""
+def correction_precision(focal_sigma: float) -> Float64[np.ndarray, "3"]:
+    """Return the inverse variances of `correction_vector`."""
     return np.array([focal_sigma, CENTRE_SIGMA, CENTRE_SIGMA]) ** -2.0
 
 
-def lens_state(lens: IntrinsicsCorrection) -> Float64[np.ndarray, "3"]:
+def correction_vector(lens: IntrinsicsCorrection) -> Float64[np.ndarray, "3"]:
     """Return the lens as numbers that are 0 at the intrinsics assumed: logarithm of the focal length, shifts."""
     return np.array([np.log(lens.focal_factor), lens.shift_x, lens.shift_y])
 
@@ -98,7 +98,7 @@ def lens_state(lens: IntrinsicsCorrection) -> Float64[np.ndarray, "3"]:
 def stepped(lens: IntrinsicsCorrection, step: Float64[np.ndarray, "3"], focal_sigma: float) -> IntrinsicsCorrection:
     """Return the lens after a step, kept within four standard deviations."""
     bounds = 4 * np.array([focal_sigma, CENTRE_SIGMA, CENTRE_SIGMA])
-    log_focal, shift_x, shift_y = np.clip(lens_state(lens) + step, -bounds, bounds)
+    log_focal, shift_x, shift_y = np.clip(correction_vector(lens) + step, -bounds, bounds)
     return IntrinsicsCorrection(float(np.exp(log_focal)), float(shift_x), float(shift_y))
 
 
@@ -108,7 +108,7 @@ def linearized(
     intrinsics: Intrinsics,
     pose: Pose,
 ) -> tuple[Float64[np.ndarray, "m 2 9"], Float64[np.ndarray, "m 2"]]:
-    """Return d pixel / d (twist, lens_state) and what is left to explain; zeros behind the camera.
+    """Return d pixel / d (twist, correction_vector) and what is left to explain; zeros behind the camera.
 
     The twist moves the camera: world_from_camera @ exp(twist).
     """

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from service.errors import InvalidOptions
 from service.geometry import hat, se3_exp, se3_log, so3_exp, so3_log
 from service.interfaces import Rasterizer
-from service.pose.absolute_pose.decoupled import shifted, turned_about
+from service.pose.absolute_pose.decoupled import rotate_about, translate_in_camera
 from service.pose.descent.adam import Adam
 from service.pose.descent.losses import Loss
 from service.pose.retrieval.scene_focus import Focus
@@ -79,7 +79,7 @@ def refine(
         arm = pose.camera_from_world[:3, :3] @ (focus.point_in_world - pose.position_in_world)
         turn = -turner.step(gradient[:3] + hat(arm).T @ gradient[3:])
         shift = -shifter.step(gradient[3:])
-        pose = shifted(turned_about(pose, focus.point_in_world, turn), shift)
+        pose = translate_in_camera(rotate_about(pose, focus.point_in_world, turn), shift)
     value, _ = loss(rasterizer.render([Camera(intrinsics, pose)])[0].rgb)
     yield Refined(pose, value)
 

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
-from service.geometry import transformed, unproject
+from service.geometry import reprojection_error_px, transformed, unproject
 from service.interfaces import Features, Frame, Matcher, Rasterizer, Tools
-from service.pose.absolute_pose.pnp import reprojection_error_px
 from service.types import Camera, Intrinsics, Pose, Query, frozen
 
 SIZE_MULTIPLE_PX = 32

@@ -14,9 +14,9 @@ import numpy as np
 from service.geometry import pose_distance
 from service.interfaces import Tools
 from service.pose.absolute_pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
-from service.pose.absolute_pose.pnp import Resection, resection
-from service.pose.absolute_pose.prior_region import admits, loosened
-from service.pose.absolute_pose.unknown_focal import WIDER, focal_resection, refine
+from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
+from service.pose.absolute_pose.prior_region import inside_prior, widened_prior
+from service.pose.absolute_pose.unknown_focal import WIDER, absolute_pose_unknown_focal, refine
 from service.pose.features.views import (
     PHOTO_PX,
     Correspondences,
@@ -28,7 +28,7 @@ from service.pose.features.views import (
     rendered_frame,
     rendered_view,
 )
-from service.pose.refinement.photometric import align
+from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.image_variant import Sight
 from service.results import IterationRecord, MatchVectors
 from service.types import NO_CORRECTION, Camera, Pose, Query
@@ -55,10 +55,10 @@ DECOUPLED_STEPS = 8
 
 def matched(
     sight: Sight, views: Iterable[View], query: Query, tools: Tools
-) -> Generator[IterationRecord, None, Resection | None]:
+) -> Generator[IterationRecord, None, AbsolutePose | None]:
     """Match the photo with one view after the other until one explains it; else with all of them together."""
     photo = sight.features(query, tools)
-    best: Resection | None = None
+    best: AbsolutePose | None = None
     seen: list[Correspondences] = []
     for view in views:
         seen.append(correspondences(photo, view, tools.matcher))
@@ -75,23 +75,23 @@ def matched(
     if best is None:
         return None
     count = len(pooled.photo_px)
-    yield IterationRecord("match_pooled", best.pose, best.lens, num_matches=count, num_inliers=best.num_inliers)
+    yield IterationRecord("match_pooled", best.pose, best.correction, num_matches=count, num_inliers=best.num_inliers)
     return best
 
 
-def refined(found: Resection, query: Query, tools: Tools) -> Iterator[IterationRecord]:
+def refined(found: AbsolutePose, query: Query, tools: Tools) -> Iterator[IterationRecord]:
     """Match again, and align; where that goes astray the matches have the last word."""
     again = yield from rematched(found, query, tools)
     unsettled = (yield from aligned(again, query, tools)) if again else None
     if again and unsettled is again:
-        yield IterationRecord("refine", again.pose, again.lens, num_inliers=again.num_inliers)
+        yield IterationRecord("refine", again.pose, again.correction, num_inliers=again.num_inliers)
 
 
-def rematched(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
+def rematched(found: AbsolutePose, query: Query, tools: Tools) -> Generator[IterationRecord, None, AbsolutePose | None]:
     """Render at the pose and match with that: a right pose gains matches, a chance one has none there."""
     photo = photo_features(query, tools)
     for _ in range(REMATCHES):
-        view, _ = rendered_view(found.pose, query.corrected(found.lens), tools)
+        view, _ = rendered_view(found.pose, query.corrected(found.correction), tools)
         matches = correspondences(photo, view, tools.matcher)
         again = solved_near(found, matches, query)
         if again is None or again.num_inliers < CHANCE:
@@ -106,13 +106,13 @@ def rematched(found: Resection, query: Query, tools: Tools) -> Generator[Iterati
     return found
 
 
-def aligned(found: Resection, query: Query, tools: Tools) -> Generator[IterationRecord, None, Resection | None]:
+def aligned(found: AbsolutePose, query: Query, tools: Tools) -> Generator[IterationRecord, None, AbsolutePose | None]:
     """Align on a render, render at the result, align again, until a new render would be the same.
 
     Returns where to match again: where a free lens and the distance have come to if they creep along together for too
     long, where it began if it goes astray.
     """
-    pose, camera, lens = found.pose, None, found.lens
+    pose, camera, lens = found.pose, None, found.correction
     for round_number in range(ALIGNMENTS + bool(query.focal_sigma)):
         settled = LENS_SETTLED_PX if query.focal_sigma else SETTLED_PX
         size_px = FIRST_ALIGNED_PX if camera is None and not query.focal_sigma else None
@@ -120,20 +120,22 @@ def aligned(found: Resection, query: Query, tools: Tools) -> Generator[Iteration
         if new_camera is camera:
             return None
         if round_number == ALIGNMENTS:
-            return replace(found, pose=pose, lens=lens)
+            return replace(found, pose=pose, correction=lens)
         camera = new_camera
         size = camera.intrinsics
         start = Camera(query.intrinsics.resized(size.width, size.height), pose)
         levels = 2 if round_number or found.num_inliers >= GOOD_MATCH else 4
         photo = photo_at(query, tools, size)
         known = known_at(query, tools, size)
-        result = align(photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px))
+        result = refine_photometric(
+            photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px)
+        )
         tools.memo["aligned"] = result  # for the gate
         astray = found.num_inliers >= GOOD_MATCH and pose_distance(found.pose, result.pose)[0] > ASTRAY_DEG
         if astray or not np.isfinite(result.loss):
             return found if found.num_inliers >= GOOD_MATCH else None
         step_deg, step_units = pose_distance(pose, result.pose)
-        pose, lens = result.pose, result.lens
+        pose, lens = result.pose, result.correction
         yield IterationRecord(
             "refine",
             pose,
@@ -145,25 +147,25 @@ def aligned(found: Resection, query: Query, tools: Tools) -> Generator[Iteration
         )
 
 
-def resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> Resection | None:
+def resected(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> AbsolutePose | None:
     """Resect with the photo's focal length, or with the best one if that is approximate."""
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     given = (matches.photo_px, matches.points_in_world)
     if query.focal_sigma:
-        found = focal_resection(*given, query.intrinsics, query.focal_sigma, pixels)
+        found = absolute_pose_unknown_focal(*given, query.intrinsics, query.focal_sigma, pixels)
     else:
-        found = resection(*given, query.intrinsics, pixels, max_trials)
+        found = estimate_absolute_pose(*given, query.intrinsics, pixels, max_trials)
     return found if found and _possible(found.pose, matches, query) else None
 
 
-def solved_near(near: Resection, matches: Correspondences, query: Query) -> Resection | None:
+def solved_near(near: AbsolutePose, matches: Correspondences, query: Query) -> AbsolutePose | None:
     """Solve the matches with a render at a pose: decoupled from there; by PnP, and refined, if the lens is free."""
     if query.focal_sigma:
         pixels = REMATCH_ERROR_PX * query.intrinsics.long_side / PHOTO_PX
-        lens = query.intrinsics.corrected(near.lens)
-        found = resection(matches.photo_px, matches.points_in_world, lens, WIDER * pixels, 500)
+        lens = query.intrinsics.corrected(near.correction)
+        found = estimate_absolute_pose(matches.photo_px, matches.points_in_world, lens, WIDER * pixels, 500)
         if found:
-            found = replace(found, lens=near.lens)
+            found = replace(found, correction=near.correction)
             given = (matches.photo_px, matches.points_in_world)
             found = refine(*given, query.intrinsics, found, query.focal_sigma, pixels)
     elif len(matches.photo_px) < MIN_POINTS:
@@ -173,7 +175,7 @@ def solved_near(near: Resection, matches: Correspondences, query: Query) -> Rese
         centre = np.median(points, axis=0)
         given = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, centre)
         solved = least_squares_solve(given, near.pose, DECOUPLED_STEPS)
-        found = Resection(solved.pose, solved.weights >= 0.5, near.lens)
+        found = AbsolutePose(solved.pose, solved.weights >= 0.5, near.correction)
     return found if found and _possible(found.pose, matches, query) else None
 
 
@@ -182,18 +184,18 @@ def _possible(pose: Pose, matches: Correspondences, query: Query) -> bool:
     if query.region is None:
         return True
     distance = np.median(np.linalg.norm(matches.points_in_world - pose.position_in_world, axis=1))
-    return admits(loosened(query.region, float(distance)), pose)
+    return inside_prior(widened_prior(query.region, float(distance)), pose)
 
 
 def match_record(
-    stage: str, best: Resection | Pose, matches: Correspondences, found: Resection | None, camera: Camera
+    stage: str, best: AbsolutePose | Pose, matches: Correspondences, found: AbsolutePose | None, camera: Camera
 ) -> IterationRecord:
     """Return what is told of a matching; `best` is the answer so far, `found` what these matches agree on."""
     inlier = found.inlier if found else np.zeros(len(matches.photo_px), bool)
     return IterationRecord(
         stage,
         best if isinstance(best, Pose) else best.pose,
-        NO_CORRECTION if isinstance(best, Pose) else best.lens,
+        NO_CORRECTION if isinstance(best, Pose) else best.correction,
         num_matches=len(inlier),
         num_inliers=int(inlier.sum()),
         matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),

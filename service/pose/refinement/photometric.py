@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from service.geometry import moved, se3_exp, se3_log
 from service.interfaces import Frame
 from service.jit import inline, kernel, summing
-from service.pose.absolute_pose.unknown_focal import lens_precision, lens_state, stepped
+from service.pose.absolute_pose.unknown_focal import correction_precision, correction_vector, stepped
 from service.pose.refinement.covariance import inverse, spread, summed_by_cell
 from service.pose.refinement.pyramid import cut_off, depth_pyramid, edge_owner_depth, luma, pyramid
 from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose
@@ -65,16 +65,16 @@ CORRELATED = 50.0
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class RefinementResult:
     pose: Pose
-    lens: IntrinsicsCorrection
+    correction: IntrinsicsCorrection
     """Beside the intrinsics that were given."""
     loss: float
     """Mean absolute residual (0..1) at the finest level; infinite where too few pixels overlap."""
     end: _End | None = field(default=None, repr=False)
 
 
-def align(
+def refine_photometric(
     photo: UInt8[np.ndarray, "h w 3"],
     frame: Frame,
     camera: Camera,
@@ -84,7 +84,7 @@ def align(
     focal_sigma: float = 0.0,
     known: Bool[np.ndarray, "h w"] | None = None,
     roughly: bool = False,
-) -> Alignment:
+) -> RefinementResult:
     """Move `start` until the photo, where it is known, agrees with the frame, which `camera` rendered.
 
     The photo has the frame's size; `start` has the photo's intrinsics, without the `lens` to begin with, and its pose
@@ -100,11 +100,11 @@ def align(
         state.look[3] = 0.0  # another at each level
         loss = _align_level(level, state, SETTLED_COARSE_PX if finer or roughly else SETTLED_PX)
         if not np.isfinite(loss):
-            return Alignment(start.pose, lens, loss)
+            return RefinementResult(start.pose, lens, loss)
     assert level is not None
     render_from_photo = np.linalg.inv(state.photo_from_render)
     pose = moved(camera.pose, se3_log(render_from_photo))
-    return Alignment(pose, state.lens, loss, _End(frame, level, state.look))
+    return RefinementResult(pose, state.lens, loss, _End(frame, level, state.look))
 
 
 @dataclass(slots=True)
@@ -206,33 +206,33 @@ def _align_level(level: _Level, state: _State, settled_px: float = SETTLED_PX) -
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class PoseUncertainty:
     """What the pixels say of a pose."""
 
-    pull: Float64[np.ndarray, "6"]
+    last_step: Float64[np.ndarray, "6"]
     """The twist (rad, scene units) by which alignment would still move the pose: true = pose @ exp(twist)."""
     covariance: Float64[np.ndarray, "k k"]
-    """Of the twist; with an approximate lens also of its `lens_state`."""
-    focal_pull: float
+    """Of the twist; with an approximate lens also of its `correction_vector`."""
+    focal_step: float
     """By how much the logarithm of the focal length would change if it were free..."""
     focal_sigma: float
     """...and the standard deviation of that."""
 
 
-def evidence(
+def pose_uncertainty(
     photo: UInt8[np.ndarray, "h w 3"],
     frame: Frame,
     camera: Camera,
     answer: Camera,
     focal_sigma: float,
     known: Bool[np.ndarray, "h w"] | None = None,
-    aligned: Alignment | None = None,
-) -> Evidence | None:
+    result: RefinementResult | None = None,
+) -> PoseUncertainty | None:
     """Weigh an answer against the frame, which `camera` rendered nearby; None where the pixels don't determine it.
 
-    If `aligned` is the alignment with this frame that led to the answer, most is known already.
+    If `result` is the refinement with this frame that led to the answer, most is known already.
     """
-    end = aligned.end if aligned and aligned.pose is answer.pose else None
+    end = result.end if result and result.pose is answer.pose else None
     if end and end.frame is frame:
         level, look = replace(end.level, photo_lens=answer.intrinsics), end.look
     else:
@@ -254,16 +254,16 @@ def evidence(
     if covariance is None:
         return None
     if free_focal is None:  # a flat wall seen straight on says nothing of it
-        return Evidence(pull, covariance, 0.0, np.inf)
-    focal_pull = float((free_focal @ scores.sum(0)[:focal])[-1])
-    if not focal_sigma and abs(focal_pull) > SUSPICIOUS:
+        return PoseUncertainty(pull, covariance, 0.0, np.inf)
+    focal_step = float((free_focal @ scores.sum(0)[:focal])[-1])
+    if not focal_sigma and abs(focal_step) > SUSPICIOUS:
         # From a pose that makes up for a wrong focal length one step leads a fifth of the way.
         free = replace(state, focal_sigma=FREE_SIGMA, look=state.look.copy())
         _align_level(level, free)
-        focal_pull = float(np.log(free.lens.focal_factor))
+        focal_step = float(np.log(free.lens.focal_factor))
     # A wrong lens makes residuals that are alike over quarters: against it only those of cells may be held.
     sigma = FOCAL_INFLATION * float(np.linalg.norm(scores[:, :focal] @ free_focal[-1]))
-    return Evidence(pull, covariance, focal_pull, sigma)
+    return PoseUncertainty(pull, covariance, focal_step, sigma)
 
 
 def _covariance(
@@ -276,7 +276,7 @@ def _covariance(
         found = inverse(hessian[: LENS.start, : LENS.start])
         return None if found is None else size * found[TWIST, TWIST]
     information = hessian / size
-    information[LENS, LENS] += np.diag(lens_precision(focal_sigma))
+    information[LENS, LENS] += np.diag(correction_precision(focal_sigma))
     keep = np.r_[TWIST, LENS]
     found = inverse(information)
     return None if found is None else found[np.ix_(keep, keep)]
@@ -307,9 +307,9 @@ def _solved(
     size = len(columns)
     hessian, right = _normal_equations(columns, weights, residuals, state.slopes)
     if state.focal_sigma:
-        trust = CORRELATED * loss * lens_precision(state.focal_sigma)
+        trust = CORRELATED * loss * correction_precision(state.focal_sigma)
         hessian[range(10, 13), range(10, 13)] += trust
-        right[LENS] -= trust * lens_state(state.lens)
+        right[LENS] -= trust * correction_vector(state.lens)
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
     damped = hessian * scale * scale[:, None]
     damped[range(size), range(size)] += 1e-6
@@ -322,7 +322,7 @@ def _solved(
 def _linearize(render, depth, pixels, k):
     """Return the points in the render's camera frame, and the columns d value / d (twist, look, lens).
 
-    The twist moves the points, the gain's column is the render's value. The lens (see `lens_state`) is the photo's.
+    The twist moves the points, the gain's column is the render's value. The last three: `correction_vector`.
     """
     fx, fy, cx, cy = k[0], k[1], k[2], k[3]
     inner = render.shape[1] - 2

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.interfaces import Features, Tools
-from service.pose.absolute_pose.prior_region import excess
+from service.pose.absolute_pose.prior_region import distance_outside
 from service.pose.features.in_plane_rotation import PHOTO_CORNERS, corners, turns_to_upright
 from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, known_at, photo_at, photo_features, sized
 from service.pose.retrieval.index import ViewIndex
@@ -98,6 +98,6 @@ def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: View
     """Return the views' votes, those of views that are far from the photo's region put below all others."""
     if query.region is None:
         return votes
-    away = np.array([excess(query.region, view.camera.pose) for view in index.views])
+    away = np.array([distance_outside(query.region, view.camera.pose) for view in index.views])
     reach = np.sort(away)[min(NEAREST, len(away)) - 1]
     return np.where(away <= reach, votes, min(0.0, float(votes.min())))

@@ -15,9 +15,9 @@ from itertools import islice
 
 import numpy as np
 
-from service.geometry import pose_distance
+from service.geometry import pose_distance, reprojection_error_px
 from service.interfaces import Features, Matcher
-from service.pose.absolute_pose.pnp import Resection, reprojection_error_px, resection
+from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, Correspondences, View, correspondences
 from service.pose.retrieval.scores import top, vote
 from service.results import Candidates, IterationRecord
@@ -60,7 +60,7 @@ def rivals(
     scores: np.ndarray,
     matcher: Matcher,
     max_error_px: float,
-) -> Iterator[Resection]:
+) -> Iterator[AbsolutePose]:
     """Yield poses apart from the answer on which matches agree, most first.
 
     `distance` is that from the answer to what it sees, `signals` are the gate's of it; `scores` say which views are
@@ -75,7 +75,7 @@ def rivals(
     left = _unexplained(Correspondences.pooled(found), intrinsics, answer, EXPLAINED * max_error_px)
     least = MANY if whole(signals) else LEAST
     for _ in range(MOST):
-        rival = resection(left.photo_px, left.points_in_world, intrinsics, max_error_px, TRIALS)
+        rival = estimate_absolute_pose(left.photo_px, left.points_in_world, intrinsics, max_error_px, TRIALS)
         if rival is None or rival.num_inliers < least:
             return
         if apart(rival.pose, answer, distance):

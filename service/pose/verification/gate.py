@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from service.geometry import reprojection_error_px
 from service.interfaces import Frame, Tools
-from service.pose.absolute_pose.pnp import reprojection_error_px
-from service.pose.absolute_pose.prior_region import admits
+from service.pose.absolute_pose.prior_region import inside_prior
 from service.pose.features.views import (
     Correspondences,
     correspondences,
@@ -32,7 +32,7 @@ from service.pose.features.views import (
     rendered_frame,
     rendered_view,
 )
-from service.pose.refinement.photometric import Evidence, evidence
+from service.pose.refinement.photometric import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import APPEARANCE, MIN_ALPHA, appearance, both_known
 from service.results import Reason, Status, Verdict
 from service.types import Camera, Intrinsics, Pose, Query
@@ -158,7 +158,7 @@ def _verdict(query: Query, pose: Pose, tools: Tools) -> Verdict:
 
 def _seen(
     query: Query, pose: Pose, frame: Frame, camera: Camera, tools: Tools
-) -> tuple[dict[str, float], Evidence | None]:
+) -> tuple[dict[str, float], PoseUncertainty | None]:
     """Return the signals and the evidence of the pixels; `camera` rendered the frame at the pose or nearby."""
     size = camera.intrinsics
     photo, known = photo_at(query, tools, size), known_at(query, tools, size)
@@ -166,7 +166,7 @@ def _seen(
     pixels = None
     if not _unlike(looks):
         answer = Camera(query.intrinsics.resized(size.width, size.height), pose)
-        pixels = evidence(photo, frame, camera, answer, query.focal_sigma, known, tools.memo.get("aligned"))
+        pixels = pose_uncertainty(photo, frame, camera, answer, query.focal_sigma, known, tools.memo.get("aligned"))
     return looks | geometry_signals(frame, size, pixels), pixels
 
 
@@ -175,7 +175,7 @@ def _unlike(signals: Mapping[str, float]) -> bool:
 
 
 def _within_region(verdict: Verdict, query: Query, pose: Pose) -> Verdict:
-    return verdict if admits(query.region, pose) else doubted(verdict, Reason.OUTSIDE_PRIOR)
+    return verdict if inside_prior(query.region, pose) else doubted(verdict, Reason.OUTSIDE_PRIOR)
 
 
 def doubted(verdict: Verdict, reason: Reason, score: float = DOUBTFUL) -> Verdict:
@@ -185,7 +185,7 @@ def doubted(verdict: Verdict, reason: Reason, score: float = DOUBTFUL) -> Verdic
     return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
 
 
-def geometry_signals(frame: Frame, size: Intrinsics, pixels: Evidence | None) -> dict[str, float]:
+def geometry_signals(frame: Frame, size: Intrinsics, pixels: PoseUncertainty | None) -> dict[str, float]:
     """Return the signals of what is seen and how well it fixes the pose; `pixels` is the evidence on this frame."""
     depth = frame.median_depth[::4, ::4]
     typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
@@ -193,7 +193,9 @@ def geometry_signals(frame: Frame, size: Intrinsics, pixels: Evidence | None) ->
     if pixels is not None:
         spread = float(np.sqrt(np.trace(pixels.covariance[3:6, 3:6]))) / typical_depth
         if spread < UNDETERMINED:
-            drift = size.fx * float(np.linalg.norm(pixels.pull[:3]) + np.linalg.norm(pixels.pull[3:]) / typical_depth)
+            drift = size.fx * float(
+                np.linalg.norm(pixels.last_step[:3]) + np.linalg.norm(pixels.last_step[3:]) / typical_depth
+            )
     return {
         "coverage": float((frame.alpha > MIN_ALPHA).mean()),
         "drift_px": min(drift, 1e3),
@@ -239,7 +241,7 @@ def in_doubt(signals: Mapping[str, float]) -> list[str]:
 
 
 def judged(
-    signals: Mapping[str, float], pixels: Evidence | None, focal_sigma: float, few_features: bool = False
+    signals: Mapping[str, float], pixels: PoseUncertainty | None, focal_sigma: float, few_features: bool = False
 ) -> Verdict:
     """Return the verdict on a pose; `focal_sigma` is what was known of the lens."""
     score = min(probability(signals), DOUBTFUL if in_doubt(signals) else 1.0)
@@ -276,15 +278,15 @@ def _weakest(signals: Mapping[str, float]) -> Reason:
 
 
 def _of_lens(
-    pixels: Evidence | None, known_sigma: float
+    pixels: PoseUncertainty | None, known_sigma: float
 ) -> tuple[Reason | None, Float64[np.ndarray, "6 6"] | None, float]:
     """Return a doubt about the lens, the pose's covariance, and that of the focal length's logarithm."""
     if pixels is None:
         return None, None, known_sigma
-    covariance = pixels.covariance[:6, :6] + np.outer(pixels.pull, pixels.pull)
+    covariance = pixels.covariance[:6, :6] + np.outer(pixels.last_step, pixels.last_step)
     if known_sigma:
-        sigma = max(float(np.sqrt(pixels.covariance[6, 6])), abs(pixels.focal_pull))  # a method may not estimate it
+        sigma = max(float(np.sqrt(pixels.covariance[6, 6])), abs(pixels.focal_step))  # a method may not estimate it
         return (Reason.FOCAL_UNCERTAIN if sigma > ENOUGH_FOCAL_SIGMA else None), covariance, sigma
-    off = abs(pixels.focal_pull)
+    off = abs(pixels.focal_step)
     contradicted = off > CONTRADICTION and off > 3 * pixels.focal_sigma
     return (Reason.INTRINSICS_CONTRADICTED if contradicted else None), covariance, 0.0

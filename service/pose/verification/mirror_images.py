@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from service.interfaces import Tools
-from service.pose.absolute_pose.pnp import resection
+from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, VIEW_FEATURES, View, correspondences, to_uint8
 from service.pose.retrieval.scores import top, vote
 from service.pose.verification.appearance import APPEARANCE
@@ -65,7 +65,7 @@ def _recognised(view: View, views: Sequence[View], tools: Tools) -> int:
     for i in top(votes, TRIES):
         matches = correspondences(found, views[i], tools.matcher)
         error_px = MATCH_ERROR_PX * lens.long_side / PHOTO_PX
-        pose = resection(matches.photo_px, matches.points_in_world, lens, error_px, TRIALS)
+        pose = estimate_absolute_pose(matches.photo_px, matches.points_in_world, lens, error_px, TRIALS)
         most = max(most, pose.num_inliers if pose else 0)
     return most
 

@@ -31,7 +31,7 @@ from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
 from service.photos.sequence import Reading, check_sequence, is_packed, is_sequence, packed, read_sequence
-from service.pose.absolute_pose.prior_region import admits
+from service.pose.absolute_pose.prior_region import inside_prior
 from service.results import StageTiming
 from service.scene_manager.manager import several
 from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion, Query
@@ -260,7 +260,7 @@ def prior_from(prior: PriorIn, where: str = "prior") -> tuple[Pose | None, Prior
         if prior.box is None:
             return pose, None
         box = BoxPrior(np.array(prior.box[0]), np.array(prior.box[1]))
-        if pose is not None and not admits(box, pose):
+        if pose is not None and not inside_prior(box, pose):
             raise InvalidPrior("the pose lies outside the box.", where="box", hint="Leave one of them out.")
         return pose, box
     except InvalidPrior as error:
