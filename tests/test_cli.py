@@ -24,6 +24,7 @@ from PIL import Image
 import service
 import service.__main__
 from service import jit
+from service.cli.render import render
 from service.geometry import moved, pose_distance
 from service.types import Pose
 from tests.small_room import INTRINSICS, pose_at, write_room
@@ -65,7 +66,7 @@ def photo(room) -> Path:
     path = room / "photos" / "query.png"
     path.parent.mkdir()
     pose = json.dumps({"world_from_camera": TRUTH.world_from_camera.tolist()})
-    service.__main__.render(room, pose, path)
+    render(room, pose, path)
     return path
 
 
@@ -105,7 +106,7 @@ def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
     frames = []
     for i, pose in enumerate(truth):
         frames.append(tmp_path / f"{i}.png")
-        service.__main__.render(room, json.dumps({"world_from_camera": pose.world_from_camera.tolist()}), frames[-1])
+        render(room, json.dumps({"world_from_camera": pose.world_from_camera.tolist()}), frames[-1])
     size = (INTRINSICS["width"], INTRINSICS["height"])
     writer = cv2.VideoWriter(str(film), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, size)
     for frame in frames:
@@ -291,7 +292,7 @@ def test_bench_paper_shows_how_far_it_is():
     from rich.console import Console
 
     from service.bench.paper.runs import Standing
-    from service.cli.bench_commands import _standing_table
+    from service.cli.bench_paper import _standing_table
 
     cells = ("table2/mc_do/hard", "table2/icomma/hard", "table5/mc_do:mc/random")
     standing = Standing(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})

@@ -21,7 +21,7 @@ from rich.console import Console
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from service.cli.serve import run
+from service.cli.server import run
 from service.errors import InvalidRequest, QueueFull
 from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
 from service.web.app import create_app
@@ -155,8 +155,8 @@ def test_serve_beyond_this_machine_makes_a_key_and_prints_it_in_the_url(stepping
             super().__init__(config)
             servers.append(self)
 
-    monkeypatch.setattr("service.cli.serve.uvicorn.Server", Server)
-    for place in ("service.cli.serve", "service.web.app"):
+    monkeypatch.setattr("service.cli.server.uvicorn.Server", Server)
+    for place in ("service.cli.server", "service.web.app"):
         monkeypatch.setattr(f"{place}.is_loopback", lambda host: False)
     chosen = settings(port=0, keys_file=tmp_path / "none.json", data_dir=tmp_path / "data", log_json=False)
     consoles = Console(file=out, width=200), Console(file=io.StringIO())

@@ -1,93 +1,30 @@
-"""`splatfix serve`: a socket, a server, and a few lines that tell where it is."""
+"""`splatfix serve`: the HTTP service."""
 
 from __future__ import annotations
 
-import logging
-import socket
-import threading
-import time
+from pathlib import Path
+from typing import Annotated
 
-import uvicorn
-from fastapi import FastAPI
-from rich.console import Console
+import typer
 
-from service import __version__
-from service.cli.example_request import curl_line
-from service.errors import InvalidRequest
-from service.logs import json_handler
-from service.web.api_keys import KeyRing
-from service.web.app import create_app
-from service.web.middleware.authentication import is_loopback
-from service.web.settings import DATA_HOME, Settings
-
-_CONNECTIONS_S = 3
-"""What open connections get after SIGTERM, before the running jobs get their own grace period."""
+from service.cli.terminal import err, out, settings_of
 
 
-def run(settings: Settings, out: Console, err: Console) -> None:
-    """Serve until SIGTERM or SIGINT. Raises InvalidRequest, StorageFailed and what `create_app` raises."""
-    if settings.log_json if settings.log_json is not None else not err.is_terminal:
-        logging.getLogger().handlers = [json_handler()]
-    if settings.data_dir is None and settings.port:  # on a random port nobody would come back to it
-        settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
-    keys = KeyRing(settings.keys_file)
-    key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_passing("start", "admin")
-    with _listener(settings.host, settings.port) as listener:
-        settings = settings.model_copy(update={"port": listener.getsockname()[1]})
-        application = create_app(settings, keys=keys)
-        server = uvicorn.Server(
-            uvicorn.Config(
-                application,
-                log_config=None,
-                log_level="warning",
-                access_log=False,
-                server_header=False,
-                ws="websockets-sansio",
-                ws_max_size=2**26,
-                ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
-                timeout_graceful_shutdown=_CONNECTIONS_S,
-            )
-        )
-        logging.getLogger("service").setLevel(logging.INFO)
-        told = server, application, settings, key, out, err
-        threading.Thread(target=_announce, args=told, daemon=True).start()
-        server.run(sockets=[listener])
-
-
-def _listener(host: str, port: int) -> socket.socket:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        return socket.create_server((host, port), family=family)
-    except OSError as error:
-        raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
-
-
-def _announce(
-    server: uvicorn.Server, application: FastAPI, settings: Settings, key: str, out: Console, err: Console
+def serve(
+    scenes: Annotated[
+        list[Path] | None, typer.Argument(help="Scene folders, scene files, or folders of scene folders.")
+    ] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
+    port: Annotated[int | None, typer.Option(help="0: any free one.", min=0, max=65535)] = None,
+    viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
+    open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
 ) -> None:
-    """Wait until the service is ready, then say where it is and what to type."""
-    with err.status("starting") as status:
-        while not server.started:
-            time.sleep(0.05)
-        scenes = application.state.parts.scenes
-        while awaited := scenes.readiness().awaited:
-            status.update(", ".join(awaited))
-            time.sleep(0.1)
-    readiness, url = scenes.readiness(), settings.loopback_url
-    entrance = f"?key={key}" if key else ""
-    for reason in readiness.failed:
-        err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
-    lines = [
-        f"splatfix {__version__} {'is ready' if readiness.ready else 'runs, but has no usable scene'}:",
-        f"  start page  {url}/{entrance}",
-        *([f"  viewer      {url}/viewer/{entrance}"] if settings.viewer else []),
-        f"  API         {url}/docs",
-    ]
-    ready = [entry for entry in scenes.entries() if entry.state == "ready"]
-    if key:
-        lines += ["The key was made for this run only; `splatfix keys add NAME` makes lasting ones."]
-    if ready:
-        scene, folder = ready[0].loaded.scene, ready[0].path
-        several = len(scenes.entries()) > 1
-        lines += ["Try it:", f"  {curl_line(url, scene, folder, name_scene=several, key=key)}"]
-    out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment, or a file.
+
+    The file is the one that SPLATFIX_CONFIG names, or ~/.config/splatfix/splatfix.toml.
+    """
+    from service.cli.server import run
+
+    given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
+    # None stands for an option that was not given: the environment's or the file's value holds.
+    run(settings_of({name: value for name, value in given.items() if value is not None}), out, err)

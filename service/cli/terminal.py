@@ -17,11 +17,14 @@ if TYPE_CHECKING:
     from service.localize import LoadedScene
     from service.web.settings import Settings
 
-# Everything else is imported where it is used: `splatfix --help` shall not wait for torch and numba.
-
 out, err = Console(), Console(stderr=True)
 
 MatcherOption = Annotated[str, typer.Option("--matcher", help="Of local features; `splatfix doctor` lists them.")]
+IntrinsicsOption = Annotated[
+    str,
+    typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
+]
+JsonFileOption = Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")]
 
 
 def settings_of(given: dict[str, Any]) -> Settings:
@@ -78,9 +81,9 @@ def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -
     return loaded
 
 
-def tell_machine() -> None:
+def print_machine() -> None:
     """Say on what a benchmark runs, and what else runs there."""
-    from service.cli.doctor import processor
+    from service.cli.diagnostics import processor
 
     err.print(processor(), markup=False, highlight=False, soft_wrap=True)
 

@@ -16,7 +16,7 @@ from service.scene_formats.manifest import read_manifest
 from service.types import GaussianScene
 
 
-def inspected(path: Path) -> dict[str, Any]:
+def scene_facts(path: Path) -> dict[str, Any]:
     """Return the facts as JSON has them; lengths in scene units. Renders some hundred small views: seconds.
 
     Raises SceneError.
@@ -85,7 +85,7 @@ def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
     }
 
 
-def told(facts: dict[str, Any]) -> dict[str, str]:
+def as_lines(facts: dict[str, Any]) -> dict[str, str]:
     """Return the facts for people: one line each."""
     index, size, memory = facts["index"], facts["training_size"], facts["memory_bytes"]
     placed = f"{index['views']} views, placed by {index['placed_by']}"

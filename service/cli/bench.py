@@ -1,0 +1,22 @@
+"""`splatfix bench ...`: the benchmark commands by name."""
+
+from __future__ import annotations
+
+import typer
+
+from service.cli.bench_ablation import bench_ablation
+from service.cli.bench_gate import bench_gate
+from service.cli.bench_localize import bench_localize
+from service.cli.bench_paper import bench_paper
+from service.cli.bench_render import bench_render
+from service.cli.bench_scale import bench_scale
+from service.cli.bench_track import bench_track
+
+bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
+bench_app.command("localize")(bench_localize)
+bench_app.command("track")(bench_track)
+bench_app.command("paper")(bench_paper)
+bench_app.command("gate")(bench_gate)
+bench_app.command("render")(bench_render)
+bench_app.command("scale")(bench_scale)
+bench_app.command("ablation")(bench_ablation)

@@ -1,0 +1,29 @@
+"""`splatfix bench ablation`: what each part of the default estimator adds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, settings_of, write_json
+from service.errors import InvalidRequest
+
+
+def bench_ablation(
+    folders: Annotated[list[Path], typer.Argument(help="Scene folders with test photos: at least two.")],
+    parts: Annotated[list[str] | None, typer.Option("--part", help="Remove only this; may be repeated.")] = None,
+    json_file: JsonFileOption = None,
+) -> None:
+    """Remove each part of the default estimator in turn; print a Markdown table of what is left."""
+    from service.bench.ablation import run, table
+
+    print_machine()
+    if len(folders) < 2:
+        raise InvalidRequest("needs two scenes or more, to hide the photos of one by another's.", where="folders")
+    with progress_bar() as progress:
+        bar = counter(progress, "conditions")
+        rows = run(folders, parts=parts or (), cache_dir=settings_of({}).cache_dir, progress=bar)
+    write_json(json_file, rows)
+    out.print(table(rows), markup=False, highlight=False, soft_wrap=True)

@@ -1,0 +1,77 @@
+"""`splatfix bench localize`: accuracy and time on the test photos of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from service.cli.terminal import (
+    JsonFileOption,
+    MatcherOption,
+    counter,
+    parsed_option,
+    print_machine,
+    progress_bar,
+    say,
+    settings_of,
+    short,
+    write_json,
+)
+
+
+def bench_localize(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses, or a scene file.")],
+    data: Annotated[Path | None, typer.Option(help="The data set's folder, if it isn't the scene's.")] = None,
+    layout: Annotated[
+        str, typer.Option(help="auto, nerf_synthetic, llff, mipnerf360, deep_blending, nerfstudio or scene.")
+    ] = "auto",
+    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
+    estimator: str = "view_index",
+    matcher: MatcherOption = "",
+    start: Annotated[str, typer.Option(help="none, near, easy, hard, pnerf, inplace or random.")] = "none",
+    trials: Annotated[int, typer.Option(min=1, help="Starts a photo.")] = 1,
+    seed: int = 0,
+    intrinsics: Annotated[Literal["given", "approximate", "withheld"], typer.Option()] = "given",
+    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
+    modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
+    options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
+    budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
+    budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
+    misses: Annotated[Path | None, typer.Option(help="A folder for a picture of each miss at 1 deg, 0.01.")] = None,
+    json_file: JsonFileOption = None,
+) -> None:
+    """Localize a scene's test photos and compare with the truth."""
+    from service.bench import misses as pictures
+    from service.bench.localize import Budget, run
+    from service.localize import DEFAULT_MATCHER
+    from service.web.schemas.parsing import options_from
+
+    print_machine()
+    with progress_bar() as progress:
+        outcome = run(
+            folder,
+            data=data,
+            layout=layout,
+            background=background,
+            estimator=estimator,
+            matcher=matcher or DEFAULT_MATCHER,
+            start=start,
+            trials=trials,
+            seed=seed,
+            intrinsics=intrinsics,
+            cameras=cameras,
+            modify=tuple(modify or ()),
+            occluders=occluders,
+            options=options_from(estimator, parsed_option(options, "options") or {}),
+            budget=Budget(budget_s, budget_renders),
+            progress=counter(progress, "photos"),
+            cache_dir=settings_of({}).cache_dir,
+            on_miss=pictures.kept_in(misses) if misses else None,
+        )
+    write_json(json_file, outcome)
+    for name, value in outcome.items():
+        if name != "per_query":
+            say(f"{name:28} {short(value)}")

@@ -1,0 +1,110 @@
+"""`splatfix bench paper`: the paper's tables and figures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from service.cli.terminal import MatcherOption, err, out, print_machine, settings_of
+from service.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from service.bench.paper.runs import Standing
+
+
+def bench_paper(
+    scenes: Annotated[list[str], typer.Argument(help="Scene folders; SCENE=DATA where the data set is elsewhere.")],
+    folder: Annotated[Path, typer.Option("--out", help="Where results are kept; a run there is gone on with.")],
+    trials: Annotated[int, typer.Option(min=1, help="Of fast methods, a scene and protocol.")] = 40,
+    slow_trials: Annotated[int, typer.Option(min=0, help="Of the baselines.")] = 5,
+    study: Annotated[list[str] | None, typer.Option(help="table1, table2, table5, pnerf, range, resolution.")] = None,
+    method: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
+    protocol: Annotated[list[str] | None, typer.Option(help="Only these.")] = None,
+    layout: Annotated[str, typer.Option(help="Of the data sets.")] = "auto",
+    background: Annotated[Literal["scene", "white", "black"], typer.Option()] = "scene",
+    matcher: MatcherOption = "",
+    seed: int = 0,
+    report: Annotated[Path | None, typer.Option(help="Write tables, figures and page to this folder.")] = None,
+    run: Annotated[bool, typer.Option("--run/--report-only", help="Run what is missing first.")] = True,
+) -> None:
+    """Reproduce the paper: methods x scenes x protocols, then its tables and figures."""
+    from service.bench.paper import runs
+    from service.bench.paper.plan import chosen
+    from service.localize import DEFAULT_MATCHER
+
+    asked = runs.Asked(
+        scenes=_scene_arguments(scenes),
+        cells=chosen(study or (), method or (), protocol or ()),
+        out=folder,
+        trials=trials,
+        slow_trials=slow_trials,
+        seed=seed,
+        matcher=matcher or DEFAULT_MATCHER,
+        layout=layout,
+        background=background,
+        cache_dir=settings_of({}).cache_dir,
+    )
+    if run:
+        print_machine()
+        with _live_table() as show:
+            runs.run(asked, show)
+    if report:
+        from service.bench.paper.report import write
+
+        with err.status("drawing"):
+            write(asked, report)
+        out.print(str(report / "index.html"), highlight=False, soft_wrap=True)
+
+
+def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
+    """SCENE or SCENE=DATA; a scene's name is its folder's."""
+    found: dict[str, tuple[Path, Path | None]] = {}
+    for text in given:
+        scene, _, data = text.partition("=")
+        name = Path(scene).resolve().stem
+        if name in found:
+            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
+        found[name] = Path(scene), Path(data) if data else None
+    return found
+
+
+@contextmanager
+def _live_table() -> Iterator[Callable[[Standing], None]]:
+    """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
+    from rich.live import Live
+
+    told = time.monotonic()
+    with Live(console=err, auto_refresh=False, transient=True) as live:
+
+        def show(standing: Standing) -> None:
+            nonlocal told
+            if err.is_terminal:
+                live.update(_standing_table(standing), refresh=True)
+            elif time.monotonic() - told > 60:
+                told = time.monotonic()
+                done, total = sum(standing.done.values()), sum(standing.total.values())
+                err.print(f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go", highlight=False)
+
+        yield show
+
+
+def _standing_table(standing: Standing) -> Table:
+    from rich.table import Table
+
+    scenes = list(dict.fromkeys(scene for scene, _ in standing.total))
+    table = Table("study / method / start", *scenes, title="within 5 deg / 0.05, of done, of all")
+    for cell in dict.fromkeys(cell for _, cell in standing.total):
+        places = [(scene, cell) for scene in scenes]
+        if any(standing.done.get(place) for place in places):
+            counts = [(standing.within.get(p, 0), standing.done.get(p, 0), standing.total[p]) for p in places]
+            table.add_row(cell, *(f"{a} / {b} / {c}" for a, b, c in counts))
+    done, total = sum(standing.done.values()), sum(standing.total.values())
+    table.caption = f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go"
+    return table

@@ -1,0 +1,43 @@
+"""`splatfix bench scale`: loading, indexing, memory and localization by the size of a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, short, write_json
+
+
+def bench_scale(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    around: Annotated[list[Path] | None, typer.Option(help="Scenes to put around it; else varied copies.")] = None,
+    sizes: Annotated[list[int] | None, typer.Option("--size", min=1000, help="Gaussians; may be repeated.")] = None,
+    cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "ignored",
+    compressed: Annotated[bool, typer.Option("--compressed", help="Write compressed scene files.")] = False,
+    work: Annotated[Path | None, typer.Option(help="Where to write the large scenes meanwhile.")] = None,
+    plot_file: Annotated[Path | None, typer.Option("--plot", help="Draw the curves, a .png.")] = None,
+    json_file: JsonFileOption = None,
+) -> None:
+    """Measure loading, indexing, memory and localization of scenes of growing size."""
+    from service.bench.scale import SIZES, run
+
+    print_machine()
+    with progress_bar() as progress:
+        rows = run(
+            folder,
+            others=around or (),
+            sizes=sizes or SIZES,
+            cameras=cameras,
+            compressed=compressed,
+            work=work,
+            progress=counter(progress, "sizes"),
+        )
+    write_json(json_file, rows)
+    if plot_file:
+        from service.bench.paper.figures import growth  # loads matplotlib
+
+        plot_file.write_bytes(growth(rows))
+    for name in rows[0]:
+        out.print(f"{name:20}" + " ".join(f"{short(row[name]):>14}" for row in rows), highlight=False, soft_wrap=True)

@@ -1,0 +1,141 @@
+"""What runs on this machine, and why the rest doesn't."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+
+from service import __version__
+from service.bench.render import room_cameras, synthetic_room
+from service.estimators import ESTIMATORS
+from service.geometry import look_at
+from service.localize import DEFAULT_MATCHER, choose_rasterizer
+from service.matchers import MATCHERS
+from service.pose.refinement.photometric import refine_photometric
+from service.render import RASTERIZERS
+from service.scene_formats import SCENE_FORMATS
+from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    subject: str
+    ok: bool
+    detail: str
+    needed: bool = True
+    """Whether localizing depends on it."""
+
+
+def findings() -> Iterator[Finding]:
+    """Examine the machine; some of it takes seconds, so one after the other."""
+    yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
+    yield Finding("processor", True, processor())
+    chosen, passed_over = choose_rasterizer()
+    yield Finding("renders with", True, f"{chosen} ({passed_over})" if passed_over else chosen)
+    for name in dict.fromkeys((chosen, "cpu")):
+        yield _tried(f"renderer {name}", partial(_try_renderer, name))
+    yield _tried("matcher", _try_matcher)
+    yield _package("pi-heif", "HEIC photos")
+    yield from _plugins()
+    yield _package("viser", "the viewer")
+    yield _gpu()
+    yield _browser()
+
+
+def compile_kernels() -> None:
+    """Compile every kernel now, so that nothing has to later: a minute the first time, seconds after that."""
+    (camera,) = room_cameras(64)[:1]
+    rasterizer = RASTERIZERS.load("cpu").create(synthetic_room(2000))
+    frame = rasterizer.render([camera])[0]
+    rasterizer.pose_gradient(camera, frame.rgb)
+    rasterizer.scene_gradients(camera, frame.rgb)
+    refine_photometric((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera, 2)
+
+
+def processor() -> str:
+    """Name the processor, its SIMD and its load: what a timing rests on."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    values = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
+    flags = set(values.get("flags", values.get("Features", "")).split())
+    simd = [name for name in ("avx512f", "avx512bw", "avx2", "fma", "asimd", "sve") if name in flags]
+    model = values.get("model name", platform.processor() or platform.machine())
+    load = ", ".join(f"{value:.1f}" for value in os.getloadavg()) if hasattr(os, "getloadavg") else "unknown"
+    return f"{model}, {os.cpu_count()} cores ({' '.join(simd) or 'no SIMD known'}), load {load}"
+
+
+def _tried(subject: str, attempt: Callable[[], str]) -> Finding:
+    began = time.perf_counter()
+    try:
+        detail = attempt()
+    except Exception as error:  # whatever it is, it is the finding
+        return Finding(subject, False, f"{type(error).__name__}: {error}")
+    return Finding(subject, True, f"{detail} ({time.perf_counter() - began:.1f} s)")
+
+
+def _try_renderer(name: str) -> str:
+    """Render one opaque red Gaussian: the kernels compile for this machine, and the middle is red."""
+    scene = GaussianScene(
+        means=np.zeros((1, 3), np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 0.3, np.float32),
+        opacities=np.ones(1, np.float32),
+        sh=np.array([[[1.7725, -1.7725, -1.7725]]], np.float32),
+        info=SceneInfo("doctor", "doctor", "", "none"),
+    )
+    pose = look_at(np.array([0.0, 0.0, 3.0]), np.zeros(3), np.array([0.0, 1.0, 0.0]))
+    camera = Camera(Intrinsics(64, 64, 64.0, 64.0, 32.0, 32.0), pose)
+    middle = RASTERIZERS.load(name).create(scene).render([camera])[0].rgb[32, 32]
+    if np.abs(middle - [1, 0, 0]).max() > 0.05:
+        raise ArithmeticError(f"a red Gaussian came out as {middle}")
+    return "a picture is right"
+
+
+def _try_matcher() -> str:
+    """Match a noise image with itself: the weights are there."""
+    image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8).repeat(4, 0).repeat(4, 1)
+    matcher = MATCHERS.load(DEFAULT_MATCHER).create()
+    features = matcher.extract(image, 200)
+    matches = matcher.match(features, features)
+    if len(matches) < 20:
+        raise ArithmeticError(f"an image matches itself at {len(matches)} points only")
+    return f"{matcher.name} has its weights, torch {metadata.version('torch')}"
+
+
+def _package(name: str, purpose: str) -> Finding:
+    found = importlib.util.find_spec(name.replace("-", "_")) is not None
+    return Finding(purpose, found, f"{name} {metadata.version(name)}" if found else f"{name} is not installed")
+
+
+def _plugins() -> Iterator[Finding]:
+    folders = {"estimator": ESTIMATORS, "matcher": MATCHERS, "renderer": RASTERIZERS, "format": SCENE_FORMATS}
+    for kind, folder in folders.items():
+        for name in folder.names():
+            reason = folder.missing(name)
+            yield Finding(f"{kind} {name}", reason is None, reason or "available", needed=False)
+
+
+def _gpu() -> Finding:
+    tool = shutil.which("nvidia-smi")
+    if not tool:
+        return Finding("GPU", False, "no NVIDIA driver; rendering is on the CPU", needed=False)
+    listed = subprocess.run([tool, "-L"], capture_output=True, text=True, timeout=20, check=False).stdout.strip()
+    if importlib.util.find_spec("gsplat") is None:
+        return Finding("GPU", False, f"{listed or 'none'}; gsplat is not installed", needed=False)
+    return Finding("GPU", bool(listed), listed or "none", needed=False)
+
+
+def _browser() -> Finding:
+    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    return Finding("browser", found is not None, found or "no Chromium: browser tests are skipped", needed=False)

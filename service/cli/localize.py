@@ -1,0 +1,158 @@
+"""`splatfix localize`: the poses of photos, or of a sequence's frames, in a scene or in one of several."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import track
+
+from service.cli.terminal import (
+    IntrinsicsOption,
+    MatcherOption,
+    err,
+    loaded_scene,
+    parsed_option,
+    print_json,
+    read_file,
+    say,
+)
+from service.errors import InvalidRequest
+
+if TYPE_CHECKING:
+    from service.localize import LoadedScene
+    from service.web.schemas.parsing import Body
+    from service.web.schemas.requests import LocalizeFields
+    from service.web.schemas.responses import Result
+
+
+@dataclass(frozen=True, slots=True)
+class _Output:
+    """Where results go; standard output has one line a photo unless it is to have JSON."""
+
+    as_json: bool
+    csv_file: Path | None
+    tum_file: Path | None
+
+
+def localize(
+    photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC; or one video.")],
+    scene: Annotated[
+        list[Path], typer.Option("--scene", help="Scene folder, scene file or folder of scenes; may be repeated.")
+    ],
+    sequence: Annotated[
+        bool, typer.Option("--sequence", help="One camera's photos in their order: follow it. A video always is.")
+    ] = False,
+    intrinsics: IntrinsicsOption = "",
+    prior: Annotated[str, typer.Option(help="What is known of the pose, as the API takes it: JSON or a file.")] = "",
+    estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
+    matcher: MatcherOption = "",
+    seed: int = 0,
+    budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Of a sequence: use each Nth.")] = 1,
+    times: Annotated[str, typer.Option(help="Of a sequence's photos: JSON list of seconds, or a file of it.")] = "",
+    csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
+    tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
+) -> None:
+    """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which."""
+    from service.localize import DEFAULT_ESTIMATOR
+    from service.photos.sequence import is_sequence
+    from service.scene_formats.discovery import find_scenes
+    from service.web.schemas.parsing import Body, body_of
+
+    fields = _fields(
+        {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every},
+        {"intrinsics": intrinsics, "prior": prior, "times_s": times},
+    )
+    files = [(str(photo), read_file(photo)) for photo in photos]
+    track_camera = sequence or any(is_sequence(data) for _, data in files)
+    if not track_camera:
+        _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times})
+    paths = [path for given_path in scene for path in find_scenes(given_path)]
+    if track_camera:
+        _require_one_scene(paths)
+    loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
+    output = _Output(as_json, csv_file, tum_file)
+    if track_camera:
+        _localize_sequence(body_of(files, {}), fields, loaded[0], output)
+    else:
+        _localize_each([Body(data, name, {}) for name, data in files], fields, loaded, output)
+
+
+def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
+    """Return the request's fields as the API parses them; `nested` options are JSON, or files of it."""
+    from service.web.schemas.parsing import read_fields
+
+    given = plain | {name: parsed_option(text, name) for name, text in nested.items()}
+    return read_fields({name: value for name, value in given.items() if value is not None})
+
+
+def _refuse_sequence_options(given: dict[str, Any]) -> None:
+    for option, value in given.items():
+        if value:
+            raise InvalidRequest("this is of a sequence: add --sequence.", where=option)
+
+
+def _require_one_scene(paths: list[Path]) -> None:
+    if len(paths) > 1:
+        raise InvalidRequest(
+            "only single photos are looked for in several scenes; this is a sequence.",
+            where="--scene",
+            hint="Name one scene; one photo of the sequence, by itself, can tell which.",
+        )
+
+
+def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output) -> None:
+    """Localize every photo by itself, in the one scene or in each of several."""
+    from service.cli import result_tables
+    from service.localize import localize as run
+    from service.multi_scene import Found, localize_anywhere
+    from service.web.schemas.conversion import result_out, timing_out
+    from service.web.schemas.parsing import make_task
+    from service.web.schemas.resources import versions
+
+    results: list[tuple[str, Result]] = []
+    for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
+        task, query = make_task(body, fields, loaded[0])
+        if len(loaded) > 1:
+            found = localize_anywhere(query, loaded, task.request)
+        else:
+            found = Found(run(query, loaded[0], task.request), loaded[0])
+        anchor = found.loaded.scene.info.geo_anchor
+        results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
+        if not output.as_json:
+            say(result_tables.photo_line(*results[-1]))
+    if output.as_json:
+        print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
+    if output.csv_file:
+        result_tables.write_photo_table(output.csv_file, results)
+
+
+def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, output: _Output) -> None:
+    """Track the camera of a video, or of photos in their order, through a scene."""
+    from service.cli import result_tables
+    from service.jobs.trajectory import Trajectory
+    from service.photos.sequence import read_sequence
+    from service.tracking import localize_sequence
+    from service.web.schemas.exports import trajectory_of
+    from service.web.schemas.parsing import make_task
+
+    task, _ = make_task(body, fields, loaded, max_frames=sys.maxsize)
+    if task.reading is None:
+        raise InvalidRequest("a sequence has two photos or more, or is a video.", where="photos")
+    trajectory = Trajectory()
+    for found in localize_sequence(read_sequence(body.photo, task.reading), loaded, task.request):
+        frame = trajectory.add(found).frame
+        if frame and not output.as_json:
+            say(result_tables.frame_line(frame))
+    result = trajectory.result(loaded.scene.info.geo_anchor)
+    if output.as_json:
+        print_json({"photo": body.name, **result.model_dump(mode="json")})
+    if output.csv_file:
+        result_tables.write_frame_table(output.csv_file, result.frames or [])
+    if output.tum_file:
+        output.tum_file.write_text(trajectory_of(result.frames or []), encoding="utf-8")

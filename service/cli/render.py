@@ -1,0 +1,34 @@
+"""`splatfix render`: an image of a scene at a pose."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.terminal import IntrinsicsOption, loaded_scene, parsed_option
+from service.errors import InvalidRequest
+
+
+def render(
+    scene: Annotated[Path, typer.Option("--scene", help="Scene folder or scene file.")],
+    pose: Annotated[str, typer.Option(help="As the API takes a prior: JSON or a file.")],
+    out_file: Annotated[Path, typer.Option("--out", help="A .png or .jpg to write.")],
+    intrinsics: IntrinsicsOption = "",
+) -> None:
+    """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
+    from service.scene_manager.scene_images import picture
+    from service.web.schemas.parsing import read_fields
+    from service.web.schemas.requests import RenderIn
+
+    fields = read_fields({"truth": parsed_option(pose, "truth")})
+    if fields.truth is None:
+        raise InvalidRequest("a pose is required.", where="--pose")
+    kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
+    if kind not in ("png", "jpg"):
+        raise InvalidRequest("must end with .png or .jpg.", where="--out")
+    request = RenderIn(
+        pose=fields.truth, intrinsics=parsed_option(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
+    )
+    out_file.write_bytes(picture(loaded_scene(scene), request))

@@ -1,0 +1,40 @@
+"""`splatfix scenes list | inspect`: what scenes there are, and what is in one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.terminal import err, print_json, say
+
+scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes.")
+
+
+@scenes_app.command("list")
+def list_scenes(
+    folder: Annotated[Path, typer.Argument(help="A scene, or a folder of scenes.")] = Path(),
+) -> None:
+    """List the scenes at a path, without reading them."""
+    from service.scene_formats.discovery import find_scenes
+
+    for scene in find_scenes(folder):
+        say(str(scene))
+
+
+@scenes_app.command("inspect")
+def inspect_scene(
+    scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")],
+    as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+) -> None:
+    """Read a scene; print what is in it, what is unknown of it, and from where its views would be rendered."""
+    from service.cli.scene_facts import as_lines, scene_facts
+
+    with err.status(f"looking at {scene}"):
+        facts = scene_facts(scene)
+    if as_json:
+        print_json(facts)
+        return
+    for name, value in as_lines(facts).items():
+        say(f"{name:18} {value}")
