@@ -26,11 +26,12 @@ from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, u
 
 from service.results import Reason, Status
 from service.types import IntrinsicsCorrection
-from viewer import app, draw, private, session, shapes
-from viewer.app import Viewer, job_of
-from viewer.client import Service, ServiceTrouble
-from viewer.feed import JobFeed, Library
+from viewer import browser_session, frusta, viewer_server, viser_internals
+from viewer import comparison_images as images
+from viewer.job_stream import JobStream, Library
 from viewer.replay import replay_html
+from viewer.service_client import ServiceClient, ServiceError
+from viewer.viewer_server import Viewer, job_of
 
 
 @pytest.fixture
@@ -40,7 +41,7 @@ def fake() -> FakeService:
 
 @pytest.fixture
 def viewer(fake: FakeService) -> Iterator[Viewer]:
-    viewer = Viewer(Service("http://fake", fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
     yield viewer
     viewer.stop()
 
@@ -90,7 +91,7 @@ def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: Fa
 def _render_shown(browser: FakeBrowser) -> np.ndarray:
     """The colour of the render in the picture: low and to the right, where the fake matches have no lines."""
     image = next(w for w in browser.widgets.values() if w["type"] == "GuiImageMessage")
-    picture = draw.decode(bytes(image["_data"]))
+    picture = images.decode(bytes(image["_data"]))
     return picture[int(0.95 * picture.shape[0]), int(0.93 * picture.shape[1])].astype(int)
 
 
@@ -209,7 +210,7 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
         browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "looking through")
         browser.set("fly to result", True)
         ball = viewer._library.scene("ball")
-        goal = shapes.behind(records(3)[-1].pose, ball.extent, ball.splats.centres)
+        goal = frusta.behind(records(3)[-1].pose, ball.extent, ball.splats.centres)
         # viser leaves out changes below 1e-5 of the value.
         browser.wait(lambda: np.allclose(client.camera.position, goal.position, atol=1e-4), "arrival")
         browser.wait(lambda: np.allclose(client.camera.look_at, goal.look_at, atol=1e-4), "looking there")
@@ -218,7 +219,7 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
 def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
     fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "_ARRIVAL_S", 0.0)
+    monkeypatch.setattr(browser_session, "_ARRIVAL_S", 0.0)
     job = fake.job("j")
     fake.loading_s = 0.5
     with _browser(viewer, "/jobs/j") as browser:
@@ -229,7 +230,7 @@ def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
         browser.wait(lambda: browser.widget("step")["value"] == 2 and "15 agree" in browser.text(), "the last step")
         (client,) = viewer.server.get_clients().values()
         ball = viewer._library.scene("ball")
-        there = shapes.behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
+        there = frusta.behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
         assert np.allclose(client.camera.position, there, atol=1e-4)
 
 
@@ -308,7 +309,7 @@ def test_without_the_photo_the_render_is_shown(fake: FakeService, viewer: Viewer
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: "photo was deleted" in browser.text(), "the message")
         image = next(w for w in browser.widgets.values() if w["type"] == "GuiImageMessage")
-        shown = draw.decode(bytes(image["_data"])).mean((0, 1))
+        shown = images.decode(bytes(image["_data"])).mean((0, 1))
         assert np.abs(shown - render_rgb(2, matched=False)).max() < 6
         assert "agrees" in browser.text()
         browser.wait(lambda: "between two, on average" in browser.text(), "the angles")
@@ -347,7 +348,7 @@ def _nothing_more_comes(browser: FakeBrowser) -> bool:
 def _background(browser: FakeBrowser) -> str:
     """What lies behind the scene."""
     data = browser.background["rgb_data"]
-    picture = draw.decode(bytes(data)) if data else np.zeros((1, 1, 3))
+    picture = images.decode(bytes(data)) if data else np.zeros((1, 1, 3))
     return "exact" if np.abs(picture.mean((0, 1)) - EXACT_RGB).max() < 4 else "ground"
 
 
@@ -437,7 +438,10 @@ def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it
     job = fake.job("walk", 3)
     job.walk = [Status.LOCALIZED, Status.LOCALIZED, Status.UNCERTAIN]
     job.finish()
-    texture = lambda: draw.decode(bytes(browser.nodes["/trajectory/current"]["props"]["_image_data"])).mean((0, 1))  # noqa: E731
+
+    def texture() -> np.ndarray:
+        return images.decode(bytes(browser.nodes["/trajectory/current"]["props"]["_image_data"])).mean((0, 1))
+
     with _browser(viewer, "/jobs/walk") as browser:
         for step, told, colour in (
             (2, "only the photo of step 1 is kept", render_rgb(2, matched=False)),
@@ -452,8 +456,8 @@ def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it
 
 def test_a_replay_has_the_splats_and_every_step(fake: FakeService) -> None:
     fake.job("saved", 3, finished=True)
-    service = Service("http://fake", fake.transport)
-    feed = JobFeed(service, "saved")
+    service = ServiceClient("http://fake", fake.transport)
+    feed = JobStream(service, "saved")
     feed.start()
     until(lambda: feed.complete, "the job")
     page = replay_html(feed, Library(service).scene("ball"))
@@ -501,8 +505,8 @@ def test_no_browser_can_open_a_public_tunnel(
     asked = threading.Event()
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: asked.set())
     if not forbidden:  # shows that the message is the right one: without the ban it has its effect
-        monkeypatch.setattr(app, "forbid_sharing", lambda server: None)
-    viewer = Viewer(Service("http://fake", fake.transport), "127.0.0.1", 0)
+        monkeypatch.setattr(viewer_server, "forbid_sharing", lambda server: None)
+    viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
     try:
         with _browser(viewer) as browser:
             browser.send(type="ShareUrlRequest")
@@ -517,13 +521,13 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
     other: Any = object.__new__(viser.ViserServer)
     other._websock_server, other.stop = SimpleNamespace(_handlers={}), stopped.set
     with pytest.raises(RuntimeError, match="tunnel"):
-        private.forbid_sharing(other)
+        viser_internals.forbid_sharing(other)
     assert stopped.is_set()
 
 
 def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     with pytest.raises(OSError, match="is taken"):
-        Viewer(Service("http://fake", fake.transport), "127.0.0.1", viewer.server.get_port())
+        Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", viewer.server.get_port())
 
 
 @pytest.mark.parametrize(
@@ -536,14 +540,14 @@ def test_only_plain_ids_are_taken_from_an_address(path: str, job: str | None) ->
 
 
 def test_a_path_that_cannot_be_told_means_the_newest_job(viewer: Viewer) -> None:
-    assert private.requested_path(viewer.server, 12345) == "/"
+    assert viser_internals.requested_path(viewer.server, 12345) == "/"
 
 
 def test_a_picture_that_cannot_be_had_is_told_and_the_rest_goes_on(
     fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake.job("j", 3, finished=True)
-    monkeypatch.setattr(JobFeed, "render", _refused)
+    monkeypatch.setattr(JobStream, "render", _refused)
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: "no picture of this step: /render: HTTP 503" in browser.text(), "the message")
         browser.set("step", 1)
@@ -552,7 +556,7 @@ def test_a_picture_that_cannot_be_had_is_told_and_the_rest_goes_on(
 
 
 def _refused(*_: object, **__: object) -> np.ndarray:
-    raise ServiceTrouble("/render", "", 503)
+    raise ServiceError("/render", "", 503)
 
 
 def test_the_program_serves_until_it_is_told_to_end(fake: FakeService) -> None:

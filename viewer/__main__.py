@@ -10,8 +10,8 @@ import signal
 import threading
 from contextlib import redirect_stdout
 
-from viewer.app import Viewer
-from viewer.client import Service
+from viewer.service_client import ServiceClient
+from viewer.viewer_server import Viewer
 
 log = logging.getLogger("viewer")
 
@@ -32,7 +32,7 @@ def main() -> None:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    service = Service(arguments.service, key=os.environ.get("SPLATFIX_VIEWER_KEY", ""))
+    service = ServiceClient(arguments.service, key=os.environ.get("SPLATFIX_VIEWER_KEY", ""))
     with redirect_stdout(io.StringIO()):  # viser prints an address that no one but the relay shall use
         viewer = Viewer(service, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())

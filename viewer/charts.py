@@ -14,7 +14,7 @@ from jaxtyping import Float64
 
 from service.results import IterationRecord
 from service.types import Pose
-from viewer.measure import SHORTEST_PX, MatchView, angle_counts, mean_angle_deg, pose_error
+from viewer.match_geometry import SHORTEST_PX, MatchView, angle_counts, mean_angle_deg, pose_error
 
 _BINS = 24
 _QUIET = "#9aa0a8"

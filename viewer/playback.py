@@ -10,9 +10,9 @@ import numpy as np
 
 from service.results import IterationRecord
 from service.types import Pose
-from viewer.client import Answer, JobSummary, JobView
-from viewer.draw import INLIER, OUTLIER, ColourBy, Mode, score_colours
-from viewer.measure import MatchView, pose_error
+from viewer.comparison_images import INLIER, OUTLIER, ColourBy, Mode, score_colours
+from viewer.match_geometry import MatchView, pose_error
+from viewer.service_client import Answer, JobSummary, JobView
 
 STATUS_COLOURS = {
     "localized": (60, 180, 90),

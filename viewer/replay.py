@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import viser
 
 from service.results import IterationRecord
-from viewer import shapes
-from viewer.client import JobView, Splats
-from viewer.draw import match_colours, reduced
-from viewer.feed import JobFeed, SceneContent
-from viewer.measure import seen
-from viewer.private import forbid_sharing
-from viewer.stage import Stage
+from viewer import frusta
+from viewer.comparison_images import match_colours, reduced
+from viewer.job_stream import JobStream, SceneContent
+from viewer.match_geometry import matches_at_pose
+from viewer.scene_3d import Scene3D
+from viewer.service_client import JobView, Splats
+from viewer.viser_internals import forbid_sharing
 
 MAX_SPLATS = 120_000
 """4 MB of the file."""
@@ -23,8 +23,8 @@ _STEP_S, _END_S = 0.6, 2.0
 _TEXTURE_PX = 384
 
 
-def replay_html(feed: JobFeed, content: SceneContent) -> str:
-    """Return the file's text; renders every step, which takes a while. Raises ServiceTrouble, ValueError."""
+def replay_html(feed: JobStream, content: SceneContent) -> str:
+    """Return the file's text; renders every step, which takes a while. Raises ServiceError, ValueError."""
     job, records = feed.job, feed.records[:]
     if job is None or not records:
         raise ValueError("the job has no steps yet")
@@ -32,10 +32,10 @@ def replay_html(feed: JobFeed, content: SceneContent) -> str:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         forbid_sharing(server)
-        stage = Stage(_Tape(server))
+        stage = Scene3D(_Tape(server))
         stage.show_scene(_decimated(content), None)
         stage.add_splats()
-        _look(server, shapes.behind(records[-1].pose, content.extent, content.splats.centres))
+        _look(server, frusta.behind(records[-1].pose, content.extent, content.splats.centres))
         stage.show_trajectory(records, job)
         tape = server.get_scene_serializer()
         every = -(-len(records) // _STEPS)
@@ -52,7 +52,7 @@ def replay_html(feed: JobFeed, content: SceneContent) -> str:
 
 
 class _Tape:
-    """What `Stage` draws on; its camera is nobody's."""
+    """What `Scene3D` draws on; its camera is nobody's."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.scene, self.camera = server.scene, SimpleNamespace()
@@ -65,7 +65,7 @@ def _said(record: IterationRecord, count: int, job: JobView) -> str:
     return f"{text}, {job.answer.status.replace('_', ' ')}" if ended and job.answer else text
 
 
-def _show(stage: Stage, feed: JobFeed, index: int) -> None:
+def _show(stage: Scene3D, feed: JobStream, index: int) -> None:
     record, job = feed.records[index], feed.job
     if job is None:
         return
@@ -74,11 +74,11 @@ def _show(stage: Stage, feed: JobFeed, index: int) -> None:
     weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
     stage.show_candidates(next(weighed, None), job.photo)
     source = feed.matches(index)
-    view = seen(source, job.camera(record), index) if source else None
+    view = matches_at_pose(source, job.camera(record), index) if source else None
     stage.show_matches(view, None if view is None else match_colours(view, "inlier"))
 
 
-def _look(server: viser.ViserServer, view: shapes.Viewpoint) -> None:
+def _look(server: viser.ViserServer, view: frusta.Viewpoint) -> None:
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, view.fov_rad
 

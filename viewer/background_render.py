@@ -17,8 +17,8 @@ import viser.transforms as vt
 from jaxtyping import UInt8
 
 from service.types import Camera, Intrinsics, Pose
-from viewer.client import Service, ServiceTrouble
-from viewer.draw import decode
+from viewer.comparison_images import decode
+from viewer.service_client import ServiceClient, ServiceError
 
 log = logging.getLogger(__name__)
 
@@ -29,10 +29,10 @@ _LONG_SIDE_PX, _MOVING_PX = 1280, 480
 Show = Callable[[UInt8[np.ndarray, "h w 3"] | None], None]
 
 
-class ExactView:
+class BackgroundRender:
     """One browser's. Its thread sleeps until the view has moved; `close` ends it."""
 
-    def __init__(self, client: viser.ClientHandle, service: Service, show: Show) -> None:
+    def __init__(self, client: viser.ClientHandle, service: ServiceClient, show: Show) -> None:
         """`show` puts a picture in the place of the browser's splats, and with None the splats back."""
         self._client, self._service, self._show = client, service, show
         self._scene_id: str | None = None
@@ -110,7 +110,7 @@ class ExactView:
         self._view = self._camera()
         try:
             picture = decode(self._service.picture(scene_id, self._camera(long_side_px)))
-        except (ServiceTrouble, ValueError) as error:
+        except (ServiceError, ValueError) as error:
             log.warning("no exact render: %s", error)
             return
         with self._changed:

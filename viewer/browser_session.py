@@ -19,15 +19,15 @@ import numpy as np
 import viser
 
 from service.types import Camera, Pose
-from viewer.client import ServiceTrouble
-from viewer.detail import Detail
-from viewer.draw import Mode
-from viewer.exact import ExactView
-from viewer.feed import JobFeed, Library, SceneContent
-from viewer.panel import NO_JOB, NO_SCENE, Panel
+from viewer.background_render import BackgroundRender
+from viewer.comparison_images import Mode
+from viewer.controls import NO_JOB, NO_SCENE, Controls
+from viewer.job_stream import JobStream, Library, SceneContent
 from viewer.playback import Playback, headline_html, job_label, legend_html, scene_html
 from viewer.replay import replay_html
-from viewer.stage import Layer, Stage
+from viewer.scene_3d import Layer, Scene3D
+from viewer.service_client import ServiceError
+from viewer.step_display import StepDisplay
 
 log = logging.getLogger(__name__)
 
@@ -36,24 +36,24 @@ _ARRIVAL_S = 2.0
 Action = Callable[[], None]
 
 
-class Session:
+class BrowserSession:
     """Ends with its browser tab: `close` frees everything."""
 
     def __init__(self, client: viser.ClientHandle, library: Library, job_id: str | None, *, splats: bool) -> None:
         """`splats`: whether the browser is to draw them, to begin with; else the service does."""
-        self.panel = Panel(client, splats=splats)
-        self.stage = Stage(client, splats=splats)
+        self.panel = Controls(client, splats=splats)
+        self.stage = Scene3D(client, splats=splats)
         self._client = client
         self._library = library
         self._follows = job_id is None
         """Shows the newest job, whichever that is."""
         self._wanted = job_id
         """The job that the address or the user asked for, where it doesn't follow; None: a scene by itself."""
-        self._feed: JobFeed | None = None
+        self._feed: JobStream | None = None
         self._scene_id: str | None = None
         self._playback = Playback()
-        self._detail = Detail(self.panel, self.stage)
-        self._exact = ExactView(client, library.service, self._show_exact)
+        self._detail = StepDisplay(self.panel, self.stage)
+        self._exact = BackgroundRender(client, library.service, self._show_exact)
         self._saving = False
         self._opened = self._ticked = 0.0
         self._asked: dict[str, Any] = {}
@@ -123,7 +123,7 @@ class Session:
     def _try(self, action: Action) -> None:
         try:
             action()
-        except (ServiceTrouble, ValueError) as error:
+        except (ServiceError, ValueError) as error:
             log.warning("%s", error)
             self.panel.headline.content = headline_html(None, 0, str(error))
         except Exception:

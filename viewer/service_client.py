@@ -20,7 +20,7 @@ FINISHED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 _JOBS_LISTED = 50
 
 
-class ServiceTrouble(Exception):
+class ServiceError(Exception):
     """The service does not answer, or answers with an error."""
 
     def __init__(self, path: str, problem: object, status: int | None = None) -> None:
@@ -83,20 +83,20 @@ class JobView:
     estimator: str
     photo_name: str
     photo: Intrinsics
-    """Of the image that `Service.photo` returns."""
+    """Of the image that `ServiceClient.photo` returns."""
     truth: Pose | None
     """As whoever sent the photo knows it."""
     answer: Answer | None
     """None until it has ended."""
     photo_step: int | None = None
-    """Of several photos, the step that `Service.photo` belongs to; None: there is one photo, or it isn't known yet."""
+    """Of several photos, the step whose photo `ServiceClient.photo` returns; None: one photo, or not known yet."""
 
     def camera(self, record: IterationRecord) -> Camera:
         """Return the photo's camera as a step has it: its pose, its estimate of the lens."""
         return Camera(self.photo.corrected(record.lens), record.pose)
 
 
-class Service:
+class ServiceClient:
     """One running splatfix service. Safe to use from several threads."""
 
     def __init__(self, url: str, transport: httpx.BaseTransport | None = None, key: str = "") -> None:
@@ -158,9 +158,9 @@ class Service:
             answer = self._http.post(path, json={"pose": pose, "intrinsics": size, "format": kind})
             return answer.raise_for_status().content
         except httpx.HTTPStatusError as error:
-            raise ServiceTrouble(path, error, error.response.status_code) from error
+            raise ServiceError(path, error, error.response.status_code) from error
         except httpx.HTTPError as error:
-            raise ServiceTrouble(path, error) from error
+            raise ServiceError(path, error) from error
 
     def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | JobView]:
         """Yield a job's records from the first one on, at last the finished job; less if `stop` is set."""
@@ -169,7 +169,7 @@ class Service:
         try:
             with self._http.stream("GET", path, timeout=timeout) as response:
                 if response.is_error:
-                    raise ServiceTrouble(path, "", response.status_code)
+                    raise ServiceError(path, "", response.status_code)
                 for event, data in sse_events(response.iter_lines()):
                     if stop.is_set():
                         return
@@ -179,7 +179,7 @@ class Service:
                         yield _job(json.loads(data))
                         return
         except httpx.HTTPError as error:
-            raise ServiceTrouble(path, error) from error
+            raise ServiceError(path, error) from error
 
     def _json(self, path: str) -> Any:
         return json.loads(self._bytes(path))
@@ -188,9 +188,9 @@ class Service:
         try:
             return self._http.get(path, params=query).raise_for_status().content
         except httpx.HTTPStatusError as error:
-            raise ServiceTrouble(path, error, error.response.status_code) from error
+            raise ServiceError(path, error, error.response.status_code) from error
         except httpx.HTTPError as error:
-            raise ServiceTrouble(path, error) from error
+            raise ServiceError(path, error) from error
 
 
 def sse_events(lines: Iterator[str]) -> Iterator[tuple[str, str]]:

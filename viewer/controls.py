@@ -7,8 +7,8 @@ from typing import get_args
 import numpy as np
 import viser
 
-from viewer.draw import MODES, ColourBy
-from viewer.stage import Layer
+from viewer.comparison_images import MODES, ColourBy
+from viewer.scene_3d import Layer
 
 NO_JOB: str = "no job yet"
 NO_SCENE: str = "no scene yet"
@@ -18,7 +18,7 @@ _REPLAY_HINT = "One HTML file that plays this job from disk, without a service."
 _SPEEDS = ("1", "2", "5", "10", "20")
 
 
-class Panel:
+class Controls:
     """The handles, by what they are for. What happens on a click is wired in `session`."""
 
     def __init__(self, client: viser.ClientHandle, *, splats: bool) -> None:

@@ -17,12 +17,12 @@ from jaxtyping import Float64, UInt8
 
 from service.results import Candidates, IterationRecord
 from service.types import Camera, Intrinsics, Pose
-from viewer import shapes
-from viewer.client import JobView
-from viewer.draw import score_colours
-from viewer.feed import SceneContent
-from viewer.measure import MatchView
+from viewer import frusta
+from viewer.comparison_images import score_colours
+from viewer.job_stream import SceneContent
+from viewer.match_geometry import MatchView
 from viewer.playback import CURRENT_COLOUR, INITIAL_COLOUR, TRAINING_COLOUR, TRUTH_COLOUR, answer_colour
+from viewer.service_client import JobView
 
 Layer = Literal["splats", "training cameras", "trajectory", "candidates", "match vectors"]
 
@@ -42,7 +42,7 @@ class Canvas(Protocol):
     def flush(self) -> None: ...
 
 
-class Stage:
+class Scene3D:
     """What one browser sees. All methods are called from one thread."""
 
     def __init__(self, client: Canvas, *, splats: bool = True) -> None:
@@ -68,13 +68,13 @@ class Stage:
             # Nearer than this nothing is drawn: the frusta that one stands in would cover what one looks at.
             client.camera.near, client.camera.far = 1.15 * scene.frustum, 500 * scene.radius
             if pose is None:
-                self.look(shapes.first_view(scene, cameras))
+                self.look(frusta.first_view(scene, cameras))
             else:
                 self.look_over(pose)
         self.show_exact(None)
         client.flush()
-        poses = shapes.stacked([c.pose for c in cameras])
-        segments = shapes.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
+        poses = frusta.stacked([c.pose for c in cameras])
+        segments = frusta.frusta(poses, [c.intrinsics for c in cameras], 0.6 * scene.frustum)
         self._lines("training cameras", "cameras", segments, TRAINING_COLOUR, 1.0)
 
     def show_trajectory(self, records: Sequence[IterationRecord], job: JobView) -> None:
@@ -82,7 +82,7 @@ class Stage:
         if self._scene is None or not records:
             return
         depth = self._scene.extent.frustum
-        poses = shapes.stacked([r.pose for r in records])
+        poses = frusta.stacked([r.pose for r in records])
         moved = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max((1, 2), initial=0.0) > 0) + 1
         kept = [0, *moved.tolist()]
         steps = poses[kept]
@@ -90,7 +90,7 @@ class Stage:
         colour = answer_colour(job.answer)
         self._spline(steps[:, :3, 3], colour)
         lenses = [job.camera(records[i]).intrinsics for i in kept[1:-1]]
-        ghosts = shapes.frusta(steps[1:-1], lenses, 0.5 * depth)
+        ghosts = frusta.frusta(steps[1:-1], lenses, 0.5 * depth)
         self._lines("trajectory", "steps", ghosts, INITIAL_COLOUR, 1.0)
         self._frustum("initial", job.camera(records[0]), INITIAL_COLOUR, 0.8 * depth)
         if job.answer is not None:
@@ -108,7 +108,7 @@ class Stage:
             return
         with self._client.atomic():
             node.wxyz, node.position = _wxyz(camera.pose.world_from_camera), camera.pose.position_in_world
-            node.fov, node.aspect, node.scale = shapes.frustum_form(camera.intrinsics, depth)
+            node.fov, node.aspect, node.scale = frusta.frustum_form(camera.intrinsics, depth)
 
     def label(self, pose: Pose, text: str) -> None:
         """Write above the picture in a camera."""
@@ -126,8 +126,8 @@ class Stage:
         colours = score_colours(scores)
         depth = self._scene.extent.frustum
         best = np.argsort(-scores, kind="stable")[:_FRUSTA]
-        segments = shapes.frusta(poses[best], [photo] * len(best), 0.7 * depth)
-        self._lines("candidates", "candidates", segments, shapes.frustum_colours(_linear(colours[best])), 1.5)
+        segments = frusta.frusta(poses[best], [photo] * len(best), 0.7 * depth)
+        self._lines("candidates", "candidates", segments, frusta.frustum_colours(_linear(colours[best])), 1.5)
         # All of them as one cloud: hundreds of frusta would be a thicket.
         self._points("candidates", "cloud", poses[:, :3, 3], colours, 0.07 * depth)
 
@@ -168,14 +168,14 @@ class Stage:
             return None
         ray, depth = (np.array(origin, np.float64), np.array(direction, np.float64)), self._scene.extent.frustum
         indices, poses = self._steps
-        if self._visible["trajectory"] and (hit := shapes.nearest_to_ray(*ray, poses, depth)) is not None:
+        if self._visible["trajectory"] and (hit := frusta.nearest_to_ray(*ray, poses, depth)) is not None:
             return indices[hit]
         cameras = [named.camera for named in self._scene.view.cameras]
-        training = shapes.stacked([camera.pose for camera in cameras])
-        hit = shapes.nearest_to_ray(*ray, training, 0.6 * depth) if self._visible["training cameras"] else None
+        training = frusta.stacked([camera.pose for camera in cameras])
+        hit = frusta.nearest_to_ray(*ray, training, 0.6 * depth) if self._visible["training cameras"] else None
         return None if hit is None else cameras[hit]
 
-    def look(self, view: shapes.Viewpoint) -> None:
+    def look(self, view: frusta.Viewpoint) -> None:
         camera = self._client.camera
         with self._client.atomic():
             camera.up_direction = view.up
@@ -185,25 +185,25 @@ class Stage:
 
     def look_through(self, camera: Camera) -> None:
         if self._scene is not None:
-            self.look(shapes.through(camera, self._scene.extent, self._client.camera.aspect))
+            self.look(frusta.through(camera, self._scene.extent, self._client.camera.aspect))
 
     def look_over(self, pose: Pose) -> None:
         """Stand behind a camera, at once."""
         if self._scene is not None:
-            self.look(shapes.behind(pose, self._scene.extent, self._scene.splats.centres))
+            self.look(frusta.behind(pose, self._scene.extent, self._scene.splats.centres))
 
     def fly_to(self, pose: Pose) -> None:
         """Move over the shoulder of a camera within a second; blocks for that long."""
         if self._scene is None:
             return
         camera = self._client.camera
-        start = shapes.Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov)
-        goal = shapes.behind(pose, self._scene.extent, self._scene.splats.centres)
+        start = frusta.Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov)
+        goal = frusta.behind(pose, self._scene.extent, self._scene.splats.centres)
         began = time.monotonic()
         share = 0.0
         while share < 1:
             share = min(1.0, (time.monotonic() - began) / _FLIGHT_S)
-            self.look(shapes.between(start, goal, share))
+            self.look(frusta.between(start, goal, share))
             self._client.flush()
             time.sleep(_FRAME_S)
 
@@ -223,7 +223,7 @@ class Stage:
         self._nodes["splats"]["splats"] = self._client.scene.add_gaussian_splats(
             "/splats/splats",
             centers=splats.centres * np.float32(k),
-            covariances=shapes.full_covariances(splats.covariances * np.float32(k * k)),
+            covariances=frusta.full_covariances(splats.covariances * np.float32(k * k)),
             rgbs=splats.rgba[:, :3],
             opacities=splats.rgba[:, 3:],
             scale=1 / k,
@@ -306,7 +306,7 @@ class Stage:
         depth: float,
         texture: UInt8[np.ndarray, "h w 3"] | None = None,
     ) -> None:
-        fov, aspect, scale = shapes.frustum_form(camera.intrinsics, depth)
+        fov, aspect, scale = frusta.frustum_form(camera.intrinsics, depth)
         self._nodes["trajectory"][name] = self._client.scene.add_camera_frustum(
             f"/trajectory/{name}",
             fov=fov,

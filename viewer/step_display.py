@@ -18,13 +18,23 @@ from jaxtyping import UInt8
 
 from service.results import IterationRecord
 from viewer.charts import curves_html, stages_html, vectors_html
-from viewer.client import ServiceTrouble
-from viewer.draw import ColourBy, Mode, Overlay, beside, flicker_html, flow, match_colours, overlaid, reduced
-from viewer.feed import JobFeed
-from viewer.measure import MatchView, seen
-from viewer.panel import Panel
+from viewer.comparison_images import (
+    ColourBy,
+    Mode,
+    Overlay,
+    beside,
+    flicker_html,
+    flow,
+    match_colours,
+    overlaid,
+    reduced,
+)
+from viewer.controls import Controls
+from viewer.job_stream import JobStream
+from viewer.match_geometry import MatchView, matches_at_pose
 from viewer.playback import caption_html, flow_caption_html, record_html, small_html
-from viewer.stage import Stage
+from viewer.scene_3d import Scene3D
+from viewer.service_client import ServiceError
 
 _TEXTURE_PX = 512
 _KEPT_PICTURES = 4
@@ -32,10 +42,10 @@ _APART_S = 0.02
 """viser puts in one message what comes within a sixtieth of a second."""
 
 
-class Detail:
+class StepDisplay:
     """All methods are called from the session's thread."""
 
-    def __init__(self, panel: Panel, stage: Stage) -> None:
+    def __init__(self, panel: Controls, stage: Scene3D) -> None:
         self.mode: Mode = "beside"
         self._panel, self._stage = panel, stage
         self._shown: tuple[str, int] | None = None
@@ -58,7 +68,7 @@ class Detail:
         return max(0.0, self._todo[0][0] - time.monotonic()) if self._todo else None
 
     def go_on(self) -> None:
-        """Do what is due next. Raises ServiceTrouble, ValueError."""
+        """Do what is due next. Raises ServiceError, ValueError."""
         self._todo.pop(0)[1]()
 
     def clear(self) -> None:
@@ -67,7 +77,7 @@ class Detail:
         self._composed = {}
         self._stage.clear_job()
 
-    def show(self, feed: JobFeed, index: int) -> None:
+    def show(self, feed: JobStream, index: int) -> None:
         """Show a record; the rest follows with `go_on`."""
         record, job = feed.records[index], feed.job
         if job is None:
@@ -80,13 +90,13 @@ class Detail:
             self._shown = feed.id, index
             self.redraw(feed, index)
 
-    def redraw(self, feed: JobFeed, index: int) -> None:
+    def redraw(self, feed: JobStream, index: int) -> None:
         """Let pictures, charts and 3D follow with `go_on`."""
         nearby = [k for k in (index - 1, index + 1) if 0 <= k < len(feed.records)]
         self._todo = [(0.0, partial(self._draw, feed, index))]
         self._todo += [(0.0, partial(self._prepare, feed, feed.records[k])) for k in nearby]
 
-    def _draw(self, feed: JobFeed, index: int) -> None:
+    def _draw(self, feed: JobStream, index: int) -> None:
         """Bring pictures and charts up to the step."""
         record, view = feed.records[index], None
         try:
@@ -95,14 +105,14 @@ class Detail:
             self._panel.flush()
             self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
             self._flow(feed, record, view)
-        except (ServiceTrouble, ValueError) as error:
+        except (ServiceError, ValueError) as error:
             self._panel.caption.content = small_html(f"There is no picture of this step: {error}")
         truth = feed.job.truth if feed.job else None
         self._panel.curves.content = curves_html(feed.records, truth, index)
         self._panel.flush()
         self._todo.insert(0, (time.monotonic() + _APART_S, partial(self._place, feed, record, view)))
 
-    def _place(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
+    def _place(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
         """Bring the 3D up to the step."""
         if feed.job is None:
             return
@@ -118,9 +128,9 @@ class Detail:
         self._stage.show_candidates(next(weighed, None), feed.job.photo)
         self._stage.show_matches(view, None if view is None else match_colours(view, self._colour_by))
 
-    def _prepare(self, feed: JobFeed, record: IterationRecord) -> None:
+    def _prepare(self, feed: JobStream, record: IterationRecord) -> None:
         """Have at hand the picture of a step."""
-        with suppress(ServiceTrouble, ValueError):
+        with suppress(ServiceError, ValueError):
             photo, view = _photo(feed, record), self._view(feed, record)
             if photo is None:
                 feed.render(record.index, matched=False)
@@ -129,12 +139,12 @@ class Detail:
             else:
                 self._compared(feed, record, view, photo)
 
-    def _view(self, feed: JobFeed, record: IterationRecord) -> MatchView | None:
+    def _view(self, feed: JobStream, record: IterationRecord) -> MatchView | None:
         """Return the match vectors as the step sees them."""
         source = feed.matches(record.index)
-        return seen(source, feed.job.camera(record), record.index) if source and feed.job else None
+        return matches_at_pose(source, feed.job.camera(record), record.index) if source and feed.job else None
 
-    def _flow(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
+    def _flow(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
         """Draw the match vectors over the photo, or over what it should look like."""
         self._panel.flow.visible = view is not None
         if view is not None:
@@ -142,7 +152,7 @@ class Detail:
             ground = feed.render(record.index, matched=False) if photo is None else photo
             self._panel.flow.image = flow(ground, view, match_colours(view, self._colour_by))
 
-    def _picture(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> None:
+    def _picture(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
         """Compose photo and render."""
         panel, mode = self._panel, self.mode
         panel.matches.visible = mode == "beside"
@@ -164,7 +174,7 @@ class Detail:
         panel.window.visible = True
 
     def _compared(
-        self, feed: JobFeed, record: IterationRecord, view: MatchView | None, photo: UInt8[np.ndarray, "h w 3"]
+        self, feed: JobStream, record: IterationRecord, view: MatchView | None, photo: UInt8[np.ndarray, "h w 3"]
     ) -> UInt8[np.ndarray, "a b 3"]:
         """Return photo and render in one picture; the last few are kept."""
         mode, by, weight = self.mode, self._colour_by, self._panel.weight.value
@@ -180,7 +190,7 @@ class Detail:
             self._composed = dict([*kept, (key, picture)])
         return self._composed[key]
 
-    def _render(self, feed: JobFeed, record: IterationRecord, view: MatchView | None) -> UInt8[np.ndarray, "h w 3"]:
+    def _render(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> UInt8[np.ndarray, "h w 3"]:
         """Return what stands beside the photo."""
         # Matches of this very step may refer to another view than its pose: then it is that view.
         matched = self._with_lines and view is not None and view.carried_from is None
@@ -195,7 +205,7 @@ class Detail:
         return cast(ColourBy, self._panel.colour_by.value)
 
 
-def _photo(feed: JobFeed, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the photo that a step is about; None: it isn't there (any more). Raises ServiceTrouble, ValueError."""
+def _photo(feed: JobStream, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
+    """Return the photo that a step is about; None: it isn't there (any more). Raises ServiceError, ValueError."""
     of = feed.job.photo_step if feed.job else None
     return feed.photo() if of in (None, record.index) else None

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int32, UInt8
 
-from viewer.measure import MatchView
+from viewer.match_geometry import MatchView
 
 Overlay = Literal["blend", "checker", "difference"]
 Mode = Literal["beside", Overlay, "flicker"]

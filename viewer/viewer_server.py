@@ -9,10 +9,10 @@ import time
 
 import viser
 
-from viewer.client import Service
-from viewer.feed import Library
-from viewer.private import disconnect_all, forbid_sharing, requested_path
-from viewer.session import Session
+from viewer.browser_session import BrowserSession
+from viewer.job_stream import Library
+from viewer.service_client import ServiceClient
+from viewer.viser_internals import disconnect_all, forbid_sharing, requested_path
 
 log = logging.getLogger(__name__)
 
@@ -22,10 +22,10 @@ _JOB_PATH = re.compile(r"/jobs/([A-Za-z0-9_-]{1,64})/?")
 class Viewer:
     """Serves browsers from its construction until `stop`."""
 
-    def __init__(self, service: Service, host: str, port: int) -> None:
+    def __init__(self, service: ServiceClient, host: str, port: int) -> None:
         """`port` 0 takes any free one. Raises OSError if the port is taken."""
         self._library = Library(service)
-        self._sessions: dict[int, Session] = {}
+        self._sessions: dict[int, BrowserSession] = {}
         self._lock = threading.Lock()
         self.server = viser.ViserServer(host=host, port=port, label="splatfix", verbose=False)
         if port not in (0, self.server.get_port()):  # viser moves on to the next free port by itself
@@ -53,7 +53,7 @@ class Viewer:
 
     def _open(self, client: viser.ClientHandle) -> None:
         path = requested_path(self.server, client.client_id)
-        session = Session(client, self._library, job_of(path), splats=not path.endswith("?gl=software"))
+        session = BrowserSession(client, self._library, job_of(path), splats=not path.endswith("?gl=software"))
         with self._lock:
             self._sessions[client.client_id] = session
         session.start()

@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from service.results import IterationRecord
-from viewer.client import JobSummary, JobView, SceneView, Service, ServiceTrouble, Splats
-from viewer.draw import decode
-from viewer.measure import Lifted, lifted
-from viewer.shapes import Extent, extent
+from viewer.comparison_images import decode
+from viewer.frusta import Extent, extent
+from viewer.match_geometry import BackprojectedMatches, backproject_matches
+from viewer.service_client import JobSummary, JobView, SceneView, ServiceClient, ServiceError, Splats
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +33,10 @@ _POLL_S = 0.5
 Listener = Callable[[], None]
 
 
-class JobFeed:
+class JobStream:
     """One job: grows while it runs. `records` is only ever appended to; read it from any thread."""
 
-    def __init__(self, service: Service, job_id: str) -> None:
+    def __init__(self, service: ServiceClient, job_id: str) -> None:
         self.id = job_id
         self.records: list[IterationRecord] = []
         self.job: JobView | None = None
@@ -51,7 +51,7 @@ class JobFeed:
         self._photo: UInt8[np.ndarray, "h w 3"] | None = None
         self._asked_photo = False
         self._renders: OrderedDict[tuple[int, bool], UInt8[np.ndarray, "h w 3"]] = OrderedDict()
-        self._lifted: OrderedDict[int, Lifted] = OrderedDict()
+        self._lifted: OrderedDict[int, BackprojectedMatches] = OrderedDict()
         self._lock = threading.Lock()
 
     def start(self) -> None:
@@ -64,19 +64,19 @@ class JobFeed:
     def photo(self) -> UInt8[np.ndarray, "h w 3"] | None:
         """Return the job's photo, asked for once; None: it was deleted after the job.
 
-        Raises ServiceTrouble, ValueError.
+        Raises ServiceError, ValueError.
         """
         if not self._asked_photo:
             try:
                 self._photo = decode(self._service.photo(self.id))
-            except ServiceTrouble as trouble:
+            except ServiceError as trouble:
                 if trouble.status not in (404, 410):
                     raise
             self._asked_photo = True
         return self._photo
 
     def render(self, index: int, *, matched: bool) -> UInt8[np.ndarray, "h w 3"]:
-        """Return a record's render, one of the last few or fetched. Raises ServiceTrouble, ValueError."""
+        """Return a record's render, one of the last few or fetched. Raises ServiceError, ValueError."""
         key = index, matched
         with self._lock:
             if key in self._renders:
@@ -89,10 +89,10 @@ class JobFeed:
                 self._renders.popitem(last=False)
         return image
 
-    def matches(self, index: int) -> Lifted | None:
+    def matches(self, index: int) -> BackprojectedMatches | None:
         """Return the latest matches that a step knows: its own, or an earlier one's.
 
-        Raises ServiceTrouble, ValueError.
+        Raises ServiceError, ValueError.
         """
         record = next((r for r in reversed(self.records[: index + 1]) if r.matches is not None), None)
         if record is None or record.matches is None or self.job is None:
@@ -101,7 +101,7 @@ class JobFeed:
             if record.index in self._lifted:
                 return self._lifted[record.index]
         depth = self._service.depth(self.job.scene, record.matches.render_camera)
-        found = lifted(record.matches, depth, record.index)
+        found = backproject_matches(record.matches, depth, record.index)
         with self._lock:
             self._lifted[record.index] = found
             if len(self._lifted) > _RENDERS_KEPT:
@@ -115,8 +115,8 @@ class JobFeed:
                 self._tell()
                 for event in self._service.events(self.id, self._stop):
                     self._take(event)
-            except (ServiceTrouble, ValueError, KeyError) as error:
-                gone = isinstance(error, ServiceTrouble) and error.status == 404
+            except (ServiceError, ValueError, KeyError) as error:
+                gone = isinstance(error, ServiceError) and error.status == 404
                 log.warning("job %s: %s", self.id, error)
                 self.trouble = f"The service has no job {self.id} (any more)." if gone else str(error)
                 self._tell()
@@ -150,13 +150,13 @@ class SceneContent:
 class Library:
     """Everything that browsers share, by name."""
 
-    def __init__(self, service: Service) -> None:
+    def __init__(self, service: ServiceClient) -> None:
         self.service = service
         self.jobs: tuple[JobSummary, ...] | None = None
         """Newest first, up to date while somebody listens; None: not known yet."""
         self.scenes: tuple[str, ...] = ()
         """Ids of those that can be shown."""
-        self._feeds: dict[str, JobFeed] = {}
+        self._feeds: dict[str, JobStream] = {}
         self._scenes: OrderedDict[str, SceneContent] = OrderedDict()
         self._listeners: set[Listener] = set()
         self._awake = threading.Event()
@@ -185,17 +185,17 @@ class Library:
             if not self._listeners:
                 self._awake.clear()
 
-    def follow(self, job_id: str, listener: Listener) -> JobFeed:
+    def follow(self, job_id: str, listener: Listener) -> JobStream:
         """Return the job's feed, shared with everyone who follows it; `leave` it when done."""
         with self._lock:
-            feed = self._feeds.get(job_id) or JobFeed(self.service, job_id)
+            feed = self._feeds.get(job_id) or JobStream(self.service, job_id)
             feed.listeners.add(listener)
             if job_id not in self._feeds:
                 self._feeds[job_id] = feed
                 feed.start()
             return feed
 
-    def leave(self, feed: JobFeed, listener: Listener) -> None:
+    def leave(self, feed: JobStream, listener: Listener) -> None:
         with self._lock:
             feed.listeners.discard(listener)
             if not feed.listeners and self._feeds.get(feed.id) is feed:
@@ -203,7 +203,7 @@ class Library:
                 del self._feeds[feed.id]
 
     def scene(self, scene_id: str) -> SceneContent:
-        """Return a scene for drawing; the last few are kept. Raises ServiceTrouble, ValueError."""
+        """Return a scene for drawing; the last few are kept. Raises ServiceError, ValueError."""
         with self._lock:
             if scene_id in self._scenes:
                 self._scenes.move_to_end(scene_id)
@@ -225,7 +225,7 @@ class Library:
             try:
                 known = tuple(self.service.jobs()), tuple(self.service.scenes())
                 trouble = ""
-            except (ServiceTrouble, ValueError, KeyError) as error:
+            except (ServiceError, ValueError, KeyError) as error:
                 if str(error) != trouble:  # once, not at every poll
                     trouble = str(error)
                     log.warning("list of jobs: %s", error)

@@ -16,7 +16,7 @@ from service.types import Camera, Intrinsics, Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Lifted:
+class BackprojectedMatches:
     """Matches with the points of the scene that they mean."""
 
     matches: MatchVectors
@@ -49,21 +49,21 @@ class MatchView:
     """Record that the matches were made for, if it isn't the step's own."""
 
 
-def lifted(matches: MatchVectors, depth: Float32[np.ndarray, "h w"], index: int) -> Lifted:
+def backproject_matches(matches: MatchVectors, depth: Float32[np.ndarray, "h w"], index: int) -> BackprojectedMatches:
     """Find the scene's point of each match by the depth of the render that was matched."""
     camera = matches.render_camera
     column = np.clip(matches.render_px[:, 0].astype(int), 0, depth.shape[1] - 1)
     row = np.clip(matches.render_px[:, 1].astype(int), 0, depth.shape[0] - 1)
     z = np.asarray(depth[row, column], np.float64)
     z[z <= 0] = np.nan
-    return Lifted(matches, unprojected(matches.render_px, z, camera), index)
+    return BackprojectedMatches(matches, backproject(matches.render_px, z, camera), index)
 
 
-def seen(source: Lifted, at_pose: Camera, index: int) -> MatchView:
+def matches_at_pose(source: BackprojectedMatches, at_pose: Camera, index: int) -> MatchView:
     """Return the matches as the step `index`, which gives the photo this camera, sees them."""
     matches = source.matches
     photo_px = matches.photo_px.astype(np.float64)
-    seen_px = projected(source.points_in_world, at_pose)
+    seen_px = project(source.points_in_world, at_pose)
     carried = source.index != index
     if carried:  # matched with another picture: where the points are in this one
         render_px, render_camera = seen_px, at_pose
@@ -85,7 +85,7 @@ def seen(source: Lifted, at_pose: Camera, index: int) -> MatchView:
     )
 
 
-def unprojected(
+def backproject(
     px: Float[np.ndarray, "m 2"], depth: Float64[np.ndarray, "m"], camera: Camera
 ) -> Float64[np.ndarray, "m 3"]:
     """Return the points of the world at pixels and z-depths."""
@@ -94,7 +94,7 @@ def unprojected(
     return (depth[:, None] * rays) @ world_from_camera[:3, :3].T + world_from_camera[:3, 3]
 
 
-def projected(points_in_world: Float64[np.ndarray, "m 3"], camera: Camera) -> Float64[np.ndarray, "m 2"]:
+def project(points_in_world: Float64[np.ndarray, "m 3"], camera: Camera) -> Float64[np.ndarray, "m 2"]:
     """Return the pixels of points; NaN behind the camera."""
     k, camera_from_world = camera.intrinsics, camera.pose.camera_from_world
     points = points_in_world @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
@@ -135,7 +135,7 @@ def _segments(
     camera_from_world = camera.pose.camera_from_world
     depth = points_in_world @ camera_from_world[2, :3] + camera_from_world[2, 3]
     depth = np.where(depth > 1e-9, depth, np.nan)
-    return np.stack([points_in_world, unprojected(photo_px, depth, camera)], 1)
+    return np.stack([points_in_world, backproject(photo_px, depth, camera)], 1)
 
 
 def _as_if(target: Intrinsics, px: Float64[np.ndarray, "m 2"], source: Intrinsics) -> Float64[np.ndarray, "m 2"]:
