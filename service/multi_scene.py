@@ -19,7 +19,9 @@ import numpy as np
 from service.interfaces import Tools
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request, localize
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.views import PHOTO_PX, correspondences, photo_features
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.views import photo_features
+from service.pose.matching.correspondences import correspondences
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top
 from service.results import IterationRecord, PoseEstimate, StageTiming, Status

@@ -24,7 +24,8 @@ from service.geometry import moved, pose_distance, se3_log
 from service.interfaces import Frame, RenderTally, Tools
 from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
 from service.photos.sequence import SequencePhoto
-from service.pose.features.views import known_at, photo_at, sized
+from service.pose.features.image_sizes import sized
+from service.pose.features.views import known_at, photo_at
 from service.pose.refinement.photometric import PoseUncertainty, pose_uncertainty, refine_photometric
 from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import clear, geometry_signals, judged, verify

@@ -10,8 +10,8 @@ from service.bench.ablation import CONDITIONS, removals, run, table
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.features.views import Correspondences
 from service.pose.matching import search_stages as stages
+from service.pose.matching.correspondences import Correspondences
 from service.types import Intrinsics, Query
 
 LENS = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)

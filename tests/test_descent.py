@@ -7,7 +7,7 @@ from service.estimators.icomma import match_loss
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.pose.descent.adam import Adam
 from service.pose.descent.gradient_descent import Se3, So3T3
-from service.pose.features.views import Correspondences
+from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import epipolar_inliers
 from service.pose.retrieval.scene_focus import Focus
 from service.types import Intrinsics, Pose

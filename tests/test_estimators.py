@@ -19,7 +19,7 @@ from service.localize import LoadedScene, Request, localize
 from service.multi_scene import localize_anywhere
 from service.pose.descent.gradient_descent import photometric
 from service.pose.descent.losses import LOSSES, loss_against
-from service.pose.features.views import to_uint8
+from service.pose.features.rendered_views import to_uint8
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.warm_up import warm_up
 from service.types import Camera, Intrinsics, Pose, Query

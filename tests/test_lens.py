@@ -12,7 +12,7 @@ from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearized
-from service.pose.features.views import to_uint8
+from service.pose.features.rendered_views import to_uint8
 from service.pose.refinement import covariance
 from service.pose.refinement import photometric as alignment
 from service.pose.refinement.photometric import pose_uncertainty, refine_photometric

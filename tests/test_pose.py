@@ -15,17 +15,10 @@ from hypothesis import strategies as st
 from service.geometry import look_at, moved, pose_distance, project, reprojection_error_px, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.views import (
-    PHOTO_PX,
-    correspondences,
-    lifted,
-    photo_at,
-    photo_features,
-    rendered_frame,
-    rendered_view,
-    sized,
-    to_uint8,
-)
+from service.pose.features.image_sizes import PHOTO_PX, sized
+from service.pose.features.rendered_views import backprojected, to_uint8
+from service.pose.features.views import photo_at, photo_features, rendered_frame, rendered_view
+from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.index import built_index, prepared_index
 from service.pose.retrieval.scores import top, vote
@@ -166,7 +159,7 @@ def test_points_behind_the_camera_have_infinite_error() -> None:
 def test_lifted_points_are_where_the_rays_meet_the_walls() -> None:
     camera = Camera(LENS, true_pose())
     frame = PaintedWalls().render([camera])[0]
-    view = lifted(KnownPoints().extract(to_uint8(frame.rgb), 800), frame, camera)
+    view = backprojected(KnownPoints().extract(to_uint8(frame.rgb), 800), frame, camera)
     assert len(view.points_in_world) > 200
     off_plane = np.minimum(np.abs(view.points_in_world[:, 2]), np.abs(view.points_in_world[:, 2] - 0.7))
     assert off_plane.max() < 0.01  # the median over 3x3 pixels: seen 0.003
@@ -182,7 +175,7 @@ def test_features_on_depth_edges_and_in_the_void_are_not_lifted() -> None:
     points = np.array([[10.5, 10.5], [19.5, 10.5], [20.5, 10.5], [30.5, 10.5], [10.5, 35.5]], np.float32)
     features = Features(points, np.ones(5, np.float32), np.eye(5, dtype=np.float32))
     frame = Frame(np.zeros((40, 40, 3), np.float32), alpha, depth, depth)
-    view = lifted(features, frame, Camera(Intrinsics(40, 40, 50.0, 50.0, 20.0, 20.0), Pose(np.eye(4))))
+    view = backprojected(features, frame, Camera(Intrinsics(40, 40, 50.0, 50.0, 20.0, 20.0), Pose(np.eye(4))))
     assert view.features.points_px.tolist() == [[10.5, 10.5], [30.5, 10.5]]
     assert np.allclose(view.points_in_world[:, 2], [2, 3])
 

@@ -22,8 +22,8 @@ from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request
 from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.features.views import Correspondences
 from service.pose.matching import search_stages as stages
+from service.pose.matching.correspondences import Correspondences
 from service.pose.refinement import photometric as alignment
 from service.pose.refinement import pyramid
 from service.pose.retrieval import image_variant as sight

@@ -27,7 +27,9 @@ from service.interfaces import Tools
 from service.pose.descent.adam import Adam
 from service.pose.descent.gradient_descent import Se3, photometric, require_within
 from service.pose.descent.losses import loss_against, require_loss
-from service.pose.features.views import RENDER_PX, Correspondences, known_at, photo_at, sized
+from service.pose.features.image_sizes import RENDER_PX, sized
+from service.pose.features.query_images import QueryImages
+from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import epipolar_inliers, match_record, render_and_match
 from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
@@ -69,7 +71,8 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Descend from the prior. Raises InvalidPrior without one."""
     start = required_prior(query, "icomma")
     intrinsics = sized(query.intrinsics, options.long_side_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
+    images = QueryImages(query, tools.matcher)
+    loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     pose_of = Se3(start, tools.prepared)
     numbers, adam = np.zeros(6), Adam(6, options.rate)
     matches: Correspondences | None = None
@@ -78,7 +81,7 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     for step in range(options.steps):
         pose, record = pose_of.pose(numbers), None
         if off_since is None and step % options.rematch_every == 0:
-            matches, record = _rematched(Camera(intrinsics, pose), query, tools)
+            matches, record = _rematched(Camera(intrinsics, pose), images, tools)
         value, by_twist = photometric(tools.rasterizer, intrinsics, pose, loss)
         if off_since is None and matches is not None:
             apart, by_match = match_loss(matches, query.intrinsics, pose)
@@ -95,10 +98,10 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
         yield record
 
 
-def _rematched(camera: Camera, query: Query, tools: Tools) -> tuple[Correspondences | None, IterationRecord]:
+def _rematched(camera: Camera, images: QueryImages, tools: Tools) -> tuple[Correspondences | None, IterationRecord]:
     """Match with a render; None where there is too little to go by."""
-    found, view = render_and_match(camera, tools.rasterizer, query, tools)
-    kept = epipolar_inliers(found, query.intrinsics)
+    found, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
+    kept = epipolar_inliers(found, images.query.intrinsics)
     record = match_record("match", camera.pose, found, kept, view.camera)
     if int(kept.sum()) < MIN_MATCHES:
         return None, record

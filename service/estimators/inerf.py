@@ -22,7 +22,8 @@ from service.interfaces import Tools
 from service.pose.descent.adam import Adam
 from service.pose.descent.gradient_descent import Se3, photometric, require_within
 from service.pose.descent.losses import Loss, interest_region, loss_against, require_loss
-from service.pose.features.views import RENDER_PX, known_at, photo_at, sized
+from service.pose.features.image_sizes import RENDER_PX, sized
+from service.pose.features.query_images import QueryImages
 from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Pose, Query
@@ -59,8 +60,9 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Descend from the prior. Raises InvalidPrior without one."""
     start = required_prior(query, "inerf")
     intrinsics = sized(query.intrinsics, options.long_side_px)
-    photo = photo_at(query, tools, intrinsics)
-    loss = loss_against(options.loss, photo, known_at(query, tools, intrinsics))
+    images = QueryImages(query, tools.matcher)
+    photo = images.resized(intrinsics)
+    loss = loss_against(options.loss, photo, images.valid_mask(intrinsics))
     choose = _chooser(photo, options.rays, tools.rng) if options.rays else None
     pose_of = Se3(start, tools.prepared)
     numbers, adam = np.zeros(6), Adam(6, options.rate)

@@ -10,7 +10,7 @@ from service.estimators import inerf
 from service.interfaces import Tools
 from service.pose.descent.gradient_descent import require_within
 from service.pose.descent.losses import require_loss
-from service.pose.features.views import RENDER_PX
+from service.pose.features.image_sizes import RENDER_PX
 from service.results import IterationRecord
 from service.types import Query
 

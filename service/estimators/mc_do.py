@@ -31,7 +31,10 @@ from service.pose.descent.contribution_pruning import contributions, pruned
 from service.pose.descent.gradient_descent import refine, require_within
 from service.pose.descent.hypotheses import around
 from service.pose.descent.losses import loss_against, require_loss
-from service.pose.features.views import RENDER_PX, Correspondences, View, known_at, photo_at, sized
+from service.pose.features.image_sizes import RENDER_PX, sized
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import View
+from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import match_record, render_and_match
 from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.pose.retrieval.viewpoints import index_cameras
@@ -124,13 +127,14 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Run the stages that are switched on; see the module."""
     prepared: Prepared = tools.prepared
     pose = query.prior or prepared.viewpoints[0]
+    images = QueryImages(query, tools.matcher)
     yield IterationRecord("start", pose)
     if options.hypotheses:
-        pose = yield from _sampled(pose, query, tools, options)
+        pose = yield from _sampled(pose, images, tools, options)
     if options.iterations:
-        pose = yield from _decoupled(pose, query, tools, options)
+        pose = yield from _decoupled(pose, images, tools, options)
     if options.refinement_steps:
-        yield from _descended(pose, query, tools, options)
+        yield from _descended(pose, images, tools, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,12 +147,14 @@ class _Hypothesis:
         return self.solved.support if self.solved else 0.0
 
 
-def _sampled(start: Pose, query: Query, tools: Tools, options: Options) -> Generator[IterationRecord, None, Pose]:
+def _sampled(
+    start: Pose, images: QueryImages, tools: Tools, options: Options
+) -> Generator[IterationRecord, None, Pose]:
     """Draw, score, resample around the best."""
     focus = tools.prepared.focus
     degrees, share, count = options.range_deg, options.range_share, options.hypotheses
     parents = [start]
-    from_prior = query.prior is not None and options.around == "prior"
+    from_prior = images.query.prior is not None and options.around == "prior"
     if not from_prior:
         parents = list(tools.prepared.viewpoints)
         degrees, share = SCENE_JITTER_DEG, SCENE_JITTER_SHARE
@@ -160,7 +166,7 @@ def _sampled(start: Pose, query: Query, tools: Tools, options: Options) -> Gener
         if number:
             poses = [*parents, *poses]
         for pose in poses:
-            yield _scored(pose, query, tools, options, scored)
+            yield _scored(pose, images, tools, options, scored)
             if scored[-1].support > ENOUGH:
                 break
         scored.sort(key=lambda h: -h.support)
@@ -173,24 +179,28 @@ def _sampled(start: Pose, query: Query, tools: Tools, options: Options) -> Gener
     return scored[0].pose
 
 
-def _scored(pose: Pose, query: Query, tools: Tools, options: Options, scored: list[_Hypothesis]) -> IterationRecord:
+def _scored(
+    pose: Pose, images: QueryImages, tools: Tools, options: Options, scored: list[_Hypothesis]
+) -> IterationRecord:
     """Render a hypothesis on the pruned level, match, and add it to those scored."""
-    camera = Camera(sized(query.intrinsics, options.hypothesis_px), pose)
+    camera = Camera(sized(images.query.intrinsics, options.hypothesis_px), pose)
     level = Counted(tools.prepared.level, tools.tally)
-    matches, view = render_and_match(camera, level, query, tools)
-    solved = _solved(matches, pose, query, tools, None)
+    matches, view = render_and_match(camera, level, images, tools.image_matcher)
+    solved = _solved(matches, pose, images.query, tools, None)
     scored.append(_Hypothesis(pose, solved))
     best = max(scored, key=lambda h: h.support)
     return _record("hypothesis", best.pose, matches, solved, view)
 
 
-def _decoupled(start: Pose, query: Query, tools: Tools, options: Options) -> Generator[IterationRecord, None, Pose]:
+def _decoupled(
+    start: Pose, images: QueryImages, tools: Tools, options: Options
+) -> Generator[IterationRecord, None, Pose]:
     """Render, match, solve; the pose whose own render had the most support is the answer."""
     pose, best, most = start, start, -1.0
     for iteration in range(options.iterations):
-        camera = Camera(sized(query.intrinsics, options.render_px), pose)
-        matches, view = render_and_match(camera, tools.rasterizer, query, tools)
-        solved = _solved(matches, pose, query, tools, iteration if options.solver == "gradient" else None)
+        camera = Camera(sized(images.query.intrinsics, options.render_px), pose)
+        matches, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
+        solved = _solved(matches, pose, images.query, tools, iteration if options.solver == "gradient" else None)
         if solved is None:
             yield _record("decouple", best, matches, None, view)
             break
@@ -202,9 +212,9 @@ def _decoupled(start: Pose, query: Query, tools: Tools, options: Options) -> Gen
     return best
 
 
-def _descended(start: Pose, query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    intrinsics = sized(query.intrinsics, options.render_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
+def _descended(start: Pose, images: QueryImages, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    intrinsics = sized(images.query.intrinsics, options.render_px)
+    loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     focus = tools.prepared.focus
     best, least = start, np.inf
     steps = refine(tools.rasterizer, intrinsics, start, loss, focus, options.refinement_steps, RATE, END_RATE)

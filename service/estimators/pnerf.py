@@ -26,7 +26,8 @@ from service.interfaces import Tools
 from service.pose.descent.adam import Adam
 from service.pose.descent.gradient_descent import So3T3, photometric, require_within
 from service.pose.descent.losses import loss_against, require_loss
-from service.pose.features.views import known_at, photo_at, sized
+from service.pose.features.image_sizes import sized
+from service.pose.features.query_images import QueryImages
 from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import Candidates, IterationRecord
 from service.types import Pose, Query
@@ -87,7 +88,8 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     """Descend from around the prior. Raises InvalidPrior without one."""
     start, focus = required_prior(query, "pnerf"), tools.prepared
     intrinsics = sized(query.intrinsics, options.long_side_px)
-    loss = loss_against(options.loss, photo_at(query, tools, intrinsics), known_at(query, tools, intrinsics))
+    images = QueryImages(query, tools.matcher)
+    loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     yield IterationRecord("start", start)
     fleet = [_Hypothesis(start, focus)]
     fleet += [_drawn(start, START_DEG, START_UNITS, tools) for _ in range(options.hypotheses - 1)]

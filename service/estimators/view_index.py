@@ -27,15 +27,9 @@ from service.errors import InvalidOptions
 from service.interfaces import Tools
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
-from service.pose.features.views import (
-    MATCH_ERROR_PX,
-    PHOTO_PX,
-    known_at,
-    photo_at,
-    rendered_frame,
-    rendered_view,
-    sized,
-)
+from service.pose.features.image_sizes import PHOTO_PX, sized
+from service.pose.features.views import images_of, known_at, photo_at, rendered_frame, rendered_view
+from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.matching.render_and_match import render_and_match
 from service.pose.matching.search_stages import GOOD_MATCH, aligned, match_record, matched, refined, rematched, resected
 from service.pose.retrieval.image_variant import (
@@ -318,7 +312,7 @@ def _sampled(sight: Sight, query: Query, tools: Tools) -> Iterator[IterationReco
     lens = sized(query.intrinsics, SAMPLE_PX)
     best: AbsolutePose | None = None
     for pose in poses:
-        matches, view = render_and_match(Camera(lens, pose), tools.rasterizer, query, tools)
+        matches, view = render_and_match(Camera(lens, pose), tools.rasterizer, images_of(query, tools), None)
         found = resected(matches, query, MATCH_ERROR_PX * PHOTO_PX / SAMPLE_PX, 500)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found

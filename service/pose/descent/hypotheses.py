@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.geometry import look_at, so3_exp
-from service.pose.features.views import View
+from service.pose.features.rendered_views import View
 from service.pose.retrieval.scene_focus import Focus
 from service.types import Pose
 

@@ -10,40 +10,35 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from service.interfaces import Features, Frame, ImageMatcher, Rasterizer, Tools
-from service.pose.features.views import (
-    Correspondences,
-    View,
-    correspondences,
-    lifted,
-    photo_at,
-    photo_features,
-    to_uint8,
-    view_from,
-)
+from service.interfaces import Features, Frame, ImageMatcher, Rasterizer
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import View, backprojected, to_uint8, view_from
+from service.pose.matching.correspondences import Correspondences, correspondences
 from service.results import IterationRecord, MatchVectors
 from service.types import Camera, Intrinsics, Pose, Query
 
 
 def render_and_match(
-    camera: Camera, rasterizer: Rasterizer, query: Query, tools: Tools
+    camera: Camera, rasterizer: Rasterizer, images: QueryImages, image_matcher: ImageMatcher | None = None
 ) -> tuple[Correspondences, View]:
-    """Render, match and lift the matches; `camera` has the photo's lens at any size."""
-    if tools.image_matcher:
+    """Render, match with the photo, and backproject; `camera` has the photo's intrinsics at any size.
+
+    With an image matcher the two images are matched as they are, without features of each.
+    """
+    if image_matcher:
         (frame,) = rasterizer.render([camera])
-        return _matched_images(frame, camera, tools.image_matcher, query, tools)
-    view = view_from(camera, rasterizer, tools.matcher)
-    return correspondences(photo_features(query, tools, camera.intrinsics.long_side), view, tools.matcher), view
+        return _matched_images(frame, camera, image_matcher, images)
+    view = view_from(camera, rasterizer, images.matcher)
+    return correspondences(images.features(camera.intrinsics.long_side), view, images.matcher), view
 
 
 def _matched_images(
-    frame: Frame, camera: Camera, matcher: ImageMatcher, query: Query, tools: Tools
+    frame: Frame, camera: Camera, matcher: ImageMatcher, images: QueryImages
 ) -> tuple[Correspondences, View]:
-    photo = photo_at(query, tools, camera.intrinsics)
-    pairs = matcher.match_images(photo, to_uint8(frame.rgb))
+    pairs = matcher.match_images(images.resized(camera.intrinsics), to_uint8(frame.rgb))
     # A point of the render carries its partner in the photo where a feature has its description.
-    view = lifted(Features(pairs.b_px, pairs.confidence, pairs.a_px), frame, camera)
-    partners = view.features.descriptors * _photo_scale(camera.intrinsics, query)
+    view = backprojected(Features(pairs.b_px, pairs.confidence, pairs.a_px), frame, camera)
+    partners = view.features.descriptors * _photo_scale(camera.intrinsics, images.query)
     return Correspondences(partners, view.features.points_px, view.points_in_world), view
 
 

@@ -17,17 +17,10 @@ from service.pose.absolute_pose.decoupled import MIN_POINTS, MatchedPoints, leas
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.absolute_pose.prior_region import inside_prior, widened_prior
 from service.pose.absolute_pose.unknown_focal import WIDER, absolute_pose_unknown_focal, refine
-from service.pose.features.views import (
-    PHOTO_PX,
-    Correspondences,
-    View,
-    correspondences,
-    known_at,
-    photo_at,
-    photo_features,
-    rendered_frame,
-    rendered_view,
-)
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.rendered_views import View
+from service.pose.features.views import known_at, photo_at, photo_features, rendered_frame, rendered_view
+from service.pose.matching.correspondences import Correspondences, correspondences
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.image_variant import Sight
 from service.results import IterationRecord, MatchVectors

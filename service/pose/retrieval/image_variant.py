@@ -9,8 +9,10 @@ from jaxtyping import Float64
 
 from service.interfaces import Features, Tools
 from service.pose.absolute_pose.prior_region import distance_outside
-from service.pose.features.in_plane_rotation import PHOTO_CORNERS, corners, turns_to_upright
-from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, known_at, photo_at, photo_features, sized
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.in_plane_rotation import turns_to_upright
+from service.pose.features.views import images_of, photo_features
+from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.retrieval.index import ViewIndex
 from service.types import Query
 
@@ -73,8 +75,7 @@ def first_sight(query: Query, tools: Tools) -> Sight:
 
 def turned_sight(upright: Sight, query: Query, tools: Tools) -> Sight:
     """Return the photo upright, or turned as its corners say, if the views' votes agree."""
-    size = sized(query.intrinsics, PHOTO_PX)
-    found = corners(photo_at(query, tools, size), PHOTO_CORNERS, known_at(query, tools, size))
+    found = images_of(query, tools).corners()
     best, most = upright, 0.0
     for eighths in [turn for turn in turns_to_upright(found, tools.prepared.corners) if turn][:TURNS]:
         turned = replace(upright, eighths=eighths)

@@ -17,7 +17,7 @@ from jaxtyping import Float32, Float64
 
 from service.interfaces import Features, Tools
 from service.pose.features.in_plane_rotation import MOST_CORNERS, VIEW_CORNERS, Corners, corners
-from service.pose.features.views import VIEW_FEATURES, View, lifted, to_uint8
+from service.pose.features.rendered_views import VIEW_FEATURES, View, backprojected, to_uint8
 from service.pose.retrieval.lod_proxy import Rough
 from service.pose.retrieval.scores import vote
 from service.pose.retrieval.viewpoints import INDEX_PX, index_cameras
@@ -71,7 +71,7 @@ def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
         def seen(number: int) -> tuple[View, Corners | None]:
             frame = rough.render(cameras[number])
             rgb = to_uint8(frame.rgb)
-            view = lifted(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
+            view = backprojected(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
             return view, corners(rgb) if number % every == 0 else None
 
         found = list(pool.map(seen, range(len(cameras))))

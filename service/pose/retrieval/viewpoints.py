@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from service.interfaces import Rasterizer
-from service.pose.features.views import sized
+from service.pose.features.image_sizes import sized
 from service.pose.retrieval.scene_focus import centre_depth
 from service.pose.retrieval.view_placement import find_views
 from service.types import Camera, GaussianScene, Pose

@@ -18,7 +18,9 @@ import numpy as np
 from service.geometry import pose_distance, reprojection_error_px
 from service.interfaces import Features, Matcher
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
-from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, Correspondences, View, correspondences
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.rendered_views import View
+from service.pose.matching.correspondences import MATCH_ERROR_PX, Correspondences, correspondences
 from service.pose.retrieval.scores import top, vote
 from service.results import Candidates, IterationRecord
 from service.types import Intrinsics, Pose

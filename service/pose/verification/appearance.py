@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.interfaces import Frame
-from service.pose.features.views import to_uint8
+from service.pose.features.rendered_views import to_uint8
 
 PAIR_PX = 192
 """Long side at which photo and render are compared: coarse enough to forgive what training left blurred."""

@@ -16,7 +16,9 @@ import numpy as np
 
 from service.interfaces import Tools
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.views import MATCH_ERROR_PX, PHOTO_PX, VIEW_FEATURES, View, correspondences, to_uint8
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.rendered_views import VIEW_FEATURES, View, to_uint8
+from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.retrieval.scores import top, vote
 from service.pose.verification.appearance import APPEARANCE
 from service.types import Intrinsics, Query

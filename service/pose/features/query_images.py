@@ -1,0 +1,118 @@
+"""Everything that is computed from the photo alone: resized copies, valid masks, local features, corners.
+
+Each is computed once for a size and an in-plane rotation. A job makes one `QueryImages` and passes it to the steps of
+its method and to verification. A mirrored photo needs another one; a photo with corrected intrinsics shares the
+pictures of the original (`corrected`), because none of them depends on the focal length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from service.interfaces import Features, Matcher
+from service.pose.features.image_sizes import PHOTO_PX, SIZE_MULTIPLE_PX, sized
+from service.pose.features.in_plane_rotation import PHOTO_CORNERS, Corners, corners
+from service.types import Intrinsics, IntrinsicsCorrection, Query
+
+PHOTO_FEATURES = 2048
+"""Features of a photo, at most."""
+MARGIN_PX = 6
+"""Least distance of a feature from an invalid pixel: nearer ones describe the mask's edge."""
+MIN_VALID_SHARE = 0.99
+"""Share of valid photo pixels in a pixel of a resized copy from which on that counts as valid."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueryImages:
+    """A photo, and what was computed from its pixels so far. For one thread."""
+
+    query: Query
+    matcher: Matcher
+    _photos: dict[tuple[int, int], UInt8[np.ndarray, "_ _ 3"]] = field(default_factory=dict, repr=False)
+    _masks: dict[tuple[int, int], Bool[np.ndarray, "_ _"]] = field(default_factory=dict, repr=False)
+    _features: dict[tuple[int, int], Features] = field(default_factory=dict, repr=False)
+
+    def corrected(self, correction: IntrinsicsCorrection) -> QueryImages:
+        """Return the same pictures with corrected intrinsics of the query."""
+        return replace(self, query=self.query.corrected(correction))
+
+    def resized(self, size: Intrinsics) -> UInt8[np.ndarray, "h w 3"]:
+        """Return the photo resampled to `size.width` x `size.height`: area averages when it shrinks, else bilinear."""
+        key = size.width, size.height
+        if key not in self._photos:
+            rgb = self.query.rgb
+            mode = cv2.INTER_AREA if size.width * size.height < rgb.shape[0] * rgb.shape[1] else cv2.INTER_LINEAR
+            self._photos[key] = np.asarray(cv2.resize(rgb, key, interpolation=mode))
+        return self._photos[key]
+
+    def valid_mask(self, size: Intrinsics) -> Bool[np.ndarray, "h w"] | None:
+        """Return which pixels of `resized(size)` are of valid photo pixels alone; None: all."""
+        if self.query.known is None:
+            return None
+        key = size.width, size.height
+        if key not in self._masks:
+            share = cv2.resize(self.query.known.astype(np.float32), key, interpolation=cv2.INTER_AREA)
+            self._masks[key] = np.asarray(share) > MIN_VALID_SHARE
+        return self._masks[key]
+
+    def features(self, long_side: int = PHOTO_PX, roll_steps_45deg: int = 0) -> Features:
+        """Return the photo's features, extracted at this size, in pixels of `Query.rgb`.
+
+        Before extraction the photo is rotated counter-clockwise by `roll_steps_45deg` (learned descriptors tolerate
+        some 30 degrees of in-plane rotation); the features' places refer to the photo as it is.
+        """
+        key = long_side, roll_steps_45deg
+        if key not in self._features:
+            size = sized(self.query.intrinsics, long_side)
+            rotated, rotated_from_photo = _rotated(self.resized(size), roll_steps_45deg)
+            found = self.matcher.extract(rotated, PHOTO_FEATURES)
+            points = (found.points_px - rotated_from_photo[:, 2]) @ rotated_from_photo[:, :2]
+            keep = _away_from_edges(points, self.valid_mask(size), size, bool(roll_steps_45deg % 2))
+            scale = np.array([self.query.rgb.shape[1] / size.width, self.query.rgb.shape[0] / size.height])
+            self._features[key] = Features(
+                (points[keep] * scale).astype(np.float32), found.scores[keep], found.descriptors[keep]
+            )
+        return self._features[key]
+
+    def corners(self) -> Corners:
+        """Return the photo's corners at PHOTO_PX, for the estimate of its in-plane rotation."""
+        size = sized(self.query.intrinsics, PHOTO_PX)
+        return corners(self.resized(size), PHOTO_CORNERS, self.valid_mask(size))
+
+
+def _rotated(
+    rgb: UInt8[np.ndarray, "h w 3"], steps_45deg: int
+) -> tuple[UInt8[np.ndarray, "_ _ 3"], Float64[np.ndarray, "2 3"]]:
+    """Return the image rotated about its middle on a canvas that holds it, and the map of its pixels to that."""
+    height, width = rgb.shape[:2]
+    if steps_45deg % 8 == 0:
+        return rgb, np.eye(2, 3)
+    cosine, sine = np.cos(steps_45deg * np.pi / 4), np.sin(steps_45deg * np.pi / 4)
+    rotation = np.array([[cosine, sine], [-sine, cosine]])
+    extent = np.abs(rotation) @ [width, height]
+    canvas = (np.ceil(extent / SIZE_MULTIPLE_PX - 1e-6) * SIZE_MULTIPLE_PX).astype(int)
+    shift = canvas / 2 - rotation @ [width / 2, height / 2]
+    # OpenCV counts from the centre of the first pixel.
+    shift_cv = shift - 0.5 + rotation @ [0.5, 0.5]
+    matrix = np.concatenate([rotation, shift_cv[:, None]], 1)
+    rotated = cv2.warpAffine(rgb, matrix, (int(canvas[0]), int(canvas[1])), flags=cv2.INTER_LINEAR)
+    return np.asarray(rotated), np.concatenate([rotation, shift[:, None]], 1)
+
+
+def _away_from_edges(
+    points: Float64[np.ndarray, "n 2"], valid: Bool[np.ndarray, "h w"] | None, size: Intrinsics, oblique: bool
+) -> Bool[np.ndarray, "n"]:
+    """Return which points keep MARGIN_PX from invalid pixels and, if the image was rotated obliquely, its borders."""
+    keep = np.ones(len(points), bool)
+    if oblique:  # the borders became lines in the canvas
+        keep &= ((points > MARGIN_PX) & (points < np.array([size.width, size.height]) - MARGIN_PX)).all(1)
+    if valid is not None:
+        around = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+        safe = cv2.erode(valid.astype(np.uint8), around, borderType=cv2.BORDER_REPLICATE) > 0
+        column, row = np.clip(points.astype(int), 0, [size.width - 1, size.height - 1]).T
+        keep &= safe[row, column]
+    return keep

@@ -1,0 +1,133 @@
+"""Renders of the scene, and their local features backprojected to scene points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from service.geometry import reprojection_error_px, transformed, unproject
+from service.interfaces import Features, Frame, Matcher, Rasterizer
+from service.pose.features.image_sizes import FREE_FOCAL_RENDER_PX, RENDER_PX, sized
+from service.types import Camera, Intrinsics, Pose, Query, frozen
+
+VIEW_FEATURES = 800
+"""Features of a render, at most."""
+MAX_DEPTH_RANGE = 0.06
+"""Relative, over 3x3 pixels: beyond it a feature lies on a depth edge, and its scene point is uncertain."""
+MIN_ALPHA = 0.5
+"""Opacity from which on a pixel counts as surface."""
+GRID_PX = 16
+"""Spacing of the pixels at which two cameras' images are compared."""
+MIN_MATCHING_SHARE = 0.9
+"""Share of those pixels that may move by no more than the tolerance."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A camera from which the scene was rendered, and the features found there with their scene points."""
+
+    camera: Camera
+    features: Features
+    points_in_world: Float32[np.ndarray, "n 3"]
+
+
+@dataclass(slots=True)
+class RenderedView:
+    """A render and its camera; its features are extracted when they are first needed."""
+
+    frame: Frame
+    camera: Camera
+    _view: View | None = field(default=None, repr=False)
+
+    def view(self, matcher: Matcher) -> View:
+        """Return the render's features with their scene points, extracted once."""
+        if self._view is None:
+            found = _features_of(self.frame, self.camera.intrinsics, matcher)
+            self._view = backprojected(found, self.frame, self.camera)
+        return self._view
+
+    def shows_the_same_as(self, camera: Camera, tolerance_px: float) -> bool:
+        """Return whether nine in ten of the surface points seen here are within this distance in `camera`'s image."""
+        own, size = self.camera, camera.intrinsics
+        if np.array_equal(camera.pose.world_from_camera, own.pose.world_from_camera) and size == own.intrinsics:
+            return True
+        height, width = self.frame.alpha.shape
+        if (width, height) != (size.width, size.height):
+            return False
+        row, column = (grid.ravel() for grid in np.mgrid[4:height:GRID_PX, 4:width:GRID_PX])
+        depth = self.frame.median_depth[row, column]
+        px = np.stack([column, row], 1)[depth > 0] + 0.5
+        if len(px) == 0:
+            return False
+        points = transformed(own.pose.world_from_camera, unproject(px, depth[depth > 0], own.intrinsics))
+        error = reprojection_error_px(px, points, size, camera.pose)
+        return bool((error < tolerance_px).mean() > MIN_MATCHING_SHARE)
+
+
+@dataclass(slots=True)
+class ViewRenderer:
+    """Renders the scene as a query's camera sees it; its latest render is used again where the camera hardly moved."""
+
+    rasterizer: Rasterizer
+    latest: RenderedView | None = None
+
+    def render(self, camera: Camera) -> RenderedView:
+        """Render."""
+        self.latest = RenderedView(self.rasterizer.render([camera])[0], camera)
+        return self.latest
+
+    def at(self, query: Query, pose: Pose, tolerance_px: float = 1.0, long_side: int | None = None) -> RenderedView:
+        """Return a render with the query's intrinsics at most `tolerance_px` from the pose; `long_side` in pixels."""
+        camera = camera_of(query, pose, long_side)
+        if self.latest is not None and self.latest.shows_the_same_as(camera, tolerance_px):
+            return self.latest
+        return self.render(camera)
+
+
+def camera_of(query: Query, pose: Pose, long_side: int | None = None) -> Camera:
+    """Return the query's camera at the pose, at the size for renders unless a long side (px) is given."""
+    long_side = long_side or (FREE_FOCAL_RENDER_PX if query.focal_sigma else RENDER_PX)
+    return Camera(sized(query.intrinsics, long_side), pose)
+
+
+def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
+    """Render, extract features at the render's own size, and backproject them."""
+    (frame,) = rasterizer.render([camera])
+    return backprojected(matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
+
+
+def _features_of(frame: Frame, size: Intrinsics, matcher: Matcher) -> Features:
+    """Return a render's features, extracted at RENDER_PX: from a larger one they would be finer than the photo's."""
+    rgb, small = to_uint8(frame.rgb), sized(size, RENDER_PX)
+    if small.width * small.height >= size.width * size.height:
+        return matcher.extract(rgb, VIEW_FEATURES)
+    found = matcher.extract(
+        np.asarray(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)), VIEW_FEATURES
+    )
+    scale = np.array([size.width / small.width, size.height / small.height], np.float32)
+    return replace(found, points_px=found.points_px * scale)
+
+
+def backprojected(features: Features, frame: Frame, camera: Camera) -> View:
+    """Keep the features on opaque, smooth surface, and compute the scene point of each from the median depth."""
+    height, width = frame.alpha.shape
+    column = np.clip(features.points_px[:, 0].astype(int), 1, width - 2)
+    row = np.clip(features.points_px[:, 1].astype(int), 1, height - 2)
+    around = np.stack([frame.median_depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], 1)
+    nearest, farthest = around.min(1, initial=np.inf), around.max(1, initial=0.0)
+    smooth = (nearest > 0) & (farthest - nearest < MAX_DEPTH_RANGE * nearest)
+    keep = np.flatnonzero(smooth & (frame.alpha[row, column] > MIN_ALPHA))
+    points = unproject(features.points_px[keep], np.median(around[keep], axis=1), camera.intrinsics)
+    return View(
+        camera,
+        Features(features.points_px[keep], features.scores[keep], features.descriptors[keep]),
+        frozen(transformed(camera.pose.world_from_camera, points), np.float32),
+    )
+
+
+def to_uint8(rgb: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a render (0..1) in a photo's 8 bits."""
+    return np.asarray(cv2.convertScaleAbs(np.maximum(rgb, 0), alpha=255.0))
