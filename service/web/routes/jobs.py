@@ -18,10 +18,11 @@ from service.localize import LoadedScene
 from service.photos.images import encode_image
 from service.results import Status
 from service.types import Camera
+from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf
 from service.web.schemas import resources as documents
 from service.web.schemas.conversion import record_camera
-from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.exports import EXPORT_TYPES, ExportFormat, exported
 from service.web.schemas.responses import JobList, JobOut, JobState, PhotoOut, Record, Trace
 
@@ -29,6 +30,7 @@ router = APIRouter()
 
 
 @router.get("/jobs", tags=["jobs"], responses=errors("invalid_request"))
+@route_policy(role="read")
 def list_jobs(
     parts: PartsOf,
     root: RootOf,
@@ -57,12 +59,14 @@ def list_jobs(
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
+@route_policy(role="read")
 def get_job(job: JobOf, root: RootOf) -> JobOut:
     """Say how a job stands; with its result or its error when it has ended."""
     return documents.job_document(job, root)
 
 
 @router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
+@route_policy(role="localize", body=SMALL_BODY, rate_limited=True)
 def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     """Cancel: at once if the job waits, after its current step if it runs, without effect if it has ended."""
     parts.jobs.cancel(job)
@@ -75,6 +79,7 @@ def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     response_class=EventSourceResponse,
     responses=errors("job_not_found"),
 )
+@route_policy(role="read")
 async def job_events(
     job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
 ) -> AsyncIterator[ServerSentEvent]:
@@ -115,6 +120,7 @@ def _resumed(last_event_id: str) -> tuple[int, int]:
     response_class=Response,
     responses=JPEG | errors("job_not_found", "photo_gone", "job_not_ready"),
 )
+@route_policy(role="read")
 async def job_photo(job: JobOf, parts: PartsOf) -> Response:
     """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced. For a while, or if kept."""
     photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
@@ -122,6 +128,7 @@ async def job_photo(job: JobOf, parts: PartsOf) -> Response:
 
 
 @router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors("job_not_found"))
+@route_policy(role="read")
 def job_trace(job: JobOf, parts: PartsOf) -> Trace:
     """Return all records so far, of the latest attempt."""
     return documents.job_trace(job, parts.jobs.records(job))
@@ -131,8 +138,9 @@ def job_trace(job: JobOf, parts: PartsOf) -> Trace:
     "/jobs/{job_id}/iterations/{index}/render.jpg",
     tags=["jobs"],
     response_class=Response,
-    responses=JPEG | errors("invalid_request", "job_not_found", "record_not_found", "job_not_ready", *SCENE),
+    responses=JPEG | errors("invalid_request", "job_not_found", "record_not_found", "job_not_ready", *SCENE_ERRORS),
 )
+@route_policy(role="read")
 async def job_render(
     job: JobOf,
     parts: PartsOf,
@@ -169,6 +177,7 @@ def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
     }
     | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
 )
+@route_policy(role="read")
 def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
     """Return the pose as other programs read it; not of a job that found none.
 

@@ -11,9 +11,10 @@ from fastapi import APIRouter, Header, Request, Response
 
 from service.jobs.service import Order
 from service.web.middleware.limits import client_of
+from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import PartsOf, RootOf
 from service.web.schemas import resources as documents
-from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.parsing import read_body, read_fields
 from service.web.schemas.requests import LocalizeFields, LocalizeIn
 from service.web.schemas.responses import JobOut
@@ -68,13 +69,14 @@ _ACCEPTED = {
     response_model=JobOut,
     responses=_ACCEPTED
     | errors(
-        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE),
+        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE_ERRORS),
         *("invalid_image", "invalid_intrinsics", "invalid_prior", "invalid_options", "unknown_name"),
         *("backend_missing", "idempotency_conflict", "storage_failed"),
         body=True,
     ),
     openapi_extra=_BODY,
 )
+@route_policy(role="localize", body=PHOTO_BODY, rate_limited=True, queues_job=True)
 async def localize_photo(
     request: Request,
     response: Response,

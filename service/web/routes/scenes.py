@@ -11,9 +11,10 @@ from fastapi import APIRouter, Query, Request, Response
 from service.errors import SceneExists, SceneInUse
 from service.scene_manager import splat_sample as splats
 from service.scene_manager.scene_images import PICTURE_TYPES, picture, thumbnail
+from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
 from service.web.routes.dependencies import JPEG, PartsOf, RootOf
 from service.web.schemas import resources as documents
-from service.web.schemas.error_examples import SCENE, errors
+from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.requests import RenderIn
 from service.web.schemas.responses import SceneList, SceneOut, SceneSummary
 
@@ -23,12 +24,14 @@ router = APIRouter()
 
 
 @router.get("/scenes", tags=["scenes"], responses=errors())
+@route_policy(role="read")
 async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
     """List the scenes and how far they have come."""
     return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
+@route_policy(role="read")
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Describe a scene, with its training cameras."""
     return documents.scene_document(parts.scenes.entry(scene_id), root)
@@ -50,6 +53,7 @@ def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
         }
     },
 )
+@route_policy(role="admin", body=SCENE_BODY, rate_limited=True)
 async def upload_scene(
     scene_id: str,
     request: Request,
@@ -71,6 +75,7 @@ async def upload_scene(
 @router.post(
     "/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors("scene_not_found", body=True)
 )
+@route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Load a scene into memory, and make it ready; again, if that failed before."""
     entry = parts.scenes.entry(scene_id)
@@ -84,6 +89,7 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     tags=["scenes"],
     responses=errors("scene_not_found", "bad_input", body=True),
 )
+@route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Drop a scene from memory when the last job on it has ended; it takes no more, until it is loaded again."""
     entry = parts.scenes.entry(scene_id)
@@ -97,6 +103,7 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     tags=["scenes"],
     responses=errors("scene_not_found", "scene_in_use", "storage_failed", body=True),
 )
+@route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def delete_scene(scene_id: str, parts: PartsOf) -> None:
     """Delete an uploaded scene with its files; not one that the operator named, nor one that jobs use."""
     entry = parts.scenes.entry(scene_id)
@@ -112,8 +119,9 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
     "/scenes/{scene_id}/thumbnail.jpg",
     tags=["scenes"],
     response_class=Response,
-    responses=JPEG | errors(*SCENE),
+    responses=JPEG | errors(*SCENE_ERRORS),
 )
+@route_policy(role="read")
 async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
     """Return a small picture of the scene, as its middle training camera sees it."""
     draw = partial(thumbnail, parts.scenes.get(scene_id))
@@ -130,8 +138,9 @@ async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
             "content": {splats.BINARY: {"schema": {"type": "string", "format": "binary"}}},
         }
     }
-    | errors("invalid_request", *SCENE),
+    | errors("invalid_request", *SCENE_ERRORS),
 )
+@route_policy(role="read")
 async def scene_splats(
     scene_id: str,
     parts: PartsOf,
@@ -150,10 +159,11 @@ async def scene_splats(
         200: {"description": "The picture", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
     }
     | errors(
-        *("invalid_request", "bad_request", "request_timeout", *SCENE, "invalid_intrinsics", "invalid_prior"),
+        *("invalid_request", "bad_request", "request_timeout", *SCENE_ERRORS, "invalid_intrinsics", "invalid_prior"),
         body=True,
     ),
 )
+@route_policy(role="read", body=SMALL_BODY, rate_limited=True)
 async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
     """Render a scene from any pose: a picture, or the depth of what is seen there."""
     draw = partial(picture, parts.scenes.get(scene_id), wanted)

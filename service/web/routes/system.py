@@ -6,6 +6,7 @@ from fastapi import APIRouter, Response
 
 from service.errors import NoKeys
 from service.web.metrics import METRICS_TYPE
+from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import CallerOf, PartsOf
 from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import errors
@@ -18,24 +19,28 @@ router = APIRouter()
 
 
 @router.get("/capabilities", tags=["service"], responses=errors())
+@route_policy(role="read")
 def get_capabilities(parts: PartsOf) -> Capabilities:
     """Say which estimators, matchers, renderers and formats there are, and the estimators' options."""
     return documents.capabilities(parts.settings)
 
 
 @router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))
+@route_policy(role="read")
 def get_version() -> dict[str, str]:
     """Return the versions of this service and of what its results depend on."""
     return documents.versions()
 
 
 @router.get("/livez", tags=["service"], responses=errors(always=_CANNOT_FAIL))
+@route_policy(role=None)
 async def live() -> Liveness:
     """Answer, as long as the process can."""
     return Liveness()
 
 
 @router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
+@route_policy(role=None)
 async def ready(parts: PartsOf, response: Response) -> Readiness:
     """Say whether photos can be localized at full speed: scenes loaded and ready, workers and disk at work."""
     readiness = parts.scenes.readiness()
@@ -51,12 +56,14 @@ async def ready(parts: PartsOf, response: Response) -> Readiness:
     response_class=Response,
     responses={200: {"description": "Prometheus's text form", "content": {"text/plain": {}}}} | errors(),
 )
+@route_policy(role="read")
 def get_metrics(parts: PartsOf) -> Response:
     """Return what there is to watch: requests, queue, jobs by stage and outcome, memory by scene, workers."""
     return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
 
 
 @router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))
+@route_policy(role="read", body=SMALL_BODY, rate_limited=True)
 def make_token(parts: PartsOf, caller: CallerOf) -> Token:
     """Make a token that stands for the caller's key for some minutes, to open a page with: `/viewer/?token=…`."""
     if caller is None:

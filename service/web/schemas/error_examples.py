@@ -122,7 +122,14 @@ ALWAYS = ("unauthorized", "forbidden", "internal_error")
 """What any operation may answer."""
 WITH_BODY = ("content_too_large", "rate_limited", "queue_full")
 """What all that may have a body can answer, before it is read."""
-SCENE = ("scene_not_found", "scene_unloaded", "corrupt_scene", "unsupported_format", "scene_not_ready", "no_room")
+SCENE_ERRORS = (
+    "scene_not_found",
+    "scene_unloaded",
+    "corrupt_scene",
+    "unsupported_format",
+    "scene_not_ready",
+    "no_room",
+)
 """Why a scene isn't there to work with."""
 
 _MEANINGS = {
