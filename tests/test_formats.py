@@ -341,6 +341,7 @@ class TestFolder:
             reader = SCENE_FORMATS.load(name)
             assert reader.accepts(b"", "") is False
             assert callable(reader.read)
+            assert all(suffix.startswith(".") and suffix == suffix.lower() for suffix in reader.SUFFIXES)
 
 
 ANCHOR = {"latitude": 47.0, "longitude": 8.0, "height": 400.0, "enu_from_world": np.eye(4).tolist()}

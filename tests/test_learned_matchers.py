@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,7 @@ def test_loftr_pairs_images_with_random_weights(with_weights: Path) -> None:
 
 @pytest.mark.parametrize("name", [*GLUED, "loftr"])
 def test_without_weights_it_says_what_is_missing(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    file = MATCHERS._module(name).WEIGHTS[0]
+    file = import_module(f"service.matchers.{name}").WEIGHTS[0]
     monkeypatch.delenv("SPLATFIX_WEIGHTS_DIR", raising=False)
     with pytest.raises(BackendMissing, match=f"set SPLATFIX_WEIGHTS_DIR to a folder with {file}.*nothing is downl"):
         MATCHERS.load(name)
@@ -115,7 +116,7 @@ def test_without_weights_it_says_what_is_missing(name: str, monkeypatch: pytest.
 @pytest.mark.parametrize("name", [*GLUED, "loftr"])
 def test_other_files_are_refused(name: str, content: object, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("SPLATFIX_WEIGHTS_DIR", str(tmp_path))
-    for file in MATCHERS._module(name).WEIGHTS:
+    for file in import_module(f"service.matchers.{name}").WEIGHTS:
         if isinstance(content, bytes):
             (tmp_path / file).write_bytes(content)
         else:

@@ -22,6 +22,7 @@ from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
+from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
 from service.pose.refinement.photometric import refine_photometric
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
@@ -47,7 +48,7 @@ def findings() -> Iterator[Finding]:
         yield _tried(f"renderer {name}", partial(_try_renderer, name))
     yield _tried("matcher", _try_matcher)
     yield _package("pi-heif", "HEIC photos")
-    yield from _plugins()
+    yield from plugin_findings()
     yield _package("viser", "the viewer")
     yield _gpu()
     yield _browser()
@@ -118,12 +119,15 @@ def _package(name: str, purpose: str) -> Finding:
     return Finding(purpose, found, f"{name} {metadata.version(name)}" if found else f"{name} is not installed")
 
 
-def _plugins() -> Iterator[Finding]:
-    folders = {"estimator": ESTIMATORS, "matcher": MATCHERS, "renderer": RASTERIZERS, "format": SCENE_FORMATS}
-    for kind, folder in folders.items():
-        for name in folder.names():
-            reason = folder.missing(name)
-            yield Finding(f"{kind} {name}", reason is None, reason or "available", needed=False)
+def plugin_findings() -> Iterator[Finding]:
+    """Import every plug-in; yield whether it can run here, and where it comes from unless it is built in."""
+    registries = {"estimator": ESTIMATORS, "matcher": MATCHERS, "renderer": RASTERIZERS, "format": SCENE_FORMATS}
+    for kind, registry in registries.items():
+        for name in registry.names():
+            reason = registry.missing(name)
+            source = registry.source(name)
+            origin = "" if source == BUILT_IN else f" (from {PLUGINS_DIR})" if source == FOLDER else f" (from {source})"
+            yield Finding(f"{kind} {name}", reason is None, (reason or "available") + origin, needed=False)
 
 
 def _gpu() -> Finding:

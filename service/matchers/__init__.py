@@ -1,3 +1,5 @@
-from service.plugins import PluginFolder
+"""Local features and their matching: `create() -> Matcher | ImageMatcher` (see `service.interfaces`) in a file each."""
 
-MATCHERS = PluginFolder("service.matchers", "create")
+from service.plugins import PluginRegistry
+
+MATCHERS = PluginRegistry("service.matchers", "splatfix.matchers", ("create",))

@@ -1,3 +1,5 @@
-from service.plugins import PluginFolder
+"""Renderers of Gaussian scenes: `create(scene) -> Rasterizer` (see `service.interfaces`) in a file each."""
 
-RASTERIZERS = PluginFolder("service.render", "create")
+from service.plugins import PluginRegistry
+
+RASTERIZERS = PluginRegistry("service.render", "splatfix.rasterizers", ("create",))

@@ -25,6 +25,7 @@ from service.scene_formats.ply_header import PlyHeader, element_records, read_he
 
 CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+SUFFIXES = (".ply",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:

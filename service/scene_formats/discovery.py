@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.errors import SceneNotFound
-from service.scene_formats.folder import SCENE_SUFFIXES
+from service.scene_formats.formats import is_scene_file
 from service.scene_formats.manifest import MANIFEST
 
 
@@ -24,4 +24,4 @@ def find_scenes(path: Path) -> list[Path]:
 
 def _is_scene(folder: Path) -> bool:
     """A broken scene is one, too: it shall be refused by name, not overlooked."""
-    return (folder / MANIFEST).is_file() or any(p.suffix.lower() in SCENE_SUFFIXES for p in folder.iterdir())
+    return (folder / MANIFEST).is_file() or any(is_scene_file(p) for p in folder.iterdir())

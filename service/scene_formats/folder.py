@@ -12,19 +12,16 @@ from types import ModuleType
 import numpy as np
 
 from service.errors import CorruptScene, SceneNotFound, UnsupportedFormat
-from service.plugins import PluginFolder
 from service.scene_formats.colmap import read_cameras
+from service.scene_formats.formats import SCENE_FORMATS, is_scene_file, readable_suffixes, reader_for
 from service.scene_formats.gaussians import checked
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
 from service.scene_formats.similarity import moved_gaussians, moved_pose
 from service.types import GaussianScene, NamedCamera, SceneInfo
 
-SCENE_FORMATS = PluginFolder("service.scene_formats", "read")
 COLMAP_FOLDER = Path("sparse", "0")
 _HEAD_BYTES = 4096
-SCENE_SUFFIXES = (".ply", ".splat", ".spz", ".ksplat", ".sog")
-"""What looks like a scene file; one that no reader accepts is refused by name instead of overlooked."""
 log = logging.getLogger(__name__)
 
 
@@ -120,9 +117,9 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
         if not candidates[0].is_file():
             raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
     else:
-        candidates = sorted(p for p in path.iterdir() if p.is_file() and p.suffix.lower() in SCENE_SUFFIXES)
+        candidates = sorted(p for p in path.iterdir() if p.is_file() and is_scene_file(p))
     if not candidates:
-        raise SceneNotFound("the folder has no scene file (.ply, .splat).", where=str(path))
+        raise SceneNotFound(f"the folder has no scene file ({', '.join(readable_suffixes())}).", where=str(path))
     if len(candidates) > 1:
         raise CorruptScene(
             f"several scene files: {', '.join(p.name for p in candidates[:5])}.",
@@ -133,10 +130,9 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
         head = file.read(_HEAD_BYTES)
     if not head:
         raise CorruptScene("the file is empty (0 bytes).", where=candidates[0].name)
-    for name in SCENE_FORMATS.names():
-        reader = SCENE_FORMATS.load(name)
-        if reader.accepts(head, candidates[0].suffix.lower()):
-            return candidates[0], reader
+    reader = reader_for(head, candidates[0].suffix.lower())
+    if reader:
+        return candidates[0], reader
     raise UnsupportedFormat(
         f"not a scene file that is read here; known: {', '.join(SCENE_FORMATS.names())}.",
         where=candidates[0].name,

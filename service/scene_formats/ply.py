@@ -18,6 +18,7 @@ _COLUMNS = {
     "scales": [f"scale_{i}" for i in range(3)],
     "opacities": ["opacity"],
 }
+SUFFIXES = (".ply",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:

@@ -10,11 +10,12 @@ from service.errors import CorruptScene
 from service.scene_formats.gaussians import RawGaussians, require_count, sh_from_rgb
 
 _RECORD = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
+SUFFIXES = (".splat",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:
     """Tell by the suffix: the format has no header."""
-    return suffix == ".splat"
+    return suffix in SUFFIXES
 
 
 def read(path: Path) -> RawGaussians:

@@ -28,7 +28,8 @@ from service.errors import (
     UnsupportedFormat,
 )
 from service.scene_formats import load_scene
-from service.scene_formats.folder import COLMAP_FOLDER, SCENE_SUFFIXES
+from service.scene_formats.folder import COLMAP_FOLDER
+from service.scene_formats.formats import is_scene_file, readable_suffixes
 from service.scene_formats.manifest import MANIFEST
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
@@ -90,15 +91,15 @@ class Uploads:
         if zipfile.is_zipfile(upload):
             self._unpack(upload, draft)
             upload.unlink()
-            if not any(path.suffix.lower() in SCENE_SUFFIXES for path in draft.iterdir()):
-                raise UnsupportedFormat("the archive holds no scene file (.ply, .splat).", where="archive")
-        else:
-            suffix = Path(file_name).suffix.lower()
-            if suffix not in SCENE_SUFFIXES:
-                raise InvalidRequest(
-                    "say what kind of file it is: `scene.ply` or `scene.splat`, or send a ZIP.", where="query.file"
+            if not any(is_scene_file(path) for path in draft.iterdir()):
+                raise UnsupportedFormat(
+                    f"the archive holds no scene file ({', '.join(readable_suffixes())}).", where="archive"
                 )
-            upload.rename(draft / f"scene{suffix}")
+        else:
+            if not is_scene_file(Path(file_name)):
+                names = " or ".join(f"`scene{suffix}`" for suffix in readable_suffixes())
+                raise InvalidRequest(f"say what kind of file it is: {names}, or send a ZIP.", where="query.file")
+            upload.rename(draft / f"scene{Path(file_name).suffix.lower()}")
         try:
             load_scene(draft)
         except SceneError as error:
@@ -160,7 +161,7 @@ def _wanted(path: PurePosixPath) -> str | None:
     """Return under what name a member is stored, None for what a scene isn't read from."""
     name = path.name
     if path.parts == (name,) and (
-        Path(name).suffix.lower() in SCENE_SUFFIXES or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
+        is_scene_file(Path(name)) or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
     ):
         return name if re.fullmatch(r"[\w. -]+", name) and len(name.encode()) <= _MAX_NAME_BYTES else None
     if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"[a-z]{1,40}\.(bin|txt)", name):

@@ -31,6 +31,7 @@ from service.jobs.service import Jobs
 from service.localize import LoadedScene
 from service.matchers import MATCHERS
 from service.render import RASTERIZERS
+from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.manager import Scenes
 from service.scene_manager.scene_store import Uploads
 from service.web.api_keys import KeyRing
@@ -64,6 +65,8 @@ def create_app(
     settings name what is not there, InvalidRequest if they would let everybody in without saying so.
     """
     settings = settings or Settings()
+    SCENE_FORMATS.names()  # an added plug-in with a name that is taken is refused now, and here for all kinds
+    RASTERIZERS.names()
     for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
         kind.load(name)  # an unknown name shall be told now, not in each job
     if settings.rasterizer:

@@ -59,9 +59,7 @@ async def upload_scene(
     request: Request,
     parts: PartsOf,
     root: RootOf,
-    file: Annotated[
-        str, Query(description="The file's name, for its suffix: `scene.ply`, `scene.splat`.")
-    ] = "scene.ply",
+    file: Annotated[str, Query(description="The file's name: its suffix says of which format it is.")] = "scene.ply",
 ) -> SceneOut:
     """Add a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, then loaded."""
     if any(entry.id == scene_id for entry in parts.scenes.entries()):

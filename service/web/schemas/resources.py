@@ -15,7 +15,7 @@ from service.estimators import ESTIMATORS
 from service.jobs.sqlite_store import StoredJob
 from service.localize import choose_rasterizer
 from service.matchers import MATCHERS
-from service.plugins import PluginFolder
+from service.plugins import PluginRegistry
 from service.render import RASTERIZERS
 from service.results import Status
 from service.scene_formats import SCENE_FORMATS
@@ -184,15 +184,7 @@ def _scene(entry: Entry, root: str) -> dict:
 def capabilities(settings: Settings) -> Capabilities:
     """Say what can be chosen. Imports every plug-in: slow the first time."""
     return Capabilities(
-        estimators=[
-            EstimatorCapability(
-                **plugin.model_dump(),
-                options_schema=None
-                if plugin.reason
-                else options_adapter(ESTIMATORS.load(plugin.name).Options).json_schema(),
-            )
-            for plugin in plugins(ESTIMATORS, settings.estimator)
-        ],
+        estimators=[_estimator(plugin) for plugin in plugins(ESTIMATORS, settings.estimator)],
         matchers=plugins(MATCHERS, settings.matcher),
         rasterizers=plugins(RASTERIZERS, settings.rasterizer or choose_rasterizer()[0]),
         scene_formats=plugins(SCENE_FORMATS),
@@ -201,10 +193,29 @@ def capabilities(settings: Settings) -> Capabilities:
     )
 
 
-def plugins(folder: PluginFolder, default: str = "") -> list[Capability]:
-    """Return the plug-ins of a folder, each with the reason if it can't run here."""
+def _estimator(plugin: Capability) -> EstimatorCapability:
+    schema = None
+    if plugin.available:
+        try:
+            schema = options_adapter(ESTIMATORS.load(plugin.name).Options).json_schema()
+        except Exception as error:  # of a plug-in's making; the others are listed all the same
+            reason = f"its Options have no JSON schema: {error}"
+            plugin = plugin.model_copy(update={"available": False, "reason": reason})
+    return EstimatorCapability(**plugin.model_dump(), options_schema=schema)
+
+
+def plugins(registry: PluginRegistry, default: str = "") -> list[Capability]:
+    """Return the plug-ins of a registry, each with the reason if it can't run here."""
     found = []
-    for name in folder.names():
-        reason = folder.missing(name)
-        found.append(Capability(name=name, available=reason is None, reason=reason, default=name == default))
+    for name in registry.names():
+        reason = registry.missing(name)
+        found.append(
+            Capability(
+                name=name,
+                available=reason is None,
+                reason=reason,
+                default=name == default,
+                source=registry.source(name),
+            )
+        )
     return found

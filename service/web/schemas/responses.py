@@ -425,6 +425,8 @@ class Capability(Model):
     reason: str | None
     """Why it can't run here."""
     default: bool = False
+    source: str
+    """Where it comes from: `built-in`, `plug-in folder`, or an installed package with its version."""
 
 
 class EstimatorCapability(Capability):
