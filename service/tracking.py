@@ -26,7 +26,8 @@ from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of
 from service.photos.sequence import SequencePhoto
 from service.pose.features.image_sizes import sized
 from service.pose.features.views import known_at, photo_at
-from service.pose.refinement.photometric import PoseUncertainty, pose_uncertainty, refine_photometric
+from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import clear, geometry_signals, judged, verify
 from service.render.counted import Counted
@@ -217,7 +218,7 @@ def aligned_from(query: Query, expected: Pose, seen: _Seen | None, tools: Tools)
     if seen is None or seen.size != (size.width, size.height):
         seen = _Seen.of(Camera(size, expected), tools)
     known = known_at(query, tools, size)
-    first = refine_photometric(photo, seen.frame, seen.camera, Camera(size, expected), LEVELS, known=known)
+    first = refine_photometric(photo, seen.frame, seen.camera, Camera(size, expected), LEVELS, valid_mask=known)
     if not np.isfinite(first.loss):
         return None
     pose, weighed = first.pose, None

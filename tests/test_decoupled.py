@@ -6,14 +6,9 @@ import pytest
 from service.errors import UnknownName
 from service.geometry import look_at, pose_distance, project, so3_exp, transformed
 from service.pose.absolute_pose import decoupled
-from service.pose.absolute_pose.decoupled import (
-    MatchedPoints,
-    angle_loss,
-    gradient_solve,
-    least_squares_solve,
-    length_loss,
-)
+from service.pose.absolute_pose.decoupled import MatchedPoints, least_squares_solve
 from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.decoupled_gradient import angle_loss, gradient_solve, length_loss
 from service.pose.descent.hypotheses import around, even_points
 from service.pose.descent.losses import LOSSES, loss_against
 from service.pose.retrieval.scene_focus import Focus, focus_of_scene
@@ -94,7 +89,7 @@ def test_the_two_gradients_are_decoupled_and_right() -> None:
 def test_a_common_shift_of_all_matches_turns_nothing() -> None:
     """Parallel vectors are translation: neither solver's rotation may see them."""
     matched = planted()
-    vectors, turning, _ = decoupled._linearized(matched, TRUTH)
+    vectors, turning, _ = decoupled.linearize_matches(matched, TRUTH)
     parallel = np.tile([9.0, -4.0], (150, 1))
     turn = decoupled._centred_step(turning, parallel, np.ones(150))
     assert np.abs(turn).max() < 1e-9

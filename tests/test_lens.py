@@ -11,11 +11,12 @@ import pytest
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
 from service.photos.intrinsics import intrinsics_from
-from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearized
+from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearize_reprojection
 from service.pose.features.rendered_views import to_uint8
 from service.pose.refinement import covariance
-from service.pose.refinement import photometric as alignment
-from service.pose.refinement.photometric import pose_uncertainty, refine_photometric
+from service.pose.refinement.config import REFINEMENT, UncertaintyConfig
+from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.uncertainty import pose_uncertainty
 from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose
 
@@ -60,7 +61,7 @@ def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
 @pytest.mark.parametrize("column", range(9))
 def test_linearized_is_the_derivative_by_differences(column: int) -> None:
     px, points, pose = planted(1, NO_CORRECTION, flat=False, wrong_share=0.0)
-    jacobian, _ = linearized(px, points, LENS, pose)
+    jacobian, _ = linearize_reprojection(px, points, LENS, pose)
     step = np.zeros(9)
     step[column] = 1e-6
 
@@ -107,10 +108,10 @@ def bent(rgb: np.ndarray, soft_px: float, rng: np.random.Generator) -> np.ndarra
     ],
 )
 def test_the_covariance_predicts_how_alignments_scatter(
-    soft_px: float, noise: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
+    soft_px: float, noise: float, least: float, most: float
 ) -> None:
     """Against a simulation: many photos from one planted pose, each with noise and a bend of its own."""
-    monkeypatch.setattr(alignment, "LEAST_SPREAD", 0.0)
+    config = replace(REFINEMENT, uncertainty=UncertaintyConfig(min_variance_scale=0.0))
     truth = true_pose()
     camera = Camera(LENS, truth)
     frame = PaintedWalls().render([camera])[0]
@@ -120,7 +121,7 @@ def test_the_covariance_predicts_how_alignments_scatter(
         image = bent(frame.rgb, soft_px, rng) if soft_px else frame.rgb
         photo = to_uint8((image + rng.normal(0, noise, image.shape)).astype(np.float32))
         pose = refine_photometric(photo, frame, camera, camera, 1).pose
-        found = pose_uncertainty(photo, frame, camera, Camera(LENS, pose), 0.0)
+        found = pose_uncertainty(photo, frame, camera, Camera(LENS, pose), 0.0, config=config)
         assert found is not None
         assert np.abs(found.last_step).max() < 2e-4  # a hundredth of a pixel; seen: 1.2e-4
         assert np.linalg.eigvalsh(found.covariance).min() > 0
@@ -135,14 +136,14 @@ def test_what_no_pixel_determines_has_no_covariance() -> None:
     half = rng.normal(size=(40, 10, 30))
     hessians = half @ np.swapaxes(half, 1, 2)
     places = np.stack(np.divmod(np.arange(40), 8), 1).astype(np.float64)
-    assert covariance.spread(np.zeros((40, 10)), hessians, places) == 0
+    assert covariance.jackknife_variance_scale(np.zeros((40, 10)), hessians, places, UncertaintyConfig()) == 0
     wanted = np.linalg.inv(hessians.sum(0))
-    found = covariance.inverse(hessians.sum(0))
+    found = covariance.inverse_spd(hessians.sum(0))
     assert found is not None
     assert np.allclose(found, wanted, rtol=1e-9)
     hessians[:, 3] = hessians[:, :, 3] = 0.0
-    assert covariance.inverse(hessians.sum(0)) is None
-    assert covariance.spread(np.zeros((40, 10)), hessians, places) == np.inf
+    assert covariance.inverse_spd(hessians.sum(0)) is None
+    assert covariance.jackknife_variance_scale(np.zeros((40, 10)), hessians, places, UncertaintyConfig()) == np.inf
 
 
 def test_the_spread_of_independent_parts_is_theirs() -> None:
@@ -156,7 +157,7 @@ def test_the_spread_of_independent_parts_is_theirs() -> None:
         scores = np.sqrt(2.5) * (half @ rng.normal(size=(400, 12, 1)))[..., 0]
         # The unknowns were fitted: what is left of the scores adds up to nothing.
         scores -= hessians @ np.linalg.solve(hessians.sum(0), scores.sum(0))
-        found.append(covariance.spread(scores, hessians, places))
+        found.append(covariance.jackknife_variance_scale(scores, hessians, places, UncertaintyConfig()))
     assert np.mean(found) == pytest.approx(2.5 * 4 / 3, rel=0.1)
 
 

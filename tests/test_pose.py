@@ -346,7 +346,7 @@ def test_alignment_sees_through_the_look_of_a_photo(spoil: str) -> None:
     for _ in range(2):
         camera = Camera(lens, pose)
         pose = refine_photometric(
-            to_uint8(rgb), PaintedWalls().render([camera])[0], camera, camera, 3, known=known
+            to_uint8(rgb), PaintedWalls().render([camera])[0], camera, camera, 3, valid_mask=known
         ).pose
     angle, distance = pose_distance(pose, truth)
     assert angle < 0.1

@@ -10,7 +10,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,11 +25,12 @@ from service.localize import DEFAULT_ESTIMATOR, Request
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.matching import search_stages as stages
 from service.pose.matching.correspondences import Correspondences
-from service.pose.refinement import photometric as alignment
-from service.pose.refinement import pyramid
+from service.pose.refinement.config import REFINEMENT, PyramidConfig
+from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.uncertainty import pose_uncertainty
 from service.pose.retrieval import image_variant as sight
 from service.pose.retrieval.index import ViewIndex
-from service.pose.verification import appearance
+from service.pose.verification import appearance, gate
 from service.render import cpu
 from service.results import IterationRecord
 from service.types import Query
@@ -56,7 +58,7 @@ class Removal:
 
 def removals() -> dict[str, Removal]:
     """Return the parts, and how the estimator does without each."""
-    v, s, a = view_index, stages, alignment
+    v, s = view_index, stages
     return {
         "nothing": Removal(),
         "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
@@ -72,11 +74,11 @@ def removals() -> dict[str, Removal]:
         "second render of the alignment": Removal(((s, "ALIGNMENTS", 1), (s, "FIRST_ALIGNED_PX", None))),
         "small first render": Removal(((s, "FIRST_ALIGNED_PX", None),)),
         "larger second look": Removal(((v, "SECOND_LOOK", 1.0),)),
-        "gain, bias, gamma, blur": Removal(((a, "_solved", _without_look),)),
-        "L1 weights": Removal(((a._Level, "residuals", _evenly_weighted),)),
-        "cut of large residuals": Removal(((a, "_bisquare", _uncut),)),
-        "cut-off where saturated": Removal(((a, "cut_off", _as_rendered),)),
-        "depth of the occluder at edges": Removal(((a, "edge_owner_depth", _own_depth),)),
+        "gain, bias, gamma, blur": Removal(_refined_with(estimate_photometric=False)),
+        "L1 weights": Removal(_refined_with(weighting="least_squares")),
+        "cut of large residuals": Removal(_refined_with(cutoff_medians=np.inf)),
+        "cut-off where saturated": Removal(_refined_with(pyramid=PyramidConfig(saturated_share=np.inf))),
+        "depth of the occluder at edges": Removal(_refined_with(pyramid=PyramidConfig(edge_px=0))),
         "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
         "focal length estimated": Removal(exact_focal=True),
         "decoupled solver (PnP again instead)": Removal(((s, "solved_near", _resected_again),)),
@@ -170,7 +172,16 @@ def _patched(patches: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
 
 # --- what stands in for the parts
 
-_SOLVED, _RESIDUALS, _SOLVED_NEAR = alignment._solved, alignment._Level.residuals, stages.solved_near
+_SOLVED_NEAR = stages.solved_near
+
+
+def _refined_with(**changed: Any) -> tuple[tuple[Any, str, Any], ...]:
+    """Return the patches that refine, and estimate the uncertainty, with a changed config."""
+    config = replace(REFINEMENT, **changed)
+    return (
+        (stages, "refine_photometric", partial(refine_photometric, config=config)),
+        (gate, "pose_uncertainty", partial(pose_uncertainty, config=config)),
+    )
 
 
 def _any_views(index: ViewIndex, descriptors: np.ndarray) -> np.ndarray:
@@ -187,29 +198,6 @@ def _upright(upright: Any, query: Any, tools: Any) -> Any:
 
 def _as_found(found: AbsolutePose, query: Any, tools: Any) -> Iterator[IterationRecord]:
     yield IterationRecord("refine", found.pose, found.correction, num_inliers=found.num_inliers)
-
-
-def _without_look(columns: np.ndarray, *others: Any) -> np.ndarray:
-    columns = columns.copy()
-    columns[alignment.LOOK] = 0
-    return _SOLVED(columns, *others)
-
-
-def _evenly_weighted(level: Any, state: Any) -> tuple[np.ndarray, np.ndarray, float]:
-    residuals, weights, loss = _RESIDUALS(level, state)
-    return residuals, np.where(weights > 0, np.float32(1 / alignment.DELTA), np.float32(0)), loss
-
-
-def _uncut(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    return np.ones_like(residuals)
-
-
-def _as_rendered(photo: np.ndarray, frame: Any) -> np.ndarray:
-    return frame.rgb
-
-
-def _own_depth(frame: Any) -> np.ndarray:
-    return np.where(frame.alpha > pyramid.MIN_ALPHA, frame.median_depth, np.float32(0))
 
 
 def _fixed_dilation(camera: Any, info: Any) -> float:

@@ -26,8 +26,9 @@ import numpy as np
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Rasterizer, Tools
-from service.pose.absolute_pose.decoupled import DecoupledSolution, MatchedPoints, gradient_solve, least_squares_solve
+from service.pose.absolute_pose.decoupled import DECOUPLED, DecoupledSolution, MatchedPoints, least_squares_solve
 from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.decoupled_gradient import gradient_solve
 from service.pose.descent.gradient_descent import refine, require_within
 from service.pose.descent.hypotheses import around
 from service.pose.descent.losses import loss_against, require_loss
@@ -228,7 +229,7 @@ def _solved(
     matches: Correspondences, pose: Pose, query: Query, tools: Tools, gradient_round: int | None
 ) -> DecoupledSolution | None:
     """Solve one render's matches; None where they are too few."""
-    if len(matches.photo_px) < 6:
+    if len(matches.photo_px) < DECOUPLED.min_points:
         return None
     matched = MatchedPoints(
         matches.photo_px.astype(np.float64),
@@ -244,7 +245,7 @@ def _solved(
 def _record(
     stage: str, pose: Pose, matches: Correspondences, solved: DecoupledSolution | None, view: View
 ) -> IterationRecord:
-    inlier = solved.weights >= 0.5 if solved else np.zeros(len(matches.photo_px), bool)
+    inlier = solved.inlier if solved else np.zeros(len(matches.photo_px), bool)
     loss = -solved.support if solved else None
     return match_record(stage, pose, matches, inlier, view.camera, loss)
 

@@ -1,4 +1,4 @@
-"""PoseLib, wrapped: the camera pose from pixels and the scene points seen in them."""
+"""Absolute pose by PnP-RANSAC; wraps PoseLib."""
 
 from __future__ import annotations
 
@@ -10,15 +10,27 @@ from jaxtyping import Bool, Float
 
 from service.types import NO_CORRECTION, Intrinsics, IntrinsicsCorrection, Pose
 
-MIN_POINTS = 4
+
+@dataclass(frozen=True, slots=True)
+class AbsolutePoseConfig:
+    min_points: int = 4
+    """Fewest correspondences, and fewest inliers of a solution: three fix a pose (P3P), the fourth confirms it."""
+    min_trials: int = 100
+    """RANSAC trials before the inlier ratio may end the search: an early lucky sample is no proof."""
+
+
+ABSOLUTE_POSE = AbsolutePoseConfig()
 
 
 @dataclass(frozen=True, slots=True)
 class AbsolutePose:
+    """A pose from 2D-3D correspondences."""
+
     pose: Pose
     inlier: Bool[np.ndarray, "m"]
+    """Of the correspondences that the pose was estimated from."""
     correction: IntrinsicsCorrection = NO_CORRECTION
-    """Beside the intrinsics that were given."""
+    """Of the intrinsics that were given; estimated only where the focal length is approximate."""
 
     @property
     def num_inliers(self) -> int:
@@ -31,14 +43,16 @@ def estimate_absolute_pose(
     intrinsics: Intrinsics,
     max_error_px: float,
     max_trials: int,
+    config: AbsolutePoseConfig = ABSOLUTE_POSE,
 ) -> AbsolutePose | None:
-    """Return the pose that most of the matches agree with, refined on them; None if there is none.
+    """Estimate the pose from pixels of a photo and the scene points (world frame, scene units) seen there.
 
-    Matches come surest first: the sampler begins with those (PROSAC, Chum and Matas, CVPR 2005). Without that, 500
-    trials find the pose with 98 % certainty where one match in five is right, 2000 where one in eight is. PoseLib's
-    sampler starts from a constant, so the answer is a function of the arguments.
+    P3P in LO-RANSAC with progressive sampling (PROSAC, Chum and Matas, CVPR 2005), then refined on the inliers (PoseLib).
+    The correspondences are ordered by confidence, highest first. With PROSAC 500 trials find the pose with 98 %
+    certainty where one match in five is right, 2000 where one in eight is. Deterministic: the sampler has a fixed
+    seed. `max_error_px` is the largest reprojection error of an inlier. None if no pose has enough inliers.
     """
-    if len(photo_px) < MIN_POINTS:
+    if len(photo_px) < config.min_points:
         return None
     camera = {
         "model": "PINHOLE",
@@ -48,7 +62,7 @@ def estimate_absolute_pose(
     }
     ransac = {
         "max_reproj_error": max_error_px,
-        "min_iterations": 100,
+        "min_iterations": config.min_trials,
         "max_iterations": max_trials,
         "progressive_sampling": True,
         "max_prosac_iterations": max_trials,
@@ -57,7 +71,8 @@ def estimate_absolute_pose(
     found, info = poselib.estimate_absolute_pose(
         np.asarray(photo_px, np.float64), np.asarray(points_in_world, np.float64), camera, ransac, {}
     )
-    if info["num_inliers"] < MIN_POINTS or not np.all(np.isfinite(found.Rt)):
+    # Where no sample gains enough inliers PoseLib's pose has no meaning, and may hold NaN.
+    if info["num_inliers"] < config.min_points or not np.all(np.isfinite(found.Rt)):
         return None
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = found.R.T

@@ -1,40 +1,60 @@
-"""Where a caller says that the camera is: which poses that admits."""
+"""Tests of camera poses against the prior region that a caller declared: a box, or a Gaussian over poses."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from service.geometry import se3_log
 from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion
 
-LIMIT = 22.46
-"""Chi-square with 6 degrees of freedom at 99.9 %: squared Mahalanobis distances beyond it are outside a Gaussian."""
-LOOSE_DEG, LOOSE_SHARE = 3.0, 0.05
-"""How far a pose may be off before it is aligned: per axis, and as a share of the distance to what is seen."""
+
+@dataclass(frozen=True, slots=True)
+class PriorRegionConfig:
+    max_squared_mahalanobis: float = 22.46
+    """Poses at a larger squared distance are outside a Gaussian: 99.9 % quantile of chi-square, 6 degrees of freedom."""
+    slack_deg: float = 3.0
+    """Rotation error per axis (standard deviation) of a pose from matches alone, before photometric refinement."""
+    slack_share: float = 0.05
+    """Its position error, as a share of the distance to what the photo shows."""
 
 
-def inside_prior(region: PriorRegion | None, pose: Pose) -> bool:
-    """Tell whether the region holds the pose; no region holds all."""
-    return region is None or distance_outside(region, pose) <= 0.0
+PRIOR_REGION = PriorRegionConfig()
 
 
-def distance_outside(region: PriorRegion, pose: Pose) -> float:
-    """Return how far the pose is outside, 0 inside: of a box in scene units, of a Gaussian in standard deviations."""
+def inside_prior(region: PriorRegion | None, pose: Pose, config: PriorRegionConfig = PRIOR_REGION) -> bool:
+    """Return whether the pose is inside the region, borders included; None is the region of all poses."""
+    return region is None or distance_outside(region, pose, config) <= 0.0
+
+
+def distance_outside(region: PriorRegion, pose: Pose, config: PriorRegionConfig = PRIOR_REGION) -> float:
+    """Return the pose's distance from the region, 0 inside it.
+
+    Of a box: Euclidean, of the camera's centre, in scene units. Of a Gaussian: the Mahalanobis distance of the right
+    twist from its mean pose, beyond the limit, in standard deviations.
+    """
     if isinstance(region, BoxPrior):
         position = pose.position_in_world
         outside = np.maximum(region.lower_in_world - position, position - region.upper_in_world)
         return float(np.linalg.norm(np.maximum(outside, 0.0)))
     twist = se3_log(region.pose.camera_from_world @ pose.world_from_camera)
     squared = float(twist @ np.linalg.solve(region.covariance, twist))
-    return max(float(np.sqrt(squared) - np.sqrt(LIMIT)), 0.0)
+    return max(float(np.sqrt(squared) - np.sqrt(config.max_squared_mahalanobis)), 0.0)
 
 
-def widened_prior(region: PriorRegion | None, distance: float) -> PriorRegion | None:
-    """Return the region for poses that are not aligned yet; `distance` (scene units) is that to what is seen."""
-    slack = LOOSE_SHARE * distance
+def widened_prior(
+    region: PriorRegion | None, distance: float, config: PriorRegionConfig = PRIOR_REGION
+) -> PriorRegion | None:
+    """Return the region grown by the error of a pose that photometric refinement hasn't improved yet.
+
+    `distance` (scene units) is that from the camera to what the photo shows. A box grows on every side, a Gaussian's
+    covariance by independent errors of rotation and translation.
+    """
+    slack = config.slack_share * distance
     if region is None:
         return None
     if isinstance(region, BoxPrior):
         return BoxPrior(region.lower_in_world - slack, region.upper_in_world + slack)
-    spread = np.r_[np.full(3, np.radians(LOOSE_DEG)), np.full(3, slack)]
-    return GaussianPosePrior(region.pose, region.covariance + np.diag(spread**2))
+    sigmas = np.r_[np.full(3, np.radians(config.slack_deg)), np.full(3, slack)]
+    return GaussianPosePrior(region.pose, region.covariance + np.diag(sigmas**2))

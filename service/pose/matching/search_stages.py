@@ -13,10 +13,10 @@ import numpy as np
 
 from service.geometry import pose_distance
 from service.interfaces import Tools
-from service.pose.absolute_pose.decoupled import MIN_POINTS, MatchedPoints, least_squares_solve
+from service.pose.absolute_pose.decoupled import DecoupledConfig, MatchedPoints, least_squares_solve
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.absolute_pose.prior_region import inside_prior, widened_prior
-from service.pose.absolute_pose.unknown_focal import WIDER, absolute_pose_unknown_focal, refine
+from service.pose.absolute_pose.unknown_focal import FOCAL_SEARCH, absolute_pose_unknown_focal, refine_with_intrinsics
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.rendered_views import View
 from service.pose.features.views import known_at, photo_at, photo_features, rendered_frame, rendered_view
@@ -43,7 +43,7 @@ ASTRAY_DEG = 10.0
 """An alignment that turns the camera by more, away from a pose with many matches, is wrong."""
 REMATCHES, ALIGNMENTS = 3, 4
 """Rounds of rendering at the pose and matching, or aligning, with that; at most."""
-DECOUPLED_STEPS = 8
+REMATCH_SOLVER = DecoupledConfig(steps=8)
 
 
 def matched(
@@ -121,7 +121,7 @@ def aligned(found: AbsolutePose, query: Query, tools: Tools) -> Generator[Iterat
         photo = photo_at(query, tools, size)
         known = known_at(query, tools, size)
         result = refine_photometric(
-            photo, frame, camera, start, levels, lens, query.focal_sigma, known, roughly=bool(size_px)
+            photo, frame, camera, start, levels, lens, query.focal_sigma, known, coarse=bool(size_px)
         )
         tools.memo["aligned"] = result  # for the gate
         astray = found.num_inliers >= GOOD_MATCH and pose_distance(found.pose, result.pose)[0] > ASTRAY_DEG
@@ -156,19 +156,21 @@ def solved_near(near: AbsolutePose, matches: Correspondences, query: Query) -> A
     if query.focal_sigma:
         pixels = REMATCH_ERROR_PX * query.intrinsics.long_side / PHOTO_PX
         lens = query.intrinsics.corrected(near.correction)
-        found = estimate_absolute_pose(matches.photo_px, matches.points_in_world, lens, WIDER * pixels, 500)
+        found = estimate_absolute_pose(
+            matches.photo_px, matches.points_in_world, lens, FOCAL_SEARCH.error_factor * pixels, 500
+        )
         if found:
             found = replace(found, correction=near.correction)
             given = (matches.photo_px, matches.points_in_world)
-            found = refine(*given, query.intrinsics, found, query.focal_sigma, pixels)
-    elif len(matches.photo_px) < MIN_POINTS:
+            found = refine_with_intrinsics(*given, query.intrinsics, found, query.focal_sigma, pixels)
+    elif len(matches.photo_px) < REMATCH_SOLVER.min_points:
         return None
     else:
         points = matches.points_in_world.astype(np.float64)
         centre = np.median(points, axis=0)
         given = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, centre)
-        solved = least_squares_solve(given, near.pose, DECOUPLED_STEPS)
-        found = AbsolutePose(solved.pose, solved.weights >= 0.5, near.correction)
+        solved = least_squares_solve(given, near.pose, REMATCH_SOLVER)
+        found = AbsolutePose(solved.pose, solved.inlier, near.correction)
     return found if found and _possible(found.pose, matches, query) else None
 
 

@@ -1,1 +1,6 @@
-"""Photometric refinement of a pose on a rendered RGB-D frame, and its covariance."""
+"""Photometric refinement of a pose on a rendered RGB-D frame, and the uncertainty of the result.
+
+`photometric` refines, coarse to fine, with `gauss_newton` on each `pyramid_level`; `uncertainty` linearizes at the
+answer and estimates covariance (by the jackknife of `covariance`) and the last Gauss-Newton step; `kernels` are the
+compiled inner loops, `config` all tuning constants.
+"""

@@ -1,16 +1,16 @@
-"""How far an alignment errs, told from one photo: its residuals, the image cut in quarters, and what models have shown.
+"""Variance of refined unknowns from one photo: scores of image cells, and the jackknife over quarters of the image.
 
-The score of the unknowns (columns . weight . residual, summed over pixels) has the variance s H, where H is the
-hessian; the covariance is s H^-1. With independent residuals s would be known from their size. But a model's errors
-are alike over large parts of the image (White's sandwich with blocks of 16 px, Liang and Zeger's clusters, finds a
-tenth to a quarter of the true squared error), and fitting hides them where there are few, large parts. So s is from
-the jackknife: without a quarter of what the photo tells, the unknowns move by d,
+The score of the unknowns (jacobian . weight . residual, summed over pixels) has the variance s H, where H is the
+hessian; the covariance is s H^-1. With independent residuals s would follow from their size. But a model's errors are
+correlated over large parts of the image (White's sandwich with blocks of 16 px, and Liang and Zeger's clusters, find a
+tenth to a quarter of the true squared error), and fitting hides them where the parts are few and large. So s is from
+the jackknife: without a quarter of the photo's information the unknowns move by d, and
 
     s = mean over cuts of sum over quarters d^T H d / unknowns
 
-which grants each quarter the weight that it has (the moves exceed errors where a quarter tells much), and is the mean
-over eight cuts, because one alone has few degrees of freedom. Only the size is taken from the jackknife; the shape is
-H's: four quarters can't tell 36 numbers.
+This gives each quarter the weight that it has (the moves exceed the errors where a quarter holds much information). It
+is the mean over eight cuts, because one alone has few degrees of freedom. Only the scale is the jackknife's, the shape
+is H's: four quarters don't determine a 6x6 matrix.
 """
 
 from __future__ import annotations
@@ -18,56 +18,56 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from service.jit import kernel
-
-CELL_PX = 16
-TURNS = 4
-"""Of the cross that cuts the image in quarters, within a right angle; each is cut first one way, then the other."""
-REMAINS = 1e-3
-"""Share of the hessian that no quarter takes away, so that what is left can be solved."""
+from service.pose.refinement.config import UncertaintyConfig
+from service.pose.refinement.kernels import sum_scores_by_cell
 
 
-def summed_by_cell(
-    columns: Float32[np.ndarray, "k n"],
+def scores_by_cell(
+    jacobian: Float32[np.ndarray, "k n"],
     weights: Float32[np.ndarray, "n"],
     residuals: Float32[np.ndarray, "n"],
     pixels: Int64[np.ndarray, "n"],
     shape: tuple[int, int],
-    bend: float,
+    l1_floor: float,
+    cell_px: int,
 ) -> tuple[Float64[np.ndarray, "cells k"], Float64[np.ndarray, "cells k k"], Float64[np.ndarray, "cells 2"]]:
-    """Return scores, hessians and places of the image's cells that have pixels; `pixels` count through `shape`.
+    """Return scores, hessians and (row, column) places of the square cells of an image that have pixels.
 
-    The loss is bent only where residuals are below `bend`: the weights of the others would overstate it.
+    `pixels` index an image of `shape` (rows, columns), row by row. The loss has curvature only at residuals below
+    `l1_floor`: the weights of the others would overstate it.
     """
-    across = -(-shape[1] // CELL_PX)
-    count = across * -(-shape[0] // CELL_PX)
-    sums, hessians, used = _sums(columns, weights, residuals, pixels, shape[1], CELL_PX, count, bend)
+    across = -(-shape[1] // cell_px)
+    count = across * -(-shape[0] // cell_px)
+    scores, hessians, used = sum_scores_by_cell(
+        jacobian, weights, residuals, pixels, shape[1], cell_px, count, l1_floor
+    )
     cells = np.flatnonzero(used)
-    return sums[cells], hessians[cells], np.stack(np.divmod(cells, across), 1).astype(np.float64)
+    return scores[cells], hessians[cells], np.stack(np.divmod(cells, across), 1).astype(np.float64)
 
 
-def spread(
+def jackknife_variance_scale(
     scores: Float64[np.ndarray, "cells k"],
     hessians: Float64[np.ndarray, "cells k k"],
     places: Float64[np.ndarray, "cells 2"],
+    config: UncertaintyConfig,
 ) -> float:
-    """Return s; infinite where the hessian is singular."""
+    """Return s, the factor from the inverse hessian to the covariance; infinite where the hessian is singular."""
     hessian = hessians.sum(0)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     hessians, scores, hessian = hessians * np.outer(scale, scale), scores * scale, hessian * np.outer(scale, scale)
     try:
         information = np.einsum("cij,ji->c", hessians, np.linalg.inv(hessian))
-        quarters = _quarters(places, np.maximum(information, 0.0)).astype(np.float64)
-        left = (1 + REMAINS) * hessian - np.tensordot(quarters, hessians, 1)
+        quarters = _quarters(places, np.maximum(information, 0.0), config.cuts).astype(np.float64)
+        left = (1 + config.ridge) * hessian - np.tensordot(quarters, hessians, 1)
         moves = np.linalg.solve(left, (quarters @ scores)[..., None])[..., 0]
     except np.linalg.LinAlgError:
         return np.inf
-    found = float(np.einsum("qi,ij,qj->", moves, hessian, moves)) / len(hessian) / (2 * TURNS)
+    found = float(np.einsum("qi,ij,qj->", moves, hessian, moves)) / len(hessian) / (2 * config.cuts)
     return found if np.isfinite(found) else np.inf
 
 
-def inverse(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k"] | None:
-    """Return the inverse, symmetric and positive definite; None if there is none such."""
+def inverse_spd(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k"] | None:
+    """Return the inverse, exactly symmetric; None if the matrix isn't positive definite."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     try:
         half = np.linalg.inv(np.linalg.cholesky(hessian * np.outer(scale, scale))) * scale
@@ -78,46 +78,20 @@ def inverse(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k"] |
 
 
 def _quarters(
-    places: Float64[np.ndarray, "cells 2"], information: Float64[np.ndarray, "cells"]
+    places: Float64[np.ndarray, "cells 2"], information: Float64[np.ndarray, "cells"], cuts: int
 ) -> Bool[np.ndarray, "quarters cells"]:
-    """Return, for each cut, the four parts, which hold about as much information each."""
+    """Return, for each of 2 * `cuts` cuts, four parts with about the same information each."""
     parts = []
-    for angle in 0.5 * np.pi / TURNS * np.arange(2 * TURNS):
+    for angle in 0.5 * np.pi / cuts * np.arange(2 * cuts):
         along, across = places @ [np.cos(angle), np.sin(angle)], places @ [-np.sin(angle), np.cos(angle)]
-        first = along > _middle(along, information)
+        first = along > _weighted_median(along, information)
         for half in (first, ~first):
-            beyond = across > _middle(across, information * half)
+            beyond = across > _weighted_median(across, information * half)
             parts += [half & beyond, half & ~beyond]
     return np.stack(parts)
 
 
-def _middle(values: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"]) -> float:
-    """Return the weighted median."""
+def _weighted_median(values: Float64[np.ndarray, "n"], weights: Float64[np.ndarray, "n"]) -> float:
     order = np.argsort(values, kind="stable")
     below = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
-
-
-@kernel
-def _sums(columns, weights, residuals, pixels, width, cell_px, count, bend):
-    """Return each cell's sums of score and hessian, and how many pixels it has."""
-    size = columns.shape[0]
-    across = (width + cell_px - 1) // cell_px
-    scores = np.zeros((count, size))
-    hessians = np.zeros((count, size, size))
-    used = np.zeros(count, np.int64)
-    for i in range(len(pixels)):
-        cell = pixels[i] // width // cell_px * across + pixels[i] % width // cell_px
-        used[cell] += 1
-        bent = abs(residuals[i]) < bend
-        for a in range(size):
-            weighted = columns[a, i] * weights[i]
-            scores[cell, a] += weighted * residuals[i]
-            if bent:
-                for b in range(a + 1):
-                    hessians[cell, a, b] += weighted * columns[b, i]
-    for cell in range(count):
-        for a in range(size):
-            for b in range(a):
-                hessians[cell, b, a] = hessians[cell, a, b]
-    return scores, hessians, used

@@ -25,7 +25,7 @@ from service.interfaces import Frame, Tools
 from service.pose.absolute_pose.prior_region import inside_prior
 from service.pose.features.views import known_at, photo_at, photo_features, rendered_frame, rendered_view
 from service.pose.matching.correspondences import Correspondences, correspondences
-from service.pose.refinement.photometric import PoseUncertainty, pose_uncertainty
+from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import APPEARANCE, MIN_ALPHA, appearance, both_known
 from service.results import Reason, Status, Verdict
 from service.types import Camera, Intrinsics, Pose, Query

@@ -1,0 +1,92 @@
+"""Tuning constants of photometric refinement and of its uncertainty. Intensities are 0..1 unless stated otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class PyramidConfig:
+    """How photo and render are made comparable, and into pyramids."""
+
+    blur_sigma_px: float = 0.7
+    """Gaussian blur of both at each level: renders are softer than photos."""
+    min_alpha: float = 0.5
+    """Pixels of the render with less show no surface."""
+    edge_px: int = 2
+    """Reach of an occluding edge on both sides; 0: each pixel has its own depth."""
+    edge_jump: float = 0.06
+    """Relative change of depth that makes an edge; a surface at 80 degrees from its normal has 0.02 over two pixels."""
+    max_depth_ratio: float = 1.1
+    """Of four pixels that are averaged into one of the next level; beyond it that has no depth."""
+    saturated: int = 252
+    """Photo values (0..255) from which on a channel counts as clipped."""
+    saturated_share: float = 0.005
+    """Of all values of a photo, from which on the render is clipped like the photo."""
+    exposure_block_px: int = 16
+    """Side of the blocks whose means give the exposure between photo and render."""
+    min_exposed: float = 0.05
+    """Darker blocks of either have no part in the exposure: a black rim says nothing."""
+    max_exposed: float = 0.9
+    """Brighter blocks of the photo neither: they may be clipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class UncertaintyConfig:
+    """How residuals become a covariance; fitted on the photos of chair, materials and studio."""
+
+    cell_px: int = 16
+    """Side of the cells over which scores are summed: neighbouring residuals are correlated."""
+    cuts: int = 4
+    """Directions, within a right angle, of the cross that cuts the image into quarters; twice as many cuts."""
+    ridge: float = 1e-3
+    """Share of the hessian that removing a quarter leaves in any case, so that the rest can be solved."""
+    min_variance_scale: float = 0.09
+    """Lower bound of the variance scale, the median of those scenes' photos (each two alone: 0.09 to 0.10): a photo whose
+    quarters happen to agree isn't more exact than the model."""
+    variance_share: float = 0.91
+    """Times the jackknife's variance scale: what three quarters fit, the jackknife can't see; were all quarters alike
+    it would be 3/4. With it the mean normalized error squared of those scenes is 4.3, 6.0 and 7.7, of six expected."""
+    focal_inflation: float = 2.5
+    """Times the standard deviation of the focal length from the cells' residuals."""
+    suspicious_focal_step: float = 0.004
+    """Of log focal: from this last step on a focal length said to be exact is set free, to see how far it goes."""
+    free_focal_sigma: float = 0.15
+    """Prior standard deviation of log focal in that test."""
+
+
+@dataclass(frozen=True, slots=True)
+class RefinementConfig:
+    """Gauss-Newton on each level of the pyramid."""
+
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
+    uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
+    weighting: Literal["l1", "least_squares"] = "l1"
+    """IRLS weights 1 / max(|r|, l1_floor), or the same weight 1 / l1_floor for all."""
+    l1_floor: float = 0.02
+    """Residuals below it are noise, and weigh like least squares."""
+    cutoff_medians: float = 9.0
+    """Residual, in median absolute residuals, at which Tukey's weight reaches 0; infinite: no cut-off. With a third of
+    the photo hidden it halves the median error, and on clean photos of poor models, too; blurred ones lose a little."""
+    min_median: float = 0.01
+    """Lower bound of that median."""
+    estimate_photometric: bool = True
+    """Whether gain, bias, gamma and blur are estimated with the pose."""
+    max_steps: int = 12
+    """Gauss-Newton steps on a level."""
+    max_pixels: int = 10_000
+    """A level with more uses every second, third...: 6000 were as exact as 30000 on the test scenes..."""
+    max_pixels_intrinsics: int = 20_000
+    """...but for the focal length."""
+    min_pixels: int = 200
+    """Fewest pixels, of a level and of its overlap with the photo, that are refined on."""
+    settled_px: float = 0.005
+    """A step that moves the image by less (pixels of the level) is the last, on the finest level..."""
+    settled_coarse_px: float = 0.05
+    """...and on those that a finer one, or another refinement, follows."""
+    correlated_pixels: float = 50.0
+    """Neighbouring residuals err together: so many count as one observation against the prior on the intrinsics."""
+
+
+REFINEMENT = RefinementConfig()

@@ -1,0 +1,71 @@
+"""Gauss-Newton with iteratively reweighted residuals on one level of the pyramid."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from service.geometry import se3_exp
+from service.pose.absolute_pose.intrinsics_prior import correction_vector
+from service.pose.refinement.config import RefinementConfig
+from service.pose.refinement.kernels import normal_equations
+from service.pose.refinement.pyramid_level import CORRECTION, PHOTOMETRIC, TWIST, PyramidLevel, RefinementState
+
+
+def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, config: RefinementConfig) -> float:
+    """Minimize the level's robust photometric error, changing `state`; return its mean absolute residual (0..1).
+
+    Steps end when one moves the image by less than `settled_px` pixels of the level, or after `max_steps`. Infinite
+    where too few pixels overlap, or the normal equations can't be solved.
+    """
+    if len(level.pixels) < config.min_pixels:
+        return np.inf
+    typical_depth = float(np.median(level.points[2]))
+    loss = np.inf
+    for _ in range(config.max_steps):
+        residuals, weights, loss = level.residuals(state, config)
+        if not np.isfinite(loss):
+            return np.inf
+        step = _step(level.jacobian, residuals, weights, state, loss, config)
+        if not np.all(np.isfinite(step)):
+            return np.inf
+        state.photo_from_render = state.photo_from_render @ se3_exp(-step[TWIST])
+        state.photometric += step[PHOTOMETRIC]
+        if state.prior:
+            state.correction = state.prior.stepped(state.correction, step[CORRECTION])
+        intrinsics = level.photo_intrinsics
+        moved_px = intrinsics.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
+        if moved_px + intrinsics.long_side * np.abs(step[CORRECTION]).max() < settled_px:
+            break
+    return loss
+
+
+def _step(
+    jacobian: Float32[np.ndarray, "13 n"],
+    residuals: Float32[np.ndarray, "n"],
+    weights: Float32[np.ndarray, "n"],
+    state: RefinementState,
+    loss: float,
+    config: RefinementConfig,
+) -> Float64[np.ndarray, "13"]:
+    """Solve the weighted normal equations; zeros for unknowns that are not estimated.
+
+    Each unknown is scaled by its hessian's diagonal first, for they differ by orders of magnitude.
+    """
+    if not state.prior:
+        jacobian = jacobian[: CORRECTION.start]
+    if not config.estimate_photometric:
+        jacobian = jacobian.copy()
+        jacobian[PHOTOMETRIC] = 0
+    size = len(jacobian)
+    hessian, rhs = normal_equations(jacobian, weights, residuals, state.factors)
+    if state.prior:
+        precision = config.correlated_pixels * loss * state.prior.precision
+        hessian[range(10, 13), range(10, 13)] += precision
+        rhs[CORRECTION] -= precision * correction_vector(state.correction)
+    scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
+    damped = hessian * scale * scale[:, None]
+    damped[range(size), range(size)] += 1e-6
+    step = np.zeros(13)
+    step[:size] = scale * np.linalg.solve(damped, scale * rhs)
+    return step
