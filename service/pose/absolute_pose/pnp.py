@@ -47,8 +47,8 @@ def estimate_absolute_pose(
 ) -> AbsolutePose | None:
     """Estimate the pose from pixels of a photo and the scene points (world frame, scene units) seen there.
 
-    P3P in LO-RANSAC with progressive sampling (PROSAC, Chum and Matas, CVPR 2005), then refined on the inliers (PoseLib).
-    The correspondences are ordered by confidence, highest first. With PROSAC 500 trials find the pose with 98 %
+    P3P in LO-RANSAC with progressive sampling (PROSAC, Chum and Matas, CVPR 2005), refined on the inliers. The
+    correspondences are ordered by confidence, highest first. Without that order 500 trials find the pose with 98 %
     certainty where one match in five is right, 2000 where one in eight is. Deterministic: the sampler has a fixed
     seed. `max_error_px` is the largest reprojection error of an inlier. None if no pose has enough inliers.
     """

@@ -13,7 +13,7 @@ from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion
 @dataclass(frozen=True, slots=True)
 class PriorRegionConfig:
     max_squared_mahalanobis: float = 22.46
-    """Poses at a larger squared distance are outside a Gaussian: 99.9 % quantile of chi-square, 6 degrees of freedom."""
+    """Poses beyond it are outside a Gaussian: the 99.9 % quantile of chi-square with 6 degrees of freedom."""
     slack_deg: float = 3.0
     """Rotation error per axis (standard deviation) of a pose from matches alone, before photometric refinement."""
     slack_share: float = 0.05

@@ -22,7 +22,7 @@ from service.types import Intrinsics, IntrinsicsCorrection, Pose
 @dataclass(frozen=True, slots=True)
 class FocalSearchConfig:
     log_step: float = 0.2
-    """Between two samples of the focal length's logarithm: at most a tenth off, which leaves enough inliers to refine."""
+    """Between two samples of log focal: at most a tenth off, which leaves enough inliers to refine."""
     reach_sigmas: float = 2.5
     """Half width of the grid, in standard deviations of the prior."""
     error_factor: float = 2.0

@@ -43,8 +43,8 @@ class UncertaintyConfig:
     ridge: float = 1e-3
     """Share of the hessian that removing a quarter leaves in any case, so that the rest can be solved."""
     min_variance_scale: float = 0.09
-    """Lower bound of the variance scale, the median of those scenes' photos (each two alone: 0.09 to 0.10): a photo whose
-    quarters happen to agree isn't more exact than the model."""
+    """Lower bound of the variance scale, the median of those scenes' photos (of each two alone 0.09 to 0.10): a photo
+    whose quarters happen to agree isn't more exact than the model."""
     variance_share: float = 0.91
     """Times the jackknife's variance scale: what three quarters fit, the jackknife can't see; were all quarters alike
     it would be 3/4. With it the mean normalized error squared of those scenes is 4.3, 6.0 and 7.7, of six expected."""
