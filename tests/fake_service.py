@@ -24,7 +24,9 @@ from service.results import Candidates, IterationRecord, MatchVectors, PoseEstim
 from service.scene_manager.splat_sample import packed_splats
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web.schemas.conversion import intrinsics_out, named_camera_out, pose_out, record_out, result_out
-from service.web.schemas.responses import FrameOut, JobLinks, JobOut, PhotoOut, SceneLinks, SceneOut, Timing
+from service.web.schemas.job_results import FrameOut, Timing
+from service.web.schemas.jobs import JobLinks, JobOut, PhotoOut
+from service.web.schemas.scenes import SceneLinks, SceneOut
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 

@@ -65,7 +65,7 @@ WRAPPED = {
     "prometheus_client": {"service/web/metrics.py"},
     "structlog": {"service/logs.py"},
     "pyproj": {"service/web/schemas/geodesy.py"},
-    "yaml": {"service/web/app.py"},
+    "yaml": {"service/web/openapi.py"},
     "websockets": {"service/web/viewer_relay.py"},
     "httpx": {"service/web/viewer_relay.py", "viewer/service_client.py"},
     "uvicorn": {"service/cli/server.py"},

@@ -17,7 +17,7 @@ from service.types import GeoAnchor, Intrinsics, Pose
 from service.web.schemas.conversion import geopose_out, result_out, timing_out
 from service.web.schemas.exports import exported
 from service.web.schemas.geodesy import geographic
-from service.web.schemas.responses import Result
+from service.web.schemas.job_results import Result
 
 CREATED = datetime(2026, 1, 2, 3, 4, 5, 250_000, tzinfo=UTC)
 POSE = look_at(np.array([1.0, 2.0, 3.0]), np.array([4.0, 4.0, 2.0]), np.array([0.0, 0.0, 1.0]))

@@ -16,7 +16,7 @@ from service.results import IterationRecord, Reason, Status
 from service.tracking import Tracker
 from service.types import Pose
 from service.web.schemas.conversion import result_out
-from service.web.schemas.responses import Timing
+from service.web.schemas.job_results import Timing
 
 
 @pytest.fixture(scope="module")

@@ -24,9 +24,9 @@ from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from service.localize import LoadedScene
+    from service.web.schemas.job_results import Result
     from service.web.schemas.parsing import Body
     from service.web.schemas.requests import LocalizeFields
-    from service.web.schemas.responses import Result
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,8 @@ import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from service.web.schemas.responses import FrameOut, Result, Transform
+from service.web.schemas.job_results import FrameOut, Result
+from service.web.schemas.poses import Transform
 
 _POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 

@@ -27,9 +27,9 @@ from service.scene_manager.manager import Scenes
 from service.types import Query
 from service.web.metrics import Metrics
 from service.web.schemas.conversion import intrinsics_out
+from service.web.schemas.jobs import PhotoOut
 from service.web.schemas.parsing import Body, Task, make_task
 from service.web.schemas.requests import LocalizeFields
-from service.web.schemas.responses import PhotoOut
 from service.web.settings import Settings
 
 _HOUSEKEEPING_S = 2.0

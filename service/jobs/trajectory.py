@@ -9,8 +9,8 @@ from service.results import PoseEstimate, StageTiming, Status
 from service.tracking import SequencePose
 from service.types import GeoAnchor
 from service.web.schemas.conversion import covariance_out, record_out, result_out, timing_out, transform_out
+from service.web.schemas.job_results import FrameOut, Record, Result
 from service.web.schemas.resources import versions
-from service.web.schemas.responses import FrameOut, Record, Result
 
 
 class Trajectory:

@@ -22,9 +22,9 @@ from service.scene_manager.manager import several
 from service.tracking import localize_sequence
 from service.types import Query
 from service.web.schemas.conversion import record_out, result_out, timing_out
+from service.web.schemas.job_results import Record, Result
 from service.web.schemas.requests import LocalizeFields
 from service.web.schemas.resources import versions
-from service.web.schemas.responses import Record, Result
 
 _log = logging.getLogger(__name__)
 

@@ -21,7 +21,8 @@ from service.errors import BadInput, NoRoom, SceneNotFound, SceneNotReady, Scene
 from service.localize import DEFAULT_MATCHER, LoadedScene
 from service.scene_formats.discovery import find_scenes
 from service.scene_manager.warm_up import warm_up
-from service.web.schemas.responses import Readiness, SceneState
+from service.web.schemas.scenes import SceneState
+from service.web.schemas.system import Readiness
 
 _log = logging.getLogger(__name__)
 

@@ -13,14 +13,10 @@ from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import anyio
-import yaml
 from anyio import to_thread
 from fastapi import FastAPI
-from fastapi.openapi.utils import get_openapi
-from pydantic.json_schema import models_json_schema
 from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
 
@@ -40,15 +36,12 @@ from service.web.middleware.authentication import AccessRules, Authentication, a
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Edge
 from service.web.middleware.route_lookup import RouteLookup
+from service.web.openapi import description, description_as_yaml
 from service.web.pages import add_pages
 from service.web.problems import install
 from service.web.route_policy import RoutePolicy, declare, require_policies
 from service.web.routes import router
 from service.web.routes.dependencies import Parts
-from service.web.schemas.error_examples import example_components
-from service.web.schemas.openapi_links import add_links
-from service.web.schemas.requests import LocalizeIn
-from service.web.schemas.responses import Problem, Record
 from service.web.settings import Settings
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
@@ -117,13 +110,24 @@ def create_app(
     add_pages(app)
     if relay:
         app.include_router(relay.router)
-    # The last one added is the first one that a request meets.
-    app.add_middleware(
-        Limits, settings=settings, check_room=lambda *who: to_thread.run_sync(app.state.parts.jobs.room, *who)
-    )
+    _add_middleware(app, settings, keys, metrics)
+    app.openapi = lambda: description(app)
+    _declare_documentation(app)
+    require_policies(app.routes)
+    return app
+
+
+def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
+    """Add the layers from the innermost to the outermost, which a request passes first."""
+
+    async def check_room(client: str, idempotency_key: str | None) -> None:
+        await to_thread.run_sync(app.state.parts.jobs.room, client, idempotency_key)
+
+    app.add_middleware(Limits, settings=settings, check_room=check_room)
     app.add_middleware(Authentication, rules=access_rules(settings, keys))
     app.add_middleware(RouteLookup, routes=app.routes)
     if settings.cors_origins:
+        # Outside of authentication: a browser sends preflight requests without a key.
         app.add_middleware(
             CORSMiddleware,
             allow_origins=settings.cors_origins,
@@ -132,12 +136,6 @@ def create_app(
             expose_headers=["Location", "Retry-After"],
         )
     app.add_middleware(Edge, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
-    app.openapi = lambda: openapi(app)
-    for route in app.routes:
-        if isinstance(route, Route) and route.name in _DOCUMENTATION:
-            declare(route.endpoint, _DOCUMENTATION[route.name])
-    require_policies(app.routes)
-    return app
 
 
 # FastAPI's own routes: the description of the API is public, with the page that shows it.
@@ -147,6 +145,12 @@ _DOCUMENTATION = {
     "swagger_ui_redirect": RoutePolicy(role="read"),
     "redoc_html": RoutePolicy(role="read"),
 }
+
+
+def _declare_documentation(app: FastAPI) -> None:
+    for route in app.routes:
+        if isinstance(route, Route) and route.name in _DOCUMENTATION:
+            declare(route.endpoint, _DOCUMENTATION[route.name])
 
 
 @contextmanager
@@ -194,58 +198,6 @@ async def _cancelled(task: asyncio.Task[None]) -> None:
         await task
 
 
-def openapi(app: FastAPI) -> dict[str, Any]:
-    """Return the API's description; with the models that no route names by itself."""
-    if not app.openapi_schema:
-        schema = get_openapi(
-            title=app.title,
-            version=app.version,
-            summary=_SUMMARY,
-            description=_DESCRIPTION,
-            routes=app.routes,
-        )
-        _, extra = models_json_schema(
-            [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
-            ref_template="#/components/schemas/{model}",
-        )
-        models = schema.setdefault("components", {}).setdefault("schemas", {})
-        models |= {name: model for name, model in extra["$defs"].items() if name not in models}
-        schema["components"]["examples"] = example_components()
-        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
-        schema["security"] = [{"key": []}, {}]
-        _drop_default_validation(schema)
-        add_links(schema)
-        app.openapi_schema = schema
-    return app.openapi_schema
-
-
-def _drop_default_validation(schema: dict[str, Any]) -> None:
-    """Take out what FastAPI says of its own validation: ours answers with a problem document of 400."""
-    for operations in schema["paths"].values():
-        for operation in operations.values():
-            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
-                del operation["responses"]["422"]
-    for name in ("HTTPValidationError", "ValidationError"):
-        schema["components"]["schemas"].pop(name, None)
-
-
 def openapi_yaml() -> str:
     """Return the text of openapi.yaml; it doesn't depend on any setting."""
-    return yaml.safe_dump(
-        create_app(Settings(scenes=[], viewer=False)).openapi(),
-        sort_keys=False,
-        width=100,
-        allow_unicode=True,
-    )
-
-
-_KEYS = "An API key, or a token from `/tokens`; a service without keys needs none."
-_SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
-_DESCRIPTION = """
-Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
-camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
-are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
-Every error is a problem document (RFC 9457) with a stable `code`; each operation lists those it may give, each with
-an example. An address that isn't here is answered with `not_found`, another method with `method_not_allowed`.
-A job that ended without a result has a problem document as its `error`.
-"""
+    return description_as_yaml(create_app(Settings(scenes=[], viewer=False)))

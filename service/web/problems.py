@@ -44,7 +44,7 @@ from service.errors import (
     StorageFailed,
     Unauthorized,
 )
-from service.web.schemas.responses import Problem
+from service.web.api_model import Model
 
 _log = logging.getLogger(__name__)
 
@@ -92,6 +92,24 @@ _HTTP_CODES = {
     415: "unsupported_media_type",
     503: "unavailable",
 }
+
+
+class Problem(Model):
+    """What went wrong, as RFC 9457 has it: the body of every error, `application/problem+json`."""
+
+    type: str
+    """`urn:splatfix:error:<code>`, or `about:blank` where the status says it all."""
+    title: str
+    status: int
+    detail: str
+    instance: str
+    """The path that was asked for."""
+    code: str
+    """Stable, for programs."""
+    where: str = ""
+    """The field, file or element concerned; empty if there is none."""
+    hint: str = ""
+    """What to do about it."""
 
 
 def problem_of(error: Exception, instance: str) -> Problem:

@@ -12,7 +12,7 @@ from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
 from service.jobs.service import Order
 from service.photos.sequence import is_sequence
 from service.web.middleware.limits import client_of
-from service.web.problems import problem_answer
+from service.web.problems import Problem, problem_answer
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import PartsOf
 from service.web.schemas import geopose_protocol as gpp
@@ -20,7 +20,6 @@ from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.parsing import Body
 from service.web.schemas.requests import LocalizeFields
-from service.web.schemas.responses import Problem
 
 GEOPOSE = "application/geopose+json"
 

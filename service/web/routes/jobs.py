@@ -24,7 +24,8 @@ from service.web.schemas import resources as documents
 from service.web.schemas.conversion import record_camera
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.exports import EXPORT_TYPES, ExportFormat, exported
-from service.web.schemas.responses import JobList, JobOut, JobState, PhotoOut, Record, Trace
+from service.web.schemas.job_results import Record
+from service.web.schemas.jobs import JobList, JobOut, JobState, PhotoOut, Trace
 
 router = APIRouter()
 

@@ -15,9 +15,9 @@ from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import PartsOf, RootOf
 from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
+from service.web.schemas.jobs import JobOut
 from service.web.schemas.parsing import read_body, read_fields
 from service.web.schemas.requests import LocalizeFields, LocalizeIn
-from service.web.schemas.responses import JobOut
 
 router = APIRouter()
 

@@ -16,7 +16,7 @@ from service.web.routes.dependencies import JPEG, PartsOf, RootOf
 from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.requests import RenderIn
-from service.web.schemas.responses import SceneList, SceneOut, SceneSummary
+from service.web.schemas.scenes import SceneList, SceneOut, SceneSummary
 
 MAX_SPLATS = 2_000_000
 

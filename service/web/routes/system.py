@@ -10,7 +10,7 @@ from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import CallerOf, PartsOf
 from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import errors
-from service.web.schemas.responses import Capabilities, Liveness, Readiness, Token
+from service.web.schemas.system import Capabilities, Liveness, Readiness, Token
 
 TOKEN_S = 300.0
 _CANNOT_FAIL = ("unauthorized", "forbidden")

@@ -10,27 +10,29 @@ from service.geometry import quat_from_rotation
 from service.results import HINTS, IterationRecord, PoseEstimate, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, PriorRegion
 from service.web.schemas.geodesy import geographic
-from service.web.schemas.responses import (
+from service.web.schemas.job_results import (
     Alternative,
-    Axes,
-    CameraOut,
     CandidatesOut,
     Considered,
+    MatchesOut,
+    Record,
+    Result,
+    SceneRef,
+    Timing,
+)
+from service.web.schemas.poses import (
+    Axes,
+    CameraOut,
     Covariance,
     GeoPose,
     GeoPosition,
     GeoQuaternion,
     IntrinsicsOut,
     LensOut,
-    MatchesOut,
     Matrix,
     NamedCameraOut,
     PoseOut,
-    Record,
     RegionOut,
-    Result,
-    SceneRef,
-    Timing,
     Transform,
 )
 

@@ -10,8 +10,7 @@ from typing import Any
 from starlette.exceptions import HTTPException
 
 from service import errors as e
-from service.web.problems import MEDIA_TYPE, RETRY_AFTER_S, problem_of
-from service.web.schemas.responses import Problem
+from service.web.problems import MEDIA_TYPE, RETRY_AFTER_S, Problem, problem_of
 
 _JOB, _SCENE = "/jobs/3f9c2a7be1d04c58", "/scenes/studio"
 _AGAIN = "Try again later."

@@ -16,7 +16,8 @@ from service.photos.intrinsics import ONE_FOCAL
 from service.results import Status
 from service.types import Pose
 from service.web.schemas.conversion import pose_out
-from service.web.schemas.responses import FrameOut, IntrinsicsOut, PoseOut, Result
+from service.web.schemas.job_results import FrameOut, Result
+from service.web.schemas.poses import IntrinsicsOut, PoseOut
 
 ExportFormat = Literal["colmap", "nerfstudio", "tum", "geopose"]
 EXPORT_TYPES: dict[ExportFormat, str] = {

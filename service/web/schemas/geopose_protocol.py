@@ -20,7 +20,9 @@ from service.errors import InvalidIntrinsics, InvalidRequest, NoGeoAnchor
 from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
 from service.scene_manager.manager import Entry
 from service.types import GeoAnchor
-from service.web.schemas.responses import GeoPose, Model, Result
+from service.web.api_model import Model
+from service.web.schemas.job_results import Result
+from service.web.schemas.poses import GeoPose
 
 _EARTH_M = 6_371_000.0
 

@@ -8,7 +8,7 @@ from annotated_types import Len
 from pydantic import Field
 
 from service.photos.video import MAX_EVERY
-from service.web.schemas.responses import Model
+from service.web.api_model import Model
 
 Matrix4 = Annotated[list[Annotated[list[float], Len(4, 4)]], Len(4, 4)]
 Matrix6 = Annotated[list[Annotated[list[float], Len(6, 6)]], Len(6, 6)]

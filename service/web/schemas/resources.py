@@ -20,25 +20,14 @@ from service.render import RASTERIZERS
 from service.results import Status
 from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.manager import Entry
-from service.web.problems import problem_of
+from service.web.problems import Problem, problem_of
 from service.web.schemas.conversion import named_camera_out, pose_out, region_out
+from service.web.schemas.job_results import Result
+from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
 from service.web.schemas.parsing import options_adapter, pose_from, prior_from
 from service.web.schemas.requests import LocalizeFields
-from service.web.schemas.responses import (
-    Capabilities,
-    Capability,
-    EstimatorCapability,
-    JobLinks,
-    JobOut,
-    JobSummary,
-    PhotoOut,
-    Problem,
-    Result,
-    SceneLinks,
-    SceneOut,
-    SceneSummary,
-    Trace,
-)
+from service.web.schemas.scenes import SceneLinks, SceneOut, SceneSummary
+from service.web.schemas.system import Capabilities, Capability, EstimatorCapability
 from service.web.settings import Settings
 
 _PACKAGES = (

@@ -1,0 +1,67 @@
+"""The OpenAPI description of the app, as /openapi.json and openapi.yaml have it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic.json_schema import models_json_schema
+
+from service.web.problems import Problem
+from service.web.schemas.error_examples import example_components
+from service.web.schemas.job_results import Record
+from service.web.schemas.openapi_links import add_links
+from service.web.schemas.requests import LocalizeIn
+
+_KEYS = "An API key, or a token from `/tokens`; a service without keys needs none."
+_SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
+_DESCRIPTION = """
+Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
+camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
+are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
+Every error is a problem document (RFC 9457) with a stable `code`; each operation lists those it may give, each with
+an example. An address that isn't here is answered with `not_found`, another method with `method_not_allowed`.
+A job that ended without a result has a problem document as its `error`.
+"""
+
+
+def description(app: FastAPI) -> dict[str, Any]:
+    """Return the API's description; with the models that no route names by itself."""
+    if not app.openapi_schema:
+        schema = get_openapi(
+            title=app.title,
+            version=app.version,
+            summary=_SUMMARY,
+            description=_DESCRIPTION,
+            routes=app.routes,
+        )
+        _, extra = models_json_schema(
+            [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
+            ref_template="#/components/schemas/{model}",
+        )
+        models = schema.setdefault("components", {}).setdefault("schemas", {})
+        models |= {name: model for name, model in extra["$defs"].items() if name not in models}
+        schema["components"]["examples"] = example_components()
+        schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
+        schema["security"] = [{"key": []}, {}]
+        _drop_default_validation(schema)
+        add_links(schema)
+        app.openapi_schema = schema
+    return app.openapi_schema
+
+
+def _drop_default_validation(schema: dict[str, Any]) -> None:
+    """Take out what FastAPI says of its own validation: ours answers with a problem document of 400."""
+    for operations in schema["paths"].values():
+        for operation in operations.values():
+            if "application/json" in operation["responses"].get("422", {}).get("content", {}):
+                del operation["responses"]["422"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schema["components"]["schemas"].pop(name, None)
+
+
+def description_as_yaml(app: FastAPI) -> str:
+    """Return the description as YAML, the text of openapi.yaml."""
+    return yaml.safe_dump(description(app), sort_keys=False, width=100, allow_unicode=True)
