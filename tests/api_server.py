@@ -108,8 +108,9 @@ def until(condition, seconds: float = 20) -> None:
 def fake_estimators() -> Iterator[ModuleType]:
     """The estimators of tests/fake_estimators, registered as any: by lying in the package's folder."""
     with pytest.MonkeyPatch.context() as patch:
-        paths = [*service.estimators.__path__, str(ROOT / "tests" / "fake_estimators")]
-        patch.setattr(service.estimators, "__path__", paths)
+        folder, paths = str(ROOT / "tests" / "fake_estimators"), list(service.estimators.__path__)
+        if folder not in paths:  # fixtures of two modules may hold it at once
+            patch.setattr(service.estimators, "__path__", [*paths, folder])
         yield importlib.import_module("service.estimators.stepping")
 
 
