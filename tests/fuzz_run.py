@@ -240,13 +240,13 @@ class HeicChild:
 
     def _serve(self, asked: BinaryIO, tell: BinaryIO) -> NoReturn:
         from service.photos import heic_child
-        from service.photos.images import MAX_PIXELS
+        from service.photos.images import DEFAULTS
 
         for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
         while head := asked.read(4):
             signal.alarm(_HANG_S)
-            answer = b"".join(heic_child.decoded(asked.read(*struct.unpack("<I", head)), MAX_PIXELS))
+            answer = b"".join(heic_child.decoded(asked.read(*struct.unpack("<I", head)), DEFAULTS.max_pixels))
             tell.write(struct.pack("<I", len(answer)) + answer)
             tell.flush()
         os._exit(0)
@@ -275,7 +275,7 @@ def photo_target(kind: str) -> Target:
         assert max(width, height) <= 1300
 
     words = ("Exif\\x00\\x00", "MM\\x00*", "II*\\x00", "IHDR", "IDAT", "eXIf", "iCCP", "acTL", "tRNS", "PLTE")
-    # A WebP of `MAX_PIXELS_WHOLE` takes 433 MB.
+    # A WebP of `max_pixels_webp` takes 433 MB.
     return Target(run, photos(kind), 32_768, 500 * MB, words)
 
 

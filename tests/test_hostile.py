@@ -9,6 +9,7 @@ import socket
 import sys
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,6 @@ def test_a_heic_that_crashes_its_decoder_is_a_broken_photo():
 
 
 def test_a_heic_with_too_many_pixels_is_not_decoded(monkeypatch):
-    monkeypatch.setattr(images, "MAX_PIXELS", 100)
     monkeypatch.setattr(images, "_DECODERS", tuple((*d[:2], 100, d[3]) for d in images._DECODERS))
     with pytest.raises(InvalidImage, match="megapixels"):
         read_query((ROOT / "tests" / "data" / "rotated.heic").read_bytes())
@@ -86,7 +86,7 @@ def test_a_photo_is_the_same_in_bands(mode, monkeypatch):
     file = io.BytesIO()
     image.save(file, "jpeg" if mode == "CMYK" else "png", **({"transparency": 3} if mode == "P" else {}))
     whole = read_query(file.getvalue(), background_rgb=(0.2, 0.4, 0.6))
-    monkeypatch.setattr(images, "_BAND_PX", 7 * 50)
+    monkeypatch.setattr(images, "DEFAULTS", replace(images.DEFAULTS, band_pixels=7 * 50))
     banded = read_query(file.getvalue(), background_rgb=(0.2, 0.4, 0.6))
     assert np.array_equal(banded.rgb, whole.rgb)
     assert banded.warnings == whole.warnings

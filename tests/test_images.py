@@ -169,7 +169,7 @@ class TestGeometry:
         photo = Image.fromarray(spots(camera, RAYS, pinhole, size))
         options = {"quality": 95} if kind == "JPEG" else {"compress_level": 1}
         query = read_query(encoded(photo, kind, **options), intrinsics=camera, long_side=SMALL)
-        assert min(SMALL, width) <= max(query.rgb.shape) <= min(images.NEARLY * SMALL, width)
+        assert min(SMALL, width) <= max(query.rgb.shape) <= min(images.DEFAULTS.oversize * SMALL, width)
         for ray, expected in zip(RAYS, pinhole(RAYS, query.intrinsics), strict=True):
             found = centroid(query.rgb, expected, int(0.04 * query.rgb.shape[1]))
             # Seen: 0.027; 0.46 if the reduced width were taken for the exact half of an odd one.
@@ -431,5 +431,5 @@ def test_broken_exif_is_no_error():
 
 
 def test_limits_are_what_the_messages_say():
-    assert images.MAX_PIXELS >= 9248 * 6936
-    assert images.MAX_PIXELS < 100e6
+    assert images.DEFAULTS.max_pixels >= 9248 * 6936
+    assert images.DEFAULTS.max_pixels < 100e6

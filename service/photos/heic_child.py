@@ -1,4 +1,4 @@
-"""Decodes one HEIC photo in a process of its own: its decoders are known to crash on hostile files.
+"""Decode one HEIC photo in a process of its own: its decoders are known to crash on hostile files.
 
     python -I heic_child.py MAX_PIXELS < photo.heic
 
@@ -17,12 +17,12 @@ from io import BytesIO
 from pi_heif import HeifImageFile
 
 _MEMORY_BYTES = 2 << 30
-"""64 megapixels take 1 GB: as they are stored, as RGB, and on their way out."""
+"""64 megapixels take 1 GB: as stored, as RGB, and as output."""
 _CPU_S = 20
 
 
 def main() -> None:
-    """Decode what stdin has."""
+    """Decode the file on stdin, within limits of memory and time that a hostile file can't lift."""
     for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CPU, _CPU_S), (resource.RLIMIT_CORE, 0)):
         resource.setrlimit(limit, (value, value))
     for part in decoded(sys.stdin.buffer.read(), int(sys.argv[1])):
@@ -30,9 +30,10 @@ def main() -> None:
 
 
 def decoded(data: bytes, max_pixels: int) -> list[bytes]:
-    """Return the line, and the pixels as far as they are wanted."""
+    """Return the line of JSON, and the pixels unless there are more than `max_pixels`."""
     try:
         photo = HeifImageFile(BytesIO(data))
+        # The header alone has the size: a bomb is refused before it takes memory.
         fits = photo.width * photo.height <= max_pixels
         if fits:
             photo.load()

@@ -1,7 +1,7 @@
-"""Bytes of a photo -> `Query`: upright, undistorted, uint8, no larger than needed, with a pinhole camera.
+"""Decode the bytes of a photo to a `Query`: upright, undistorted, uint8, no larger than needed, with a pinhole camera.
 
 JPEG, PNG, WebP and HEIC. The size is checked in the header before anything is decoded. Colour profiles are
-not applied: a phone's Display P3 comes out slightly paler, which gain and bias of the alignment absorb.
+not applied: a phone's Display P3 comes out slightly paler, which gain and bias of the photometric refinement absorb.
 
 Focal lengths without calibration: EXIF's 35 mm equivalent f is taken as fx = f / 36 mm x long side. Makers
 who define it by the diagonal (43.27 mm) instead mean 4 % more on a 4:3 sensor and the same on a 3:2 one.
@@ -35,36 +35,48 @@ from service.errors import InvalidImage
 from service.photos.intrinsics import require_size, undistorted
 from service.types import Intrinsics, Pose, Query
 
-MAX_PIXELS = 64 * 1024 * 1024
-"""A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
-MAX_PIXELS_WHOLE = 25 * 1024 * 1024
-"""Of WebP: it can't be decoded at a reduced size, and 64 megapixels, which 120 kB may hold, would take 1.9 GB."""
-MAX_SCANS = 24
-"""Of a progressive JPEG. Each is a walk over all pixels, for which an attacker needs 100 bytes; encoders make 10."""
-LONG_SIDE, NEARLY = 1000, 1.3
-"""Of `Query.rgb`, and how much more it may have where resampling would cost more time than it saves. Features are
-looked for at 800 pixels at most; a JPEG of 12 megapixels is decoded at a quarter of its size."""
-OPAQUE = 128
-"""Of 255: what is more transparent is unknown."""
-MIN_SIDE = 32
-"""Of `Query.rgb`; the features need more anyway."""
-GUESSED_FOCAL = 0.78
-"""In long sides; see the module's docstring."""
 
-# The classes are called directly: Image.open would try every format that Pillow knows, and warn before we
-# check.
+@dataclass(frozen=True, slots=True)
+class PhotoConfig:
+    """Limits against hostile files, and the size and focal length that a photo is given."""
+
+    max_pixels: int = 64 * 1024 * 1024
+    """A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
+    max_pixels_webp: int = 25 * 1024 * 1024
+    """WebP can't be decoded at a reduced size, and 64 megapixels, which 120 kB may hold, would take 1.9 GB."""
+    max_scans: int = 24
+    """Of a progressive JPEG. Each is a pass over all pixels and takes 100 bytes of a hostile file; encoders make 10."""
+    max_heic_s: float = 30.0
+    """Wall time of the HEIC decoder; 64 megapixels take two seconds."""
+    band_pixels: int = 1 << 21
+    """Converted to RGB at once: the whole photo is in memory once as it was decoded, and once as RGB."""
+    long_side_px: int = 1000
+    """Of `Query.rgb`. Features are extracted at 800 pixels at most; a JPEG of 12 megapixels is decoded at a quarter
+    of its size."""
+    oversize: float = 1.3
+    """Ratio of long sides up to which a decoded photo is kept as it is: resampling would cost more than it saves."""
+    min_side_px: int = 32
+    """Of `Query.rgb`; the features need more anyway."""
+    opaque: int = 128
+    """Alpha, of 255, from which on a pixel is valid."""
+    default_focal: float = 0.78
+    """In long sides; see the module's docstring."""
+
+
+DEFAULTS = PhotoConfig()
+
+# The classes are called directly: Image.open would try every format that Pillow knows, and warn before the size
+# is checked.
 _DECODERS = (
-    ("JPEG", JpegImageFile, MAX_PIXELS, lambda d: d.startswith(b"\xff\xd8\xff")),
-    ("PNG", PngImageFile, MAX_PIXELS, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
-    ("WebP", WebPImageFile, MAX_PIXELS_WHOLE, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
-    ("HEIC", None, MAX_PIXELS, lambda d: d[4:8] == b"ftyp"),
+    ("JPEG", JpegImageFile, DEFAULTS.max_pixels, lambda d: d.startswith(b"\xff\xd8\xff")),
+    ("PNG", PngImageFile, DEFAULTS.max_pixels, lambda d: d.startswith(b"\x89PNG\r\n\x1a\n")),
+    ("WebP", WebPImageFile, DEFAULTS.max_pixels_webp, lambda d: d[:4] == b"RIFF" and d[8:12] == b"WEBP"),
+    ("HEIC", None, DEFAULTS.max_pixels, lambda d: d[4:8] == b"ftyp"),
 )
-_HEIC_S = 30
-"""Wall time; 64 megapixels take two seconds."""
+"""Name, Pillow's decoder (none: a process of its own), the most pixels, and whether a file begins like one."""
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-"""Not a stuffed byte, nor a restart within a scan."""
-_BAND_PX = 1 << 21
-"""Converted at once: the whole photo is in memory once as it was decoded, and once as RGB."""
+"""Excludes a stuffed byte, and a restart within a scan."""
+_JPEG_SCAN, _JPEG_END = 0xDA, 0xD9
 _ORIENTATIONS = {
     1: (False, False, False),
     2: (False, True, False),
@@ -85,13 +97,14 @@ def read_query(
     intrinsics: Intrinsics | None = None,
     prior: Pose | None = None,
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    long_side: int = LONG_SIDE,
+    long_side: int = DEFAULTS.long_side_px,
 ) -> Query:
     """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
 
-    `intrinsics` refer to the upright photo in its full size. Transparent parts are unknown: nothing is expected
-    there. They are filled with `background_rgb` (0..1): pass the scene's, then a cut-out object has the edges that
-    it has in a render. `long_side` is about the most that the query's picture has.
+    `intrinsics` refer to the upright photo in its full size; without them the focal length is EXIF's or a default.
+    Transparent parts are invalid in the query's mask and filled with `background_rgb` (0..1): with the scene's, a
+    cut-out object has the same edges as in a render. `long_side` is the target in pixels, exceeded by
+    `PhotoConfig.oversize` at most.
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
@@ -104,12 +117,12 @@ def query_of(
     *,
     intrinsics: Intrinsics | None = None,
     prior: Pose | None = None,
-    long_side: int = LONG_SIDE,
+    long_side: int = DEFAULTS.long_side_px,
 ) -> Query:
     """Return the query of an upright photo that is decoded already. Raises InvalidImage, InvalidIntrinsics."""
     height, width = rgb.shape[:2]
     target = _target((width, height), long_side)
-    if max(width, height) <= NEARLY * max(target):
+    if max(width, height) <= DEFAULTS.oversize * max(target):
         target = width, height
     else:
         rgb = np.asarray(cv2.resize(rgb, target, interpolation=cv2.INTER_AREA))
@@ -118,7 +131,7 @@ def query_of(
 
 
 def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | None, prior: Pose | None) -> Query:
-    """Find out about the camera, and take its distortion out."""
+    """Choose the intrinsics (given, EXIF, default), scale them to the decoded image, and undistort it."""
     warnings = list(decoded.warnings)
     if intrinsics is not None:
         require_size(intrinsics, decoded.width, decoded.height)
@@ -131,15 +144,18 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
                 "(35 mm equivalent). Send intrinsics for an exact pose."
             )
         long_side = max(decoded.width, decoded.height)
-        focal = focal_mm / 36.0 * long_side if focal_mm else GUESSED_FOCAL * long_side
+        focal = focal_mm / 36.0 * long_side if focal_mm else DEFAULTS.default_focal * long_side
         size = decoded.width, decoded.height
         intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
     camera = decoded.camera(intrinsics)
-    rgb, pinhole, seen = undistorted(decoded.rgb, camera)
-    known = decoded.known
-    if seen is not None and not seen.all():
-        known = seen if known is None else seen & (undistorted(known.astype(np.uint8), camera)[0] > 0)
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), known)
+    rgb, pinhole, inside = undistorted(decoded.rgb, camera)
+    valid_mask = decoded.valid_mask
+    # Where nothing was cut off, there is no mask: code without one is faster.
+    if inside is not None and not inside.all():
+        if valid_mask is not None:
+            inside = inside & (undistorted(valid_mask.astype(np.uint8), camera)[0] > 0)
+        valid_mask = inside
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask)
 
 
 def encode_image(
@@ -148,11 +164,11 @@ def encode_image(
     *,
     quality: int = 90,
 ) -> bytes:
-    """Return an image (uint8, or float32 in 0..1) as a file; `quality` is JPEG's, 1 to 100; a PNG may be RGBA."""
+    """Encode an image (uint8, or float32 in 0..1, clipped) as a file; `quality` is JPEG's, 1..100; PNG may be RGBA."""
     if rgb.dtype != np.uint8:
         rgb = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpg" else []
-    order = [2, 1, 0, *range(3, rgb.shape[2])]
+    order = [2, 1, 0, *range(3, rgb.shape[2])]  # OpenCV writes BGR
     encoded, data = cv2.imencode(f".{kind}", np.ascontiguousarray(rgb[:, :, order]), options)
     if not encoded:
         raise ValueError(f"an image of shape {rgb.shape} can't be {kind}")
@@ -167,7 +183,7 @@ def with_palette(png: bytes) -> bytes:
 
 
 def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float32[np.ndarray, "height width 3"]:
-    """Resample: area averages where it shrinks, so nothing aliases; else bilinear."""
+    """Resample an image: area averages where it shrinks, which prevents aliasing, else bilinear."""
     shrinks = width * height < rgb.shape[0] * rgb.shape[1]
     mode = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=mode), np.float32)
@@ -184,14 +200,15 @@ def photo_size(data: bytes) -> tuple[int, int]:
 class _Decoded:
     rgb: UInt8[np.ndarray, "h w 3"]
     """Upright, reduced."""
-    known: Bool[np.ndarray, "h w"] | None
+    valid_mask: Bool[np.ndarray, "h w"] | None
+    """False where the photo is transparent; None: nowhere."""
     width: int
     """Of the upright photo in its full size."""
     height: int
     scale: tuple[float, float]
     """Pixels of `rgb` per pixel of the photo."""
     offset: tuple[float, float]
-    """Where the photo's corner lies in `rgb`: not exactly 0 after JPEG's own reduction and a mirroring."""
+    """Pixels of `rgb` at which the photo's corner lies: not exactly 0 after JPEG's reduction and a mirroring."""
     warnings: tuple[str, ...]
 
     def camera(self, photo: Intrinsics) -> Intrinsics:
@@ -212,10 +229,11 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
     """Read the header and check the size. Raises InvalidImage."""
     if not data:
         raise InvalidImage("the photo is empty (0 bytes).", where="photo")
-    fitting = [(name, decoder, limit) for name, decoder, limit, fits in _DECODERS if fits(data)]
-    if not fitting:
+    # By its first bytes: what a client says of a file's type or name need not be true.
+    matching = [(name, decoder, limit) for name, decoder, limit, begins_like in _DECODERS if begins_like(data)]
+    if not matching:
         raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
-    name, decoder, limit = fitting[0]
+    name, decoder, limit = matching[0]
     try:
         photo = _heic(data, 0 if header_only else limit) if decoder is None else decoder(BytesIO(data))
     except Image.DecompressionBombError as error:
@@ -229,55 +247,60 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
             where="photo",
             hint="Send it smaller: more than about 2 megapixels don't help.",
         )
-    if isinstance(photo, JpegImageFile) and (scans := _scans(data)) > MAX_SCANS:
-        raise InvalidImage(f"a JPEG of {scans} scans; the limit is {MAX_SCANS}.", where="photo", hint="Save it again.")
+    if isinstance(photo, JpegImageFile) and (scans := _count_scans(data)) > DEFAULTS.max_scans:
+        raise InvalidImage(
+            f"a JPEG of {scans} scans; the limit is {DEFAULTS.max_scans}.", where="photo", hint="Save it again."
+        )
     return name, photo
 
 
 def _heic(data: bytes, max_pixels: int) -> Image.Image:
-    """Decode in another process, which may crash; larger ones not. Raises ValueError."""
+    """Decode in another process, which may crash; of a larger photo only the header. Raises ValueError."""
+    # -I and an almost empty environment: the process finds its libraries, and nothing of ours.
     command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(max_pixels)]
     kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    limit_s = DEFAULTS.max_heic_s
     try:
-        told = subprocess.run(command, input=data, capture_output=True, timeout=_HEIC_S, check=True, env=kept).stdout
+        output = subprocess.run(command, input=data, capture_output=True, timeout=limit_s, check=True, env=kept).stdout
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         raise ValueError(f"its decoder crashed or took too long ({type(error).__name__})") from error
-    line, _, pixels = told.partition(b"\n")
+    line, _, pixels = output.partition(b"\n")
     head = json.loads(line)
     if "error" in head:
         raise ValueError(head["error"])
     size = head["width"], head["height"]
-    photo = Image.frombuffer(head["mode"], size, pixels) if pixels else _Large(*size)
+    photo = Image.frombuffer(head["mode"], size, pixels) if pixels else _HeaderOnly(*size)
     photo.info["exif"] = base64.b64decode(head["exif"])
     return photo
 
 
-class _Large(Image.Image):
-    """A photo that wasn't decoded: its size, and what EXIF says."""
+class _HeaderOnly(Image.Image):
+    """A photo that wasn't decoded: its size and EXIF."""
 
     def __init__(self, width: int, height: int) -> None:
         super().__init__()
         self._size = width, height
 
 
-def _scans(data: bytes) -> int:
-    """Count a JPEG's scans, up to its end: phones put videos behind it."""
-    at, scans = 2, 0
+def _count_scans(data: bytes) -> int:
+    """Count a JPEG's scans, up to its end: phones append videos."""
+    at, scans = 2, 0  # behind the start-of-image marker
     while found := _JPEG_MARKER.search(data, at):
         kind, at = found[0][-1], found.end()
-        if kind == 0xD9:
+        if kind == _JPEG_END:
             break
-        scans += kind == 0xDA
+        scans += kind == _JPEG_SCAN
         at += int.from_bytes(data[at : at + 2])  # the segment's length
     return scans
 
 
 def _target(size: tuple[int, int], long_side: int) -> tuple[int, int]:
     """Return the size to reduce a photo to. Raises InvalidImage if it is too small."""
-    if min(size) * min(1.0, LONG_SIDE / max(size)) < MIN_SIDE - 0.5:
+    # Half a pixel of tolerance: a side that rounds to the minimum is enough.
+    if min(size) * min(1.0, DEFAULTS.long_side_px / max(size)) < DEFAULTS.min_side_px - 0.5:
         raise InvalidImage(
             f"{size[0]} x {size[1]} is too small or too narrow to localize: the short side must have "
-            f"{MIN_SIDE} pixels when the long one has at most {LONG_SIDE}.",
+            f"{DEFAULTS.min_side_px} pixels when the long one has at most {DEFAULTS.long_side_px}.",
             where="photo",
         )
     factor = min(1.0, long_side / max(size))
@@ -285,6 +308,7 @@ def _target(size: tuple[int, int], long_side: int) -> tuple[int, int]:
 
 
 def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float], long_side: int) -> _Decoded:
+    """Decode, reduce and turn upright, keeping track of where rays go. Raises InvalidImage."""
     raw_size = photo.size
     target = _target(raw_size, long_side)
     step = (1.0, 1.0)
@@ -301,24 +325,26 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
             where="photo",
             hint="Upload the file again.",
         ) from None
+    # JPEG's reduction rounds up to whole pixels: the decoded image may cover a fraction of a pixel more than the photo.
     covered = (pixels.shape[1] * step[0], pixels.shape[0] * step[1])
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
     layers = [pixels] if alpha is None else [pixels, alpha]
-    if max(pixels.shape[:2]) <= NEARLY * max(target):
+    if max(pixels.shape[:2]) <= DEFAULTS.oversize * max(target):
         target = pixels.shape[1], pixels.shape[0]
     else:
         layers = [cv2.resize(layer, target, interpolation=cv2.INTER_AREA) for layer in layers]
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
+    # What is covered beyond the photo lies right and below; a mirroring brings it to the left and above.
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
     transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
     if transpose:
         layers = [layer.swapaxes(0, 1) for layer in layers]
         scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
-    turned = [np.ascontiguousarray(layer[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]) for layer in layers]
+    upright = [np.ascontiguousarray(layer[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]) for layer in layers]
     return _Decoded(
-        turned[0],
-        turned[1] >= OPAQUE if len(turned) > 1 else None,
+        upright[0],
+        upright[1] >= DEFAULTS.opaque if len(upright) > 1 else None,
         *raw_size,
         scale=(scale[0], scale[1]),
         offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
@@ -331,7 +357,7 @@ def _rgb(
 ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, list[str]]:
     """Return colours, opacity unless all is opaque, and warnings."""
     rgb, alpha = np.empty((photo.height, photo.width, 3), np.uint8), None
-    rows = max(1, _BAND_PX // photo.width)
+    rows = max(1, DEFAULTS.band_pixels // photo.width)
     for top in range(0, photo.height, rows):
         band = photo.crop((0, top, photo.width, min(top + rows, photo.height)))
         rgb[top : top + rows], band_alpha = _band_rgb(band, background_rgb)
@@ -357,13 +383,13 @@ def _band_rgb(
 
 
 def _orientation(photo: Image.Image) -> int:
-    """Return 1 to 8; 1, upright, for what is missing or unreadable. A HEIC's decoder turns it, and says 1."""
+    """Return EXIF's orientation, 1..8; 1 (upright) where it is missing or broken, and of HEIC, decoded upright."""
     value = _exif(photo).get(ExifTags.Base.Orientation, 1)
     return value if value in _ORIENTATIONS else 1
 
 
 def _focal_35mm(photo: Image.Image) -> float | None:
-    """Return EXIF's focal length in mm on 35 mm film, if it is there and possible."""
+    """Return EXIF's 35 mm equivalent focal length in mm; None if it is missing or impossible."""
     value = _exif(photo).get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
     try:
         focal = float(value) if value is not None else 0.0
@@ -374,7 +400,7 @@ def _focal_35mm(photo: Image.Image) -> float | None:
 
 def _exif(photo: Image.Image) -> Image.Exif:
     """Return the photo's EXIF; an empty one if it has none or a broken one."""
-    if "exif" not in photo.info:  # asking a PNG would decode it
+    if "exif" not in photo.info:  # `getexif` of a PNG would decode it
         return Image.Exif()
     try:
         exif = photo.getexif()

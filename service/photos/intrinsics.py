@@ -1,4 +1,4 @@
-"""A photo's intrinsics: parsed, checked against the photo, and its distortion taken out."""
+"""A photo's intrinsics: parse them, check them against the photo, and undistort the photo to a pinhole."""
 
 from __future__ import annotations
 
@@ -86,28 +86,29 @@ def require_size(given: Intrinsics, width: int, height: int) -> None:
 def undistorted(
     image: UInt8[np.ndarray, "h w *channels"], intrinsics: Intrinsics
 ) -> tuple[UInt8[np.ndarray, "h w *channels"], Intrinsics, Bool[np.ndarray, "h w"] | None]:
-    """Return the image as a pinhole of the same focal length and size sees it, black where it sees more.
+    """Resample a distorted image to that of a pinhole with the same focal length, principal point and size.
 
-    The last value says where it does not; None if nothing had to be done.
+    Returns the image (bicubic, black outside the photo), the pinhole's intrinsics, and the mask of pixels inside the
+    photo; None if the camera has no distortion.
     """
     pinhole = replace(intrinsics, model="PINHOLE", distortion=())
     if "FISHEYE" not in intrinsics.model and not any(intrinsics.distortion):
         return image, pinhole, None
-    x, y, seen = _undistortion(intrinsics)
+    x, y, inside = _undistortion(intrinsics)
     straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
-    straight[~seen] = 0
-    return straight, pinhole, seen
+    straight[~inside] = 0  # bicubic interpolation bleeds across the border
+    return straight, pinhole, inside
 
 
 @lru_cache(maxsize=4)
 def _undistortion(
     intrinsics: Intrinsics,
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Return where each pixel of the pinhole lies in the photo, and whether it does; made once for a camera."""
+    """Return the photo's pixel (x, y) for each pixel of the pinhole, and whether it has one. Cached: cameras repeat."""
     pinhole, fisheye = replace(intrinsics, model="PINHOLE", distortion=()), "FISHEYE" in intrinsics.model
     coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
     coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
-    # cv2 counts pixels from the centre of the first one.
+    # OpenCV has the centre of the top-left pixel at (0, 0), this project at (0.5, 0.5).
     matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
     make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     size = (pinhole.width, pinhole.height)
@@ -117,20 +118,21 @@ def _undistortion(
 
 
 def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:
-    """Return the pixels beyond the radius at which the distortion's polynomial turns back.
+    """Return the mask of pixels beyond the radius at which the distortion's polynomial stops growing.
 
-    There it would show the inside of the image once more.
+    There it would show the inside of the image a second time.
     """
     x = (np.arange(pinhole.width) + 0.5 - pinhole.cx) / pinhole.fx
     y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
     radius = np.linspace(0.0, np.hypot(np.abs(x).max(), np.abs(y).max()), 1025)
+    # Sampled, not solved: a thousandth of the image's diagonal is exact enough for a mask.
     turns = np.flatnonzero(np.diff((_fisheye if fisheye else _radial)(radius, coefficients)) <= 0)
     reach = radius[turns[0]] if len(turns) else np.inf
     return x[None] ** 2 + y[:, None] ** 2 > reach**2
 
 
 def _radial(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
-    """The distorted radius, tangential terms apart."""
+    """Return the distorted radius of the rational model (COLMAP's FULL_OPENCV) without its tangential terms."""
     r2 = r * r
     return r * (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
 

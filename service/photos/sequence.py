@@ -1,4 +1,4 @@
-"""Several photos, or a video, in one job: how they are kept together and read one by one; `trajectory` answers."""
+"""Several photos of one camera, or a video, as the input of one job: packed into one byte string, read one by one."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from service.photos.video import frame_count, is_video, read_video
 from service.types import Intrinsics, Pose, PriorRegion, Query
 
 PHOTO_LONG_SIDE = 832
-"""Photos of a sequence needn't be decoded larger."""
+"""Pixels of the photos of a sequence: tracking works at 800 at most, and a JPEG comes at its own next step."""
 _ZIP = b"PK\x03\x04"
 
 
@@ -33,44 +33,45 @@ class SequencePhoto:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """How a sequence is to be read."""
+    """Which photos of a sequence are read, and what is known of their camera."""
 
     limit: int
     """More photos or frames are refused."""
     every: int = 1
     times_s: Sequence[float] | None = None
-    """Of all photos, those that are left out as well; None: they come once a second, a video's at its own pace."""
+    """Of all photos, also of those that `every` leaves out; None: one a second, and a video's own times."""
     intrinsics: Intrinsics | None = None
     prior: Pose | None = None
-    """Of the first; so is the region."""
+    """Of the first photo; so is the region."""
     region: PriorRegion | None = None
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def is_packed(data: bytes) -> bool:
-    """Return whether it is what `packed` makes, or another ZIP."""
+    """Whether the bytes are what `packed` makes, or another ZIP."""
     return data.startswith(_ZIP)
 
 
 def is_sequence(data: bytes) -> bool:
-    """Return whether it is what `packed` makes, or a video."""
+    """Whether the bytes are what `packed` makes, or a video."""
     return is_packed(data) or is_video(data)
 
 
 def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
-    """Return (name, photo) in one piece: the same for the same photos."""
+    """Return (name, photo) pairs as one ZIP, deterministic: the same photos give the same bytes."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for index, (name, data) in enumerate(files):
+            # ZipInfo without a date, and the number first: two photos may have one name.
             archive.writestr(zipfile.ZipInfo(f"{index}/{name}"), data)
     return file.getvalue()
 
 
 def check_sequence(data: bytes, reading: Reading) -> None:
-    """Refuse what the heads of the files show to be wrong. Raises InvalidImage, InvalidRequest."""
+    """Check count, times and sizes by the files' headers alone. Raises InvalidImage, InvalidRequest."""
     if is_video(data):
         if reading.times_s is not None:
-            raise InvalidRequest("a video tells its times itself.", where="times_s")
+            raise InvalidRequest("a video has its own times.", where="times_s")
         _check_count(-(-frame_count(data) // reading.every), reading)
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -86,7 +87,10 @@ def check_sequence(data: bytes, reading: Reading) -> None:
 
 
 def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, None, None]:
-    """Decode one photo after the other. Raises InvalidImage, InvalidIntrinsics."""
+    """Yield the photos, decoded one at a time. Raises InvalidImage, InvalidIntrinsics.
+
+    Count and size are checked again: a video's header need not be true, and its frames are counted as they come.
+    """
     given = {"intrinsics": reading.intrinsics, "long_side": PHOTO_LONG_SIDE}
     first: tuple[int, int] | None = None
     for count, (index, name, time_s, source) in enumerate(_sources(data, reading), 1):
@@ -136,7 +140,7 @@ def _check_size(size: tuple[int, int], first: tuple[int, int]) -> None:
 
 @contextmanager
 def _at_photo(index: int) -> Iterator[None]:
-    """Say which photo an error is about."""
+    """Name the photo in an InvalidImage that is raised inside."""
     try:
         yield
     except InvalidImage as error:

@@ -1,4 +1,4 @@
-"""Decodes one video in a process of its own: decoders of video are known to crash on hostile files.
+"""Decode one video in a process of its own: decoders of video are known to crash on hostile files.
 
     python -I video_child.py EVERY MAX_FRAME_PIXELS < video
 
@@ -25,27 +25,27 @@ _MEMORY_BYTES = 2 << 30
 
 
 class _Refused(Exception):
-    """What is wrong, and how to mend it."""
+    """Two arguments: what is wrong, and what to do about it."""
 
 
 def main() -> None:
-    """Decode what stdin has: a file that can be sought in."""
+    """Decode the file on stdin, which must be seekable, and write messages to stdout."""
     for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CORE, 0)):
         resource.setrlimit(limit, (value, value))
     out = sys.stdout.buffer
     try:
         for head, pixels in _decoded(sys.stdin.buffer, *map(int, sys.argv[1:])):
-            _tell(out, head, pixels)
-        _tell(out, {"end": True})
+            _write(out, head, pixels)
+        _write(out, {"end": True})
     except _Refused as error:
-        _tell(out, dict(zip(("error", "hint"), error.args, strict=True)))
+        _write(out, dict(zip(("error", "hint"), error.args, strict=True)))
 
 
-def _tell(out: BinaryIO, head: dict[str, Any], pixels: bytes = b"") -> None:
+def _write(out: BinaryIO, head: dict[str, Any], pixels: bytes = b"") -> None:
     line = json.dumps(head).encode()
     out.write(struct.pack(">II", len(line), len(pixels)) + line)
     out.write(pixels)
-    out.flush()
+    out.flush()  # the parent waits for each message, with a deadline
 
 
 def _decoded(source: BinaryIO, every: int, max_pixels: int) -> Iterator[tuple[dict[str, Any], bytes]]:
@@ -53,11 +53,11 @@ def _decoded(source: BinaryIO, every: int, max_pixels: int) -> Iterator[tuple[di
     count = video.get(cv2.CAP_PROP_FRAME_COUNT)
     yield {"frames": int(count) if 0 < count < 1e12 else 0}, b""
     shape, time_s, number = None, -1.0, 0
-    while every and video.grab():
+    while every and video.grab():  # skipped frames are decoded, but not converted
         if number % every == 0:
-            # Not all containers tell times: then frames follow one another evenly.
-            told = round(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, 6)  # a microsecond is less than it knows
-            time_s = told if math.isfinite(told) and told > time_s else time_s + every / _rate(video)
+            # Not all containers have time stamps: then frames follow one another evenly.
+            stamp_s = round(video.get(cv2.CAP_PROP_POS_MSEC) / 1000, 6)  # stamps are coarser than a microsecond
+            time_s = stamp_s if math.isfinite(stamp_s) and stamp_s > time_s else time_s + every / _rate(video)
             decoded, bgr = video.retrieve()
             if not decoded:
                 break
