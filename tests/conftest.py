@@ -3,7 +3,10 @@
 from collections.abc import Iterator
 
 import pytest
+import shape_checks
 from hypothesis import settings
+
+shape_checks.install(("service", "viewer"))
 
 # No deadline: the machine may be busy. The same examples every time: a failure must not depend on luck.
 settings.register_profile("steady", deadline=None, derandomize=True, database=None, max_examples=60)

@@ -1,0 +1,144 @@
+"""The array shapes and types of the annotations, checked while the tests run.
+
+`install` puts an import hook before the others. It wraps each function and each dataclass of the named packages whose
+annotations name a jaxtyping array: beartype compares arguments, result and fields with them, and a dimension's name
+stands for one size within a call. Compiled kernels stay as they are, and so do processes that the tests start.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import importlib.machinery
+import inspect
+import sys
+import typing
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from beartype.door import is_bearable
+from jaxtyping import AbstractArray, jaxtyped
+
+_COMPILERS = ("service.jit", "numba", "llvmlite")
+
+
+class ShapeError(TypeError):
+    """An array has not the shape or the type that an annotation gives it."""
+
+
+def install(packages: Sequence[str]) -> None:
+    """Check what is imported from now on out of these packages."""
+    assert not [m for m in sys.modules if m.split(".")[0] in packages], "too late: something is imported already"
+    sys.meta_path.insert(0, _Finder(packages))
+
+
+class _Finder:
+    def __init__(self, packages: Sequence[str]) -> None:
+        self._packages = packages
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
+        if name.split(".")[0] not in self._packages:
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is not None and isinstance(spec.loader, importlib.machinery.SourceFileLoader):
+            spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    def get_code(self, fullname: str) -> Any:
+        """Compile the source anew: __pycache__ has, and must keep, the code without checks."""
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+    def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> Any:
+        tree = ast.parse(data)
+        arrays, compilers = _imported(tree, ("jaxtyping",)), _imported(tree, _COMPILERS)
+        for node in ast.walk(tree) if arrays else ():
+            names = {n.id for d in getattr(node, "decorator_list", ()) for n in ast.walk(d) if isinstance(n, ast.Name)}
+            if isinstance(node, ast.FunctionDef) and not names & compilers and _mentions(node, arrays):
+                node.decorator_list.append(_decorator("checked_calls", node))
+            elif isinstance(node, ast.ClassDef) and "dataclass" in names and _mentions(node, arrays):
+                node.decorator_list.insert(0, _decorator("checked_fields", node))
+        return compile(ast.fix_missing_locations(tree), path, "exec", dont_inherit=True, optimize=_optimize)
+
+
+def _imported(tree: ast.Module, modules: Sequence[str]) -> set[str]:
+    """Return the names that come from these modules or from below them."""
+    return {
+        alias.asname or alias.name
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(tuple(modules))
+        for alias in node.names
+    }
+
+
+def _mentions(node: ast.FunctionDef | ast.ClassDef, names: set[str]) -> bool:
+    """Whether an annotation of the signature, or of the class's fields, has one of the names."""
+    if isinstance(node, ast.ClassDef):
+        annotations = [a.annotation for a in node.body if isinstance(a, ast.AnnAssign)]
+    else:
+        a = node.args
+        arguments = [*a.posonlyargs, *a.args, *a.kwonlyargs, a.vararg, a.kwarg]
+        annotations = [node.returns, *(argument.annotation for argument in arguments if argument)]
+    found = {n.id for hint in annotations if hint for n in ast.walk(hint) if isinstance(n, ast.Name)}
+    return bool(found & names)
+
+
+def _decorator(name: str, node: ast.AST) -> ast.expr:
+    call = ast.parse(f"__import__({__name__!r}).{name}", mode="eval").body
+    return typing.cast(ast.expr, ast.copy_location(call, node))
+
+
+def checked_calls(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function with its arguments and its result checked."""
+    names = list(inspect.signature(function).parameters)
+    hints: dict[str, Any] | None = None
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        nonlocal hints
+        if hints is None:  # not before: an annotation may name a class from further down
+            hints = _array_hints(function)
+        with jaxtyped("context"):
+            for name, value in (*zip(names, args, strict=False), *kwargs.items()):
+                if name in hints:
+                    _check(function, name, value, hints[name])
+            result = function(*args, **kwargs)
+            if "return" in hints:
+                _check(function, "return", result, hints["return"])
+        return result
+
+    return checked
+
+
+def checked_fields(cls: type) -> type:
+    """Return the dataclass with its fields checked once they are set."""
+    set_fields = cls.__init__
+    hints: dict[str, Any] | None = None
+
+    @functools.wraps(set_fields)
+    def checked(self: Any, *args: Any, **kwargs: Any) -> None:
+        nonlocal hints
+        set_fields(self, *args, **kwargs)
+        if hints is None:
+            hints = _array_hints(cls)
+        with jaxtyped("context"):
+            for name, hint in hints.items():
+                _check(cls, name, getattr(self, name), hint)
+
+    cls.__init__ = checked  # type: ignore[method-assign]
+    return cls
+
+
+def _array_hints(annotated: Any) -> dict[str, Any]:
+    return {name: hint for name, hint in typing.get_type_hints(annotated).items() if _has_array(hint)}
+
+
+def _has_array(hint: Any) -> bool:
+    return (isinstance(hint, type) and issubclass(hint, AbstractArray)) or any(map(_has_array, typing.get_args(hint)))
+
+
+def _check(owner: Any, name: str, value: Any, hint: Any) -> None:
+    if not is_bearable(value, hint):
+        shape = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
+        raise ShapeError(f"{owner.__module__}.{owner.__qualname__}: {name} is {shape}, not {hint}")
