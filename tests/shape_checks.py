@@ -29,10 +29,10 @@ class ShapeError(TypeError):
 def install(packages: Sequence[str]) -> None:
     """Check what is imported from now on out of these packages."""
     assert not [m for m in sys.modules if m.split(".")[0] in packages], "too late: something is imported already"
-    sys.meta_path.insert(0, _Finder(packages))
+    sys.meta_path.insert(0, Finder(packages))
 
 
-class _Finder:
+class Finder:
     def __init__(self, packages: Sequence[str]) -> None:
         self._packages = packages
 
@@ -139,6 +139,15 @@ def _has_array(hint: Any) -> bool:
 
 
 def _check(owner: Any, name: str, value: Any, hint: Any) -> None:
-    if not is_bearable(value, hint):
+    if not _fits(value, hint):
         shape = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
-        raise ShapeError(f"{owner.__module__}.{owner.__qualname__}: {name} is {shape}, not {hint}")
+        raise ShapeError(f"{owner.__module__}.{owner.__qualname__}: {name} is {shape}, and not {hint}")
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value has the type, and every item of a list or a tuple: beartype looks at a random one."""
+    origin, parts = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (list, tuple, Sequence) and isinstance(value, origin):
+        items = parts if origin is tuple and parts[-1] is not ... else parts[:1] * len(value)
+        return len(items) == len(value) and all(map(_fits, value, items))
+    return is_bearable(value, hint)

@@ -174,7 +174,7 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         (("render", "--scene", room, "--pose", pose, "--out", tmp_path / "a.png"), "not a rotation"),
         (("render", "--scene", room, "--pose", "{}", "--out", tmp_path / "a.gif"), ".png"),
         (("scenes", "list", tmp_path / "none"), "none"),
-        (("serve", tmp_path / "none"), "none"),
+        (("serve", tmp_path / "none", "--port", 0), "none"),
     ]
     for arguments, expected in bad:
         code, told, complaint = splatfix(*arguments)

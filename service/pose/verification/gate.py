@@ -46,7 +46,7 @@ class Scale:
     ratio: bool = False
     """Compare by ratios."""
 
-    def __call__(self, value: Float[np.ndarray, "*n"] | float) -> Float64[np.ndarray, "*n"]:
+    def __call__(self, value: Float[np.ndarray, "*n"] | float) -> Float64[np.ndarray, "*n"] | np.float64:
         ends = np.array([self.hopeless, self.certain])
         if self.ratio:
             value, ends = np.log(np.maximum(value, 1e-6)), np.log(ends)
