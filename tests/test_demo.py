@@ -1,7 +1,7 @@
-"""The demo scene with the shipped gate model: its 16 photos, and README's examples as they are written.
+"""The demo scene with the shipped gate model: its 16 photos, and the documents' examples as they are written.
 
-The lines of README that call curl or `splatfix localize` are run in a folder with the names that they use; those
-that would not end (`serve`), install or build are only checked, by test_docs.py. So are marked blocks.
+Lines that call curl or `splatfix localize` are run in a folder with the names that they use; those that would not end
+(`serve`), install or build are only checked, by test_docs.py. So are marked blocks.
 """
 
 from __future__ import annotations
@@ -33,9 +33,17 @@ from service.web.app import create_app
 
 STUDIO = ROOT / "scenes" / "studio"
 TRUTH = json.loads((STUDIO / "truth.json").read_text())
-PYTHON = [b for b in blocks() if b.language == "python" and b.document != "docs/clients.md" and not b.not_run]
-SHELL = [b for b in blocks() if (b.document, b.language, b.not_run) == ("README.md", "sh", "")]
-LINES = [line for b in SHELL for line in lines_of(b.text) if re.match(r"curl |\S*splatfix localize ", line)]
+ELSEWHERE = ("docs/clients.md", "docs/frames.md")  # test_clients.py and test_frames.py run these
+BLOCKS = [block for block in blocks() if block.document not in ELSEWHERE and not block.not_run]
+PYTHON = [block for block in BLOCKS if block.language == "python"]
+LOCALIZES = re.compile(r"curl .*/localize$|\S*splatfix localize .*path/to/scene_folder")
+LINES = [
+    pytest.param(line, id=f"{block}-{i}")
+    for block in BLOCKS
+    if block.language == "sh"
+    for i, line in enumerate(lines_of(block.text))
+    if LOCALIZES.match(line)
+]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +102,7 @@ def test_the_demo_photos_are_localized_and_none_falsely(studio, lens, bound):
     assert ratio < bound
 
 
-# ------------------------------------------------------------------ README's examples
+# ------------------------------------------------------------------ the documents' examples
 
 
 @pytest.fixture(scope="module")
@@ -131,13 +139,14 @@ def url(studio, cache) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_command_line_of_the_readme_works_as_written(line, folder, cache, request):
+def test_a_command_line_works_as_written(line, folder, cache, request):
     if line.startswith("curl "):
         line = line.replace("http://127.0.0.1:8000", request.getfixturevalue("url"))
     environment = os.environ | {
         "SPLATFIX_CACHE_DIR": str(cache),
         "NUMBA_CACHE_DIR": str(jit.numba.config.CACHE_DIR),  # type: ignore[attr-defined]
         "PYTHONPATH": str(ROOT),
+        "PATH": f"{folder / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}",
         "NO_PROXY": "*",
     }
     done = subprocess.run(["bash", "-c", line], cwd=folder, env=environment, capture_output=True, text=True, timeout=90)
@@ -155,5 +164,4 @@ def test_the_python_of_a_document_runs(document, folder, cache, monkeypatch):
     for block in PYTHON:
         if block.document == document:
             exec(compile(block.text, str(block), "exec"), namespace)
-    if document == "README.md":
-        assert namespace["estimate"].verdict.status == "localized"
+    assert namespace["estimate"].verdict.status == "localized"

@@ -1,8 +1,8 @@
 """What the documents point at is there, and their code is code that works.
 
-Python blocks and README's command lines are run by test_demo.py, those of docs/clients.md by test_clients.py. Of all
-others the syntax is checked here, and of command lines that the command, its options and the route exist. A block in
-another language needs the comment `<!-- not run: why -->` right before it.
+Python and command lines that localize are run by test_demo.py, docs/clients.md by test_clients.py, docs/frames.md by
+test_frames.py. Of every block the syntax is checked here, and of a command line that the command, its options and the
+route exist. A block in another language needs the comment `<!-- not run: why -->` right before it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import yaml
 from api_server import ROOT, operations
 from documents import Block, blocks, blocks_of, commands_of, lines_of
 
-import service.__main__
+from service.cli.app import app
 
 BLOCKS = blocks()
 TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
@@ -122,7 +122,7 @@ def check_line(line: str) -> None:
 
 def splatfix_command(words: list[str]) -> tuple[typer.core.TyperCommand | typer.core.TyperGroup, list[str]]:
     """Return the command that the words call, and its arguments."""
-    command = typer.main.get_command(service.__main__.app)
+    command = typer.main.get_command(app)
     while isinstance(command, typer.core.TyperGroup):
         assert words[0] in command.commands, f"splatfix {' '.join(words)}"
         command, words = command.commands[words[0]], words[1:]
