@@ -7,7 +7,7 @@ from service.errors import UnknownName
 from service.geometry import look_at, pose_distance, project, so3_exp, transformed
 from service.pose.absolute_pose import decoupled
 from service.pose.absolute_pose.decoupled import MatchedPoints, least_squares_solve
-from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.contribution_pruning import contributions, prune
 from service.pose.descent.decoupled_gradient import angle_loss, gradient_solve, length_loss
 from service.pose.descent.hypotheses import around, even_points
 from service.pose.descent.losses import LOSSES, loss_against
@@ -138,7 +138,7 @@ def test_pruning_keeps_what_is_seen() -> None:
     small = LENS.resized(128, 96)
     poses = around([TRUTH], FOCUS, 180, 0, 12, np.random.default_rng(0))
     found = contributions(scene, rasterizer, [Camera(small, pose) for pose in poses])
-    level = pruned(scene, found)
+    level = prune(scene, found)
     hidden = np.linalg.norm(level.means - CENTRE, axis=1) < 0.6
     assert hidden.mean() < 0.05
     assert level.count < 0.55 * scene.count

@@ -17,7 +17,7 @@ from service.geometry import moved, pose_distance
 from service.interfaces import Tools
 from service.localize import LoadedScene, Request, localize
 from service.multi_scene import localize_anywhere
-from service.pose.descent.gradient_descent import photometric
+from service.pose.descent.gradient_descent import loss_and_gradient
 from service.pose.descent.losses import LOSSES, loss_against
 from service.pose.features.rendered_views import to_uint8
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
@@ -370,7 +370,7 @@ def test_a_loss_rests_at_the_planted_truth(name: str, room: LoadedScene) -> None
     loss = loss_against(name, to_uint8(room.rasterizer.render([Camera(LENS, truth)])[0].rgb))
     beside = moved(truth, np.array([0, np.radians(1), 0, 0, 0, 0]))
     at_truth, at_degree = (
-        np.linalg.norm(photometric(room.rasterizer, LENS, pose, loss)[1]) for pose in (truth, beside)
+        np.linalg.norm(loss_and_gradient(room.rasterizer, LENS, pose, loss)[1]) for pose in (truth, beside)
     )
     assert at_degree > 0
     assert at_truth < (0.03 if name == "l1" else 3e-4) * at_degree

@@ -25,7 +25,7 @@ from service.estimators.inerf import required_prior
 from service.geometry import project, transformed
 from service.interfaces import Tools
 from service.pose.descent.adam import Adam
-from service.pose.descent.gradient_descent import Se3, photometric, require_within
+from service.pose.descent.gradient_descent import Se3, loss_and_gradient, require_within
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
@@ -36,11 +36,25 @@ from service.results import IterationRecord
 from service.types import Camera, Intrinsics, Pose, Query
 
 MATCHES_IMAGES = True
-"""It works with matchers that have no features of one image."""
-MATCH_SHARE = 0.8
-OFF_BELOW = 0.001
-MIN_MATCHES = 5
-DECAY, DECAY_STEPS = 0.6, 50
+"""The method also works with matchers that match images in pairs, without features of one image."""
+
+
+@dataclass(frozen=True, slots=True)
+class IcommaConfig:
+    """Constants of the published method's code."""
+
+    match_weight: float = 0.8
+    """Of L_match; the photometric loss has the rest."""
+    match_until: float = 0.001
+    """L_match below which matching is switched off for good."""
+    min_matches: int = 5
+    """With fewer the photometric loss is alone."""
+    decay: float = 0.6
+    """Factor of the rate in `decay_steps` steps, from when matching is off."""
+    decay_steps: int = 50
+
+
+ICOMMA = IcommaConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +77,12 @@ class Options:
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
-    """Find the scene's focus: it defines the units."""
+    """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
 
-def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    """Descend from the prior. Raises InvalidPrior without one."""
+def run(query: Query, tools: Tools, options: Options, config: IcommaConfig = ICOMMA) -> Iterator[IterationRecord]:
+    """Descend from the prior; the last record's pose is the answer. Raises InvalidPrior without a prior."""
     start = required_prior(query, "icomma")
     intrinsics = sized(query.intrinsics, options.long_side_px)
     images = QueryImages(query, tools.matcher)
@@ -81,15 +95,16 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
     for step in range(options.steps):
         pose, record = pose_of.pose(numbers), None
         if off_since is None and step % options.rematch_every == 0:
-            matches, record = _rematched(Camera(intrinsics, pose), images, tools)
-        value, by_twist = photometric(tools.rasterizer, intrinsics, pose, loss)
+            matches, record = _rematch(Camera(intrinsics, pose), images, tools, config.min_matches)
+        value, by_twist = loss_and_gradient(tools.rasterizer, intrinsics, pose, loss)
         if off_since is None and matches is not None:
-            apart, by_match = match_loss(matches, query.intrinsics, pose)
-            value = MATCH_SHARE * apart + (1 - MATCH_SHARE) * value
-            by_twist = MATCH_SHARE * by_match + (1 - MATCH_SHARE) * by_twist
-            off_since = step if apart < OFF_BELOW else None
+            distance, by_match = match_loss(matches, query.intrinsics, pose)
+            weight = config.match_weight
+            value = weight * distance + (1 - weight) * value
+            by_twist = weight * by_match + (1 - weight) * by_twist
+            off_since = step if distance < config.match_until else None
         if off_since is not None:
-            adam.rate = options.rate * DECAY ** ((step - off_since + 1) / DECAY_STEPS)
+            adam.rate = options.rate * config.decay ** ((step - off_since + 1) / config.decay_steps)
         numbers = numbers - adam.step(pose_of.gradient(numbers, by_twist))
         reached = pose_of.pose(numbers)
         record = (
@@ -98,28 +113,33 @@ def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecor
         yield record
 
 
-def _rematched(camera: Camera, images: QueryImages, tools: Tools) -> tuple[Correspondences | None, IterationRecord]:
-    """Match with a render; None where there is too little to go by."""
+def _rematch(
+    camera: Camera, images: QueryImages, tools: Tools, min_matches: int
+) -> tuple[Correspondences | None, IterationRecord]:
+    """Match the photo with a render; return the epipolar inliers, None where they are too few, and the record."""
     found, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
     kept = epipolar_inliers(found, images.query.intrinsics)
     record = match_record("match", camera.pose, found, kept, view.camera)
-    if int(kept.sum()) < MIN_MATCHES:
+    if int(kept.sum()) < min_matches:
         return None, record
     return Correspondences(found.photo_px[kept], found.view_px[kept], found.points_in_world[kept]), record
 
 
 def match_loss(matches: Correspondences, intrinsics: Intrinsics, pose: Pose) -> tuple[float, Float64[np.ndarray, "6"]]:
-    """Return L_match at a pose and its gradient by the right twist; points behind the camera have no part."""
+    """Return L_match at a pose and its gradient by the right twist (rad, scene units).
+
+    The mean is over the points ahead of the camera.
+    """
     points = transformed(pose.camera_from_world, matches.points_in_world)
     seen = points[:, 2] > 1e-6
     if not np.any(seen):
         return 0.0, np.zeros(6)
     points = points[seen]
     size = np.array([intrinsics.width, intrinsics.height])
-    apart = (project(points, intrinsics) - matches.photo_px[seen]) / size
+    offsets = (project(points, intrinsics) - matches.photo_px[seen]) / size
     x, y, z = points.T
-    by_point = 2 * apart / size / len(points) * np.stack([intrinsics.fx / z, intrinsics.fy / z], 1)
+    by_point = 2 * offsets / size / len(points) * np.stack([intrinsics.fx / z, intrinsics.fy / z], 1)
     by_xyz = np.stack([by_point[:, 0], by_point[:, 1], -(by_point[:, 0] * x + by_point[:, 1] * y) / z], 1)
     # The camera moves by exp(twist), its points by exp(-twist): dX = X x w - t.
     by_turn = np.cross(by_xyz, points).sum(0)
-    return float(np.sum(apart**2) / len(points)), np.concatenate([by_turn, -by_xyz.sum(0)])
+    return float(np.sum(offsets**2) / len(points)), np.concatenate([by_turn, -by_xyz.sum(0)])

@@ -20,7 +20,7 @@ from jaxtyping import Float32, UInt8
 from service.errors import InvalidPrior
 from service.interfaces import Tools
 from service.pose.descent.adam import Adam
-from service.pose.descent.gradient_descent import Se3, photometric, require_within
+from service.pose.descent.gradient_descent import Se3, loss_and_gradient, require_within
 from service.pose.descent.losses import Loss, interest_region, loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
@@ -28,7 +28,17 @@ from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Pose, Query
 
-DECAY, DECAY_STEPS = 0.8, 100
+
+@dataclass(frozen=True, slots=True)
+class InerfConfig:
+    """The rate's schedule, from the supplement."""
+
+    decay: float = 0.8
+    """Factor of the rate in `decay_steps` steps."""
+    decay_steps: int = 100
+
+
+INERF = InerfConfig()
 LIMITS = {"steps": (1, 100_000), "rays": (0, 10_000_000), "rate": (0, 10), "long_side_px": (32, 4096)}
 
 
@@ -52,31 +62,31 @@ class Options:
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
-    """Find the scene's focus: it defines the units."""
+    """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
 
-def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    """Descend from the prior. Raises InvalidPrior without one."""
+def run(query: Query, tools: Tools, options: Options, config: InerfConfig = INERF) -> Iterator[IterationRecord]:
+    """Descend from the prior; the last record's pose is the answer. Raises InvalidPrior without a prior."""
     start = required_prior(query, "inerf")
     intrinsics = sized(query.intrinsics, options.long_side_px)
     images = QueryImages(query, tools.matcher)
     photo = images.resized(intrinsics)
     loss = loss_against(options.loss, photo, images.valid_mask(intrinsics))
-    choose = _chooser(photo, options.rays, tools.rng) if options.rays else None
+    draw_mask = _pixel_sampler(photo, options.rays, tools.rng) if options.rays else None
     pose_of = Se3(start, tools.prepared)
     numbers, adam = np.zeros(6), Adam(6, options.rate)
     yield IterationRecord("start", start)
     for step in range(options.steps):
-        adam.rate = options.rate * DECAY ** (step / DECAY_STEPS)
-        chosen = _sampled(loss, choose()) if choose else loss
-        value, gradient = photometric(tools.rasterizer, intrinsics, pose_of.pose(numbers), chosen)
+        adam.rate = options.rate * config.decay ** (step / config.decay_steps)
+        chosen = _on_pixels(loss, draw_mask()) if draw_mask else loss
+        value, gradient = loss_and_gradient(tools.rasterizer, intrinsics, pose_of.pose(numbers), chosen)
         numbers = numbers - adam.step(pose_of.gradient(numbers, gradient))
         yield IterationRecord("descend", pose_of.pose(numbers), loss=value)
 
 
 def required_prior(query: Query, name: str) -> Pose:
-    """Return the prior. Raises InvalidPrior."""
+    """Return the query's prior pose. Raises InvalidPrior, naming the estimator, if it has none."""
     if query.prior is None:
         raise InvalidPrior(
             f"'{name}' moves a given pose, and there is none.", where="prior", hint="Send one, or take view_index."
@@ -84,27 +94,30 @@ def required_prior(query: Query, name: str) -> Pose:
     return query.prior
 
 
-def _chooser(
+def _pixel_sampler(
     photo: UInt8[np.ndarray, "h w 3"], rays: int, rng: np.random.Generator
 ) -> Callable[[], Float32[np.ndarray, "h w 1"]]:
-    """Return what draws a step's pixels: a mask whose mean is 1."""
+    """Return a function that draws a step's pixels: a mask, zero elsewhere, whose mean is 1.
+
+    Pixels are of the photo's interest regions, or of the whole picture where those are smaller than `rays`.
+    """
     region = np.flatnonzero(interest_region(photo))
     if len(region) < rays:
         region = np.arange(photo.shape[0] * photo.shape[1])
 
-    def choose() -> Float32[np.ndarray, "h w 1"]:
+    def draw_mask() -> Float32[np.ndarray, "h w 1"]:
         mask = np.zeros(photo.shape[0] * photo.shape[1], np.float32)
         mask[rng.choice(region, min(rays, len(region)), replace=False)] = len(mask) / min(rays, len(region))
         return mask.reshape(*photo.shape[:2], 1)
 
-    return choose
+    return draw_mask
 
 
-def _sampled(loss: Loss, mask: Float32[np.ndarray, "h w 1"]) -> Loss:
-    """Return the loss of the chosen pixels alone; its value stays that of all."""
+def _on_pixels(loss: Loss, mask: Float32[np.ndarray, "h w 1"]) -> Loss:
+    """Return the loss with the gradient of the mask's pixels alone; its value stays that of all pixels."""
 
     def of(render: Float32[np.ndarray, "h w 3"]) -> tuple[float, Float32[np.ndarray, "h w 3"]]:
         value, gradient = loss(render)
         return value, gradient * mask
 
-    return Loss(of)
+    return of

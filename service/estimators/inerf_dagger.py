@@ -35,6 +35,6 @@ class Options:
 
 
 def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    """As `inerf`."""
+    """Run `inerf` on all pixels. Raises InvalidPrior without a prior."""
     inerf.required_prior(query, "inerf_dagger")
     yield from inerf.run(query, tools, inerf.Options(rays=0, **asdict(options)))

@@ -1,17 +1,17 @@
-"""The supplement's method: Monte Carlo initialization, decoupled optimization (DO), L1 refinement.
+"""The supplement's method: Monte Carlo initialization (MC), decoupled optimization (DO), L1 refinement.
 
-    hypotheses around the prior, or over the whole scene -> rendered on the pruned level, matched with the photo,
-    scored -> resampled around the best -> DO: 10 times render, match, solve -> descent of the L1 loss
+    hypotheses around the prior, or over the whole scene -> rendered from the pruned scene, matched with the photo,
+    scored -> resampled around the best -> DO: 10 times render, match, solve -> gradient descent on the L1 loss
 
 From the supplement: the three stages and their order; matches as the score; 10 iterations; rotation by the angles
 between match vectors, translation by their lengths; L1 as the loss. Ours, because it is silent: the hypotheses'
-number, range and resampling, which goes on from what the best ones' matches are solved to; the score (the weight of
-the matches that one turn about the scene's centre and one shift explain: where it is high, DO can go on); the
-second-order solver (`service.pose.absolute_pose.decoupled` has both); XFeat where the paper most likely had LoFTR;
-small renders.
+number, range and resampling, which continues from the poses that the best ones' matches are solved to; the score (the
+weight of the matches that one rotation about the scene's centre and one translation explain: from where it is high,
+DO converges); the second-order solver (`service.pose.absolute_pose.decoupled`; the first-order one is
+`service.pose.descent.decoupled_gradient`); XFeat where the paper most likely had LoFTR; small renders.
 
-Deviations: DO's matches are of rendered points with a depth, and stay fixed while a solver works on them; best so
-far, not last, is the answer of MC and DO.
+Deviations: DO's matches are of rendered points with a depth, and stay fixed while a solver works on them; the answer of
+MC and DO is the best pose so far, not the last.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.interfaces import Rasterizer, Tools
 from service.pose.absolute_pose.decoupled import DECOUPLED, DecoupledSolution, MatchedPoints, least_squares_solve
-from service.pose.descent.contribution_pruning import contributions, pruned
+from service.pose.descent.contribution_pruning import PRUNING, contributions, prune
 from service.pose.descent.decoupled_gradient import gradient_solve
-from service.pose.descent.gradient_descent import refine, require_within
+from service.pose.descent.gradient_descent import descend, require_within
 from service.pose.descent.hypotheses import around
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
@@ -45,16 +45,30 @@ from service.results import Candidates, IterationRecord
 from service.types import Camera, Pose, Query
 
 MATCHES_IMAGES = True
-"""It works with matchers that have no features of one image."""
-SCENE_JITTER_DEG, SCENE_JITTER_SHARE = 10.0, 0.05
-"""About each of the scene's viewpoints, where there is no prior."""
-LEVEL_VIEWS, LEVEL_PX = 24, 384
-PARENTS, SHRINK = 8, 0.3
-"""Each resampling round looks at what the best PARENTS were solved to, and around, in SHRINK times the last range."""
-ENOUGH = 60.0
-"""Support that ends the search: no wrong hypothesis had more than 30."""
-RATE, END_RATE = 2e-3, 1e-5
-"""Of the descent: rad, and shares of the distance to the centre."""
+"""The method also works with matchers that match images in pairs, without features of one image."""
+
+
+@dataclass(frozen=True, slots=True)
+class MonteCarloConfig:
+    """The Monte Carlo stage; all values are ours."""
+
+    scene_range_deg: float = 10.0
+    """Range per axis around each of the scene's viewpoints, where there is no prior."""
+    scene_range_share: float = 0.05
+    """Of translations there: a share of the distance to the scene's centre."""
+    parents: int = 8
+    """Best hypotheses that a resampling round draws around, at the poses that their matches are solved to."""
+    children_share: float = 0.125
+    """Hypotheses of a resampling round, as a share of the first one's; at least as many as parents."""
+    shrink: float = 0.3
+    """Factor of the range from one round to the next."""
+    enough_support: float = 60.0
+    """Support that ends the search: no wrong hypothesis had more than 30."""
+    shown: int = 64
+    """Best hypotheses that a round's record lists."""
+
+
+MONTE_CARLO = MonteCarloConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,33 +123,35 @@ AROUND = ("prior", "scene")
 @dataclass(frozen=True, slots=True)
 class Prepared:
     focus: Focus
-    level: Rasterizer
-    """Of the pruned scene."""
+    pruned: Rasterizer
+    """Of the pruned scene, for the hypotheses."""
     viewpoints: tuple[Pose, ...]
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> Prepared:
-    """Find the scene's centre and viewpoints, and prune it: a second, once."""
+    """Return the scene's focus and viewpoints, and a renderer of the pruned scene: takes a second, once a scene."""
     cameras = index_cameras(tools.scene, tools.rasterizer, tools.rng)
-    few = cameras[:: max(1, len(cameras) // LEVEL_VIEWS)]
-    views = [Camera(sized(camera.intrinsics, LEVEL_PX), camera.pose) for camera in few]
-    scene = pruned(tools.scene, contributions(tools.scene, tools.rasterizer, views))
-    level = RASTERIZERS.load(tools.rasterizer.name).create(scene)
-    return Prepared(focus_of_scene(tools.scene, tools.rasterizer), level, tuple(c.pose for c in cameras))
+    few = cameras[:: max(1, len(cameras) // PRUNING.num_views)]
+    views = [Camera(sized(camera.intrinsics, PRUNING.long_side_px), camera.pose) for camera in few]
+    scene = prune(tools.scene, contributions(tools.scene, tools.rasterizer, views))
+    renderer = RASTERIZERS.load(tools.rasterizer.name).create(scene)
+    return Prepared(focus_of_scene(tools.scene, tools.rasterizer), renderer, tuple(c.pose for c in cameras))
 
 
-def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    """Run the stages that are switched on; see the module."""
+def run(
+    query: Query, tools: Tools, options: Options, config: MonteCarloConfig = MONTE_CARLO
+) -> Iterator[IterationRecord]:
+    """Run the stages that the options leave in; see the module. A record's pose is the best one so far."""
     prepared: Prepared = tools.prepared
     pose = query.prior or prepared.viewpoints[0]
     images = QueryImages(query, tools.matcher)
     yield IterationRecord("start", pose)
     if options.hypotheses:
-        pose = yield from _sampled(pose, images, tools, options)
+        pose = yield from _sample(pose, images, tools, options, config)
     if options.iterations:
-        pose = yield from _decoupled(pose, images, tools, options)
+        pose = yield from _optimize_decoupled(pose, images, tools, options)
     if options.refinement_steps:
-        yield from _descended(pose, images, tools, options)
+        yield from _descend(pose, images, tools, options)
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,17 +164,17 @@ class _Hypothesis:
         return self.solved.support if self.solved else 0.0
 
 
-def _sampled(
-    start: Pose, images: QueryImages, tools: Tools, options: Options
+def _sample(
+    start: Pose, images: QueryImages, tools: Tools, options: Options, config: MonteCarloConfig
 ) -> Generator[IterationRecord, None, Pose]:
-    """Draw, score, resample around the best."""
+    """Draw hypotheses, score them, resample around the best; return the best."""
     focus = tools.prepared.focus
     degrees, share, count = options.range_deg, options.range_share, options.hypotheses
     parents = [start]
     from_prior = images.query.prior is not None and options.around == "prior"
     if not from_prior:
         parents = list(tools.prepared.viewpoints)
-        degrees, share = SCENE_JITTER_DEG, SCENE_JITTER_SHARE
+        degrees, share = config.scene_range_deg, config.scene_range_share
     scored: list[_Hypothesis] = []
     for number in range(1 + options.rounds):
         poses = around(parents, focus, degrees, share, count, tools.rng)
@@ -167,41 +183,42 @@ def _sampled(
         if number:
             poses = [*parents, *poses]
         for pose in poses:
-            yield _scored(pose, images, tools, options, scored)
-            if scored[-1].support > ENOUGH:
+            yield _score(pose, images, tools, options, scored)
+            if scored[-1].support > config.enough_support:
                 break
         scored.sort(key=lambda h: -h.support)
-        best = scored[: 8 * PARENTS]
+        best = scored[: config.shown]
         yield IterationRecord("sample_poses", best[0].pose, candidates=_candidates(best))
-        parents = [h.solved.pose for h in best[:PARENTS] if h.solved]
-        if best[0].support > ENOUGH or not parents:
+        parents = [h.solved.pose for h in best[: config.parents] if h.solved]
+        if best[0].support > config.enough_support or not parents:
             break
-        degrees, share, count = SHRINK * degrees, SHRINK * share, max(PARENTS, options.hypotheses // 8)
+        degrees, share = config.shrink * degrees, config.shrink * share
+        count = max(config.parents, int(config.children_share * options.hypotheses))
     return scored[0].pose
 
 
-def _scored(
+def _score(
     pose: Pose, images: QueryImages, tools: Tools, options: Options, scored: list[_Hypothesis]
 ) -> IterationRecord:
-    """Render a hypothesis on the pruned level, match, and add it to those scored."""
+    """Render a hypothesis from the pruned scene, match, solve, and append it to those scored."""
     camera = Camera(sized(images.query.intrinsics, options.hypothesis_px), pose)
-    level = Counted(tools.prepared.level, tools.tally)
-    matches, view = render_and_match(camera, level, images, tools.image_matcher)
-    solved = _solved(matches, pose, images.query, tools, None)
+    renderer = Counted(tools.prepared.pruned, tools.tally)
+    matches, view = render_and_match(camera, renderer, images, tools.image_matcher)
+    solved = _solve(matches, pose, images.query, tools, None)
     scored.append(_Hypothesis(pose, solved))
     best = max(scored, key=lambda h: h.support)
     return _record("hypothesis", best.pose, matches, solved, view)
 
 
-def _decoupled(
+def _optimize_decoupled(
     start: Pose, images: QueryImages, tools: Tools, options: Options
 ) -> Generator[IterationRecord, None, Pose]:
-    """Render, match, solve; the pose whose own render had the most support is the answer."""
+    """Render, match and solve, `iterations` times; return the solution with the most support."""
     pose, best, most = start, start, -1.0
     for iteration in range(options.iterations):
         camera = Camera(sized(images.query.intrinsics, options.render_px), pose)
         matches, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
-        solved = _solved(matches, pose, images.query, tools, iteration if options.solver == "gradient" else None)
+        solved = _solve(matches, pose, images.query, tools, iteration if options.solver == "gradient" else None)
         if solved is None:
             yield _record("decouple", best, matches, None, view)
             break
@@ -213,22 +230,25 @@ def _decoupled(
     return best
 
 
-def _descended(start: Pose, images: QueryImages, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+def _descend(start: Pose, images: QueryImages, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+    """Descend the photometric loss from `start`; each record has the pose of the least loss so far."""
     intrinsics = sized(images.query.intrinsics, options.render_px)
     loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     focus = tools.prepared.focus
     best, least = start, np.inf
-    steps = refine(tools.rasterizer, intrinsics, start, loss, focus, options.refinement_steps, RATE, END_RATE)
-    for step in steps:
+    for step in descend(tools.rasterizer, intrinsics, start, loss, focus, options.refinement_steps):
         if step.loss < least:
             best, least = step.pose, step.loss
         yield IterationRecord("refine", best, loss=step.loss)
 
 
-def _solved(
+def _solve(
     matches: Correspondences, pose: Pose, query: Query, tools: Tools, gradient_round: int | None
 ) -> DecoupledSolution | None:
-    """Solve one render's matches; None where they are too few."""
+    """Solve one render's matches for the pose; None where they are too few.
+
+    `gradient_round` counts the renders before this one for the gradient solver; None: by least squares.
+    """
     if len(matches.photo_px) < DECOUPLED.min_points:
         return None
     matched = MatchedPoints(

@@ -24,7 +24,7 @@ from jaxtyping import Float64
 from service.estimators.inerf import required_prior
 from service.interfaces import Tools
 from service.pose.descent.adam import Adam
-from service.pose.descent.gradient_descent import So3T3, photometric, require_within
+from service.pose.descent.gradient_descent import So3T3, loss_and_gradient, require_within
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import sized
 from service.pose.features.query_images import QueryImages
@@ -32,10 +32,29 @@ from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import Candidates, IterationRecord
 from service.types import Pose, Query
 
-DECAY, DECAY_STEPS = 0.33, 256
-START_DEG, START_UNITS = 15.0, 0.3
-CHILD_DEG, CHILD_UNITS = 3.0, 0.1
-LEAST_PARENTS = 4
+
+@dataclass(frozen=True, slots=True)
+class PnerfConfig:
+    """The rates' schedule is from the supplement, the sampling from the published method's code."""
+
+    decay: float = 0.33
+    """Factor of both rates in `decay_steps` steps."""
+    decay_steps: int = 256
+    start_deg: float = 15.0
+    """Range of the first hypotheses around the prior, per axis..."""
+    start_units: float = 0.3
+    """...and of their translations, in normalized units."""
+    child_deg: float = 3.0
+    """Likewise of resampled hypotheses around their parents."""
+    child_units: float = 0.1
+    kept_share: float = 0.25
+    """Of the hypotheses; the k-th resampling (from 1) keeps this share divided by 2^k."""
+    min_parents: int = 4
+    recorded_every: int = 16
+    """Steps; of the others no hypotheses are recorded: a trace holds thousands of steps."""
+
+
+PNERF = PnerfConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,12 +81,12 @@ class Options:
 
 
 def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
-    """Find the scene's focus: it defines the units."""
+    """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
 
 class _Hypothesis:
-    """A pose under way; its anchor is where it was drawn."""
+    """A pose under optimization, with numbers and Adam of its own; its anchor is where it was drawn."""
 
     def __init__(self, anchor: Pose, focus: Focus) -> None:
         self._of = So3T3(anchor, focus)
@@ -79,51 +98,60 @@ class _Hypothesis:
     def pose(self) -> Pose:
         return self._of.pose(self._numbers)
 
-    def step(self, loss: float, by_twist: Float64[np.ndarray, "6"], rates: Float64[np.ndarray, "6"]) -> None:
+    def update(self, loss: float, by_twist: Float64[np.ndarray, "6"], rates: Float64[np.ndarray, "6"]) -> None:
         self.loss = loss
         self._numbers = self._numbers - rates * self._adam.step(self._of.gradient(self._numbers, by_twist))
 
 
-def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
-    """Descend from around the prior. Raises InvalidPrior without one."""
+def run(query: Query, tools: Tools, options: Options, config: PnerfConfig = PNERF) -> Iterator[IterationRecord]:
+    """Descend from poses around the prior. A record's pose is that of the least loss in its step.
+
+    Raises InvalidPrior without a prior.
+    """
     start, focus = required_prior(query, "pnerf"), tools.prepared
     intrinsics = sized(query.intrinsics, options.long_side_px)
     images = QueryImages(query, tools.matcher)
     loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     yield IterationRecord("start", start)
-    fleet = [_Hypothesis(start, focus)]
-    fleet += [_drawn(start, START_DEG, START_UNITS, tools) for _ in range(options.hypotheses - 1)]
+    hypotheses = [_Hypothesis(start, focus)]
+    hypotheses += [_drawn(start, config.start_deg, config.start_units, tools) for _ in range(options.hypotheses - 1)]
     for step in range(options.steps):
         if step and step % options.resample_every == 0:
-            fleet = _resampled(fleet, step // options.resample_every, tools)
-        decay = DECAY ** (step / DECAY_STEPS)
+            hypotheses = _resampled(hypotheses, step // options.resample_every, tools, config)
+        decay = config.decay ** (step / config.decay_steps)
         rates = decay * np.repeat([options.turn_rate, options.shift_rate], 3)
         best, least = start, np.inf
-        for hypothesis in fleet:
+        for hypothesis in hypotheses:
             pose = hypothesis.pose
-            hypothesis.step(*photometric(tools.rasterizer, intrinsics, pose, loss), rates)
+            hypothesis.update(*loss_and_gradient(tools.rasterizer, intrinsics, pose, loss), rates)
             if hypothesis.loss < least:
                 best, least = pose, hypothesis.loss
-        shown = _candidates(fleet) if step % 16 == 0 else None  # a trace holds thousands of steps
+        shown = _candidates(hypotheses) if step % config.recorded_every == 0 else None
         yield IterationRecord("descend", best, loss=least, candidates=shown)
 
 
-def _resampled(fleet: list[_Hypothesis], round_number: int, tools: Tools) -> list[_Hypothesis]:
-    """Keep the best; each is the parent of as many noisy children."""
-    ranked = sorted(fleet, key=lambda hypothesis: hypothesis.loss)
-    keep = min(len(fleet), max(LEAST_PARENTS, round(len(fleet) * 0.25 / 2**round_number)))
+def _resampled(
+    hypotheses: list[_Hypothesis], round_number: int, tools: Tools, config: PnerfConfig
+) -> list[_Hypothesis]:
+    """Keep the best, and replace the others by hypotheses drawn around them in turn; rounds count from 1."""
+    ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.loss)
+    keep = min(len(hypotheses), max(config.min_parents, round(len(hypotheses) * config.kept_share / 2**round_number)))
     parents = ranked[:keep]
-    children = [_drawn(parents[i % keep].pose, CHILD_DEG, CHILD_UNITS, tools) for i in range(len(fleet) - keep)]
+    children = [
+        _drawn(parents[i % keep].pose, config.child_deg, config.child_units, tools)
+        for i in range(len(hypotheses) - keep)
+    ]
     return parents + children
 
 
 def _drawn(pose: Pose, degrees: float, units: float, tools: Tools) -> _Hypothesis:
+    """Draw a hypothesis, uniformly: rotation vector within +-degrees an axis, translation within +-units."""
     focus: Focus = tools.prepared
     turn = np.radians(degrees) * tools.rng.uniform(-1, 1, 3)
     numbers = np.concatenate([turn, units * tools.rng.uniform(-1, 1, 3)])
     return _Hypothesis(So3T3(pose, focus).pose(numbers), focus)
 
 
-def _candidates(fleet: list[_Hypothesis]) -> Candidates:
-    poses = np.stack([hypothesis.pose.world_from_camera for hypothesis in fleet])
-    return Candidates(poses, -np.array([hypothesis.loss for hypothesis in fleet]))
+def _candidates(hypotheses: list[_Hypothesis]) -> Candidates:
+    poses = np.stack([hypothesis.pose.world_from_camera for hypothesis in hypotheses])
+    return Candidates(poses, -np.array([hypothesis.loss for hypothesis in hypotheses]))

@@ -1,14 +1,14 @@
-"""Photometric descent: first-order steps on the pose by the renderer's gradient.
+"""Gradient descent on the pose, by the renderer's gradient of a photometric loss.
 
-`Anchored` poses are what the gradient-based methods optimize: a few numbers, zero at the anchor, that Adam moves.
-Three parametrizations, and the chain from the renderer's gradient g by the right twist of the pose P = anchor moved:
+A parametrization describes a pose by six numbers that are zero at its anchor, and carries the renderer's gradient g by
+the right twist of the pose over to them:
 
-    se3     P = exp(xi) anchor, in the world frame about its origin (iNeRF, iComMa): d/dxi = J_l(xi)^T Ad(P^-1)^T g
-    so3_t3  R = exp(w) R_0, c = c_0 + t (pNeRF): d/dw = J_l(w)^T R g_w, d/dt = R g_t
-    about   camera turned about the scene's centre, then shifted (ours, `refine`): re-anchored at every step
+    Se3      P = exp(xi) anchor, in the world frame about its origin (iNeRF, iComMa): d/dxi = J_l(xi)^T Ad(P^-1)^T g
+    So3T3    R = exp(w) R_0, c = c_0 + t (pNeRF): d/dw = J_l(w)^T R g_w, d/dt = R g_t
+    descend  rotation about the scene's focus, then a translation (ours), with a new anchor at every step
 
-The world of se3 and so3_t3 is the normalized one (origin in the scene's focus, its distance 4), so that learning
-rates mean what they mean in the sources.
+The world of Se3 and So3T3 is normalized (origin at the scene's focus, whose distance is 4), so that learning rates
+have the meaning that they have in the sources.
 """
 
 from __future__ import annotations
@@ -29,11 +29,22 @@ from service.pose.retrieval.scene_focus import Focus
 from service.types import Camera, Intrinsics, Pose
 
 NORMAL_DISTANCE = 4.0
-"""Of the focus, in the units that the sources' learning rates are for."""
+"""Of the focus, in normalized units."""
+
+
+@dataclass(frozen=True, slots=True)
+class DescentConfig:
+    rate: float = 2e-3
+    """Adam's at the first step: rad, and shares of the focus' distance."""
+    end_rate: float = 1e-5
+    """At the last step; in between it falls geometrically."""
+
+
+DESCENT = DescentConfig()
 
 
 def require_within(options: object, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Raise InvalidOptions for the first of the options' fields that lies outside its limits."""
+    """Raise InvalidOptions for the first of the options' fields that lies outside its limits, borders included."""
     for name, (low, high) in limits.items():
         value = getattr(options, name, low)
         if not low <= value <= high:
@@ -41,51 +52,53 @@ def require_within(options: object, limits: Mapping[str, tuple[float, float]]) -
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
-    """The pose after a step, and the loss before it."""
-
+class DescentStep:
     pose: Pose
     loss: float
+    """At the pose."""
 
 
-def photometric(
+def loss_and_gradient(
     rasterizer: Rasterizer, intrinsics: Intrinsics, pose: Pose, loss: Loss
 ) -> tuple[float, Float64[np.ndarray, "6"]]:
-    """Return the loss at the pose and its gradient by the right twist."""
+    """Render at the pose; return the loss and its gradient by the right twist (rad, scene units)."""
     camera = Camera(intrinsics, pose)
     (frame,) = rasterizer.render([camera])
     value, d_rgb = loss(frame.rgb)
     return value, rasterizer.pose_gradient(camera, d_rgb)
 
 
-def refine(
+def descend(
     rasterizer: Rasterizer,
     intrinsics: Intrinsics,
     start: Pose,
     loss: Loss,
     focus: Focus,
     steps: int,
-    rate: float,
-    end_rate: float,
-) -> Iterator[Refined]:
-    """Adam on (turn about the focus, shift); the rate (rad, share of the focus' distance) falls geometrically."""
-    turner, shifter = Adam(3, rate), Adam(3, rate)
+    config: DescentConfig = DESCENT,
+) -> Iterator[DescentStep]:
+    """Run Adam on (rotation about the focus, translation) in the camera's axes.
+
+    Yields `steps` + 1 poses with their losses, the start first.
+    """
+    rotation_adam, translation_adam = Adam(3, config.rate), Adam(3, config.rate)
     pose = start
     for step in range(steps):
-        turner.rate = rate * (end_rate / rate) ** (step / max(steps - 1, 1))
-        shifter.rate = turner.rate * focus.distance
-        value, gradient = photometric(rasterizer, intrinsics, pose, loss)
-        yield Refined(pose, value)
+        rotation_adam.rate = config.rate * (config.end_rate / config.rate) ** (step / max(steps - 1, 1))
+        translation_adam.rate = rotation_adam.rate * focus.distance
+        value, gradient = loss_and_gradient(rasterizer, intrinsics, pose, loss)
+        yield DescentStep(pose, value)
+        # By a rotation about the focus the camera turns in place and moves along with its arm, too.
         arm = pose.camera_from_world[:3, :3] @ (focus.point_in_world - pose.position_in_world)
-        turn = -turner.step(gradient[:3] + hat(arm).T @ gradient[3:])
-        shift = -shifter.step(gradient[3:])
-        pose = translate_in_camera(rotate_about(pose, focus.point_in_world, turn), shift)
+        rotation = -rotation_adam.step(gradient[:3] + hat(arm).T @ gradient[3:])
+        translation = -translation_adam.step(gradient[3:])
+        pose = translate_in_camera(rotate_about(pose, focus.point_in_world, rotation), translation)
     value, _ = loss(rasterizer.render([Camera(intrinsics, pose)])[0].rgb)
-    yield Refined(pose, value)
+    yield DescentStep(pose, value)
 
 
 class Se3:
-    """Six numbers: a twist in the normalized world, on the left of the anchor."""
+    """Poses by a twist (rad, normalized units) on the left of the anchor, in the normalized world frame."""
 
     def __init__(self, anchor: Pose, focus: Focus) -> None:
         self._scale, self._focus = NORMAL_DISTANCE / focus.distance, focus
@@ -97,6 +110,7 @@ class Se3:
         return matrix
 
     def pose(self, xi: Float64[np.ndarray, "6"]) -> Pose:
+        """Return the pose exp(xi) anchor, in the scene's own world frame."""
         matrix = se3_exp(xi) @ self._anchor
         matrix[:3, 3] = matrix[:3, 3] / self._scale + self._focus.point_in_world
         u, _, vt = np.linalg.svd(matrix[:3, :3])
@@ -104,7 +118,10 @@ class Se3:
         return Pose(matrix)
 
     def gradient(self, xi: Float64[np.ndarray, "6"], twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
-        """Carry the renderer's gradient over: by differences of exp and log, exact to 1e-8."""
+        """Return the gradient by xi, given that by the right twist of its pose.
+
+        By central differences of exp and log, exact to 1e-8.
+        """
         matrix = se3_exp(xi) @ self._anchor
         inverse = np.linalg.inv(matrix)
         scaled = np.concatenate([twist[:3], twist[3:] / self._scale])
@@ -118,12 +135,13 @@ class Se3:
 
 
 class So3T3:
-    """Six numbers: a rotation vector in the world's axes, in place, and a shift in the normalized world."""
+    """Poses by a rotation vector (rad, world axes) in place, and a translation (normalized units, world axes)."""
 
     def __init__(self, anchor: Pose, focus: Focus) -> None:
         self._scale, self._anchor = NORMAL_DISTANCE / focus.distance, anchor
 
     def pose(self, numbers: Float64[np.ndarray, "6"]) -> Pose:
+        """Return the pose that the numbers (rotation, translation) lead to from the anchor."""
         matrix = self._anchor.world_from_camera.copy()
         rotation = so3_exp(numbers[:3]) @ matrix[:3, :3]
         u, _, vt = np.linalg.svd(rotation)
@@ -132,13 +150,14 @@ class So3T3:
         return Pose(matrix)
 
     def gradient(self, numbers: Float64[np.ndarray, "6"], twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "6"]:
+        """Return the gradient by the numbers, given that by the right twist of their pose."""
         rotation = self.pose(numbers).world_from_camera[:3, :3]
         inverse = rotation.T
-        by_turn = np.empty(3)
+        by_rotation = np.empty(3)
         for i in range(3):
             step = 1e-5 * np.eye(3)[i]
             anchor = self._anchor.world_from_camera[:3, :3]
             ahead = so3_log(inverse @ so3_exp(numbers[:3] + step) @ anchor)
             back = so3_log(inverse @ so3_exp(numbers[:3] - step) @ anchor)
-            by_turn[i] = twist[:3] @ (ahead - back) / 2e-5
-        return np.concatenate([by_turn, rotation @ twist[3:] / self._scale])
+            by_rotation[i] = twist[:3] @ (ahead - back) / 2e-5
+        return np.concatenate([by_rotation, rotation @ twist[3:] / self._scale])
