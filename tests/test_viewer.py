@@ -21,18 +21,21 @@ from service.results import IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.splat_sample import importance, packed_splats
 from service.types import Camera, Intrinsics
 from service.web.schemas.conversion import record_out
-from viewer import charts, frusta, match_geometry
+from viewer import camera_views, charts, colours, frusta, match_geometry
 from viewer import comparison_images as images
-from viewer.job_stream import JobStream, Library
-from viewer.playback import Playback, headline_html, record_html, scene_html
-from viewer.service_client import Answer, JobView, ServiceClient, ServiceError, parsed_record, parsed_splats, sse_events
+from viewer.job_stream import JobStream
+from viewer.layers.splat_layer import full_covariances
+from viewer.panel_html import headline_html, record_html, scene_html
+from viewer.playback import Playback
+from viewer.service_client import Job, JobOutcome, ServiceClient, ServiceError, parse_record, parse_splats, sse_events
+from viewer.shared_data import SharedData
 
 # ---------------------------------------------------------------- what the service says
 
 
 @pytest.mark.parametrize("record", [*records(2), replace(records(1)[0], matches=None, candidates=None, loss=None)])
 def test_records_survive_the_wire(record: IterationRecord) -> None:
-    back = parsed_record(record_out(record).model_dump(mode="json"))
+    back = parse_record(record_out(record).model_dump(mode="json"))
     np.testing.assert_array_equal(back.pose.world_from_camera, record.pose.world_from_camera)
     for name in ("stage", "index", "elapsed_s", "loss", "num_matches", "num_inliers", "step_deg", "step_units"):
         assert getattr(back, name) == getattr(record, name)
@@ -49,17 +52,17 @@ def test_records_survive_the_wire(record: IterationRecord) -> None:
 
 def test_splats_are_read_as_the_service_packs_them() -> None:
     scene = fake_service.scene(40)
-    splats = parsed_splats(packed_splats(scene, 25))
+    splats = parse_splats(packed_splats(scene, 25))
     best = np.argsort(-importance(scene), kind="stable")[:25]
     assert splats.total == 40
     np.testing.assert_array_equal(splats.centres, scene.means[best])
-    full = frusta.full_covariances(splats.covariances)
+    full = full_covariances(splats.covariances)
     np.testing.assert_array_equal(full, full.transpose(0, 2, 1))
     # Isotropic in the fake scene: 0.05^2 on the diagonal; 1e-9 seen.
     np.testing.assert_allclose(full, np.tile(0.05**2 * np.eye(3), (25, 1, 1)), atol=1e-8)
     assert np.all(splats.rgba[:, 3] == round(0.9 * 255))
     with pytest.raises(ValueError, match="bytes for 25 splats"):
-        parsed_splats(packed_splats(scene, 25)[:-1])
+        parse_splats(packed_splats(scene, 25)[:-1])
 
 
 def test_server_sent_events() -> None:
@@ -68,15 +71,15 @@ def test_server_sent_events() -> None:
     assert list(sse_events(iter(text.split("\n")))) == [("", ""), ("record", "one\ntwo"), ("message", " spaced")]
 
 
-def test_troubles_name_the_path_and_the_status() -> None:
+def test_errors_name_the_path_and_the_status() -> None:
     service = ServiceClient("http://fake", FakeService().transport)
-    with pytest.raises(ServiceError, match=r"^/jobs/nope: HTTP 404$") as told:
+    with pytest.raises(ServiceError, match=r"^/jobs/nope: HTTP 404$") as raised:
         service.job("nope")
-    assert told.value.status == 404
+    assert raised.value.status == 404
     refused = httpx.MockTransport(lambda request: (_ for _ in ()).throw(httpx.ConnectError("refused")))
-    with pytest.raises(ServiceError, match="refused") as told:
+    with pytest.raises(ServiceError, match="refused") as raised:
         ServiceClient("http://fake", refused).jobs()
-    assert told.value.status is None
+    assert raised.value.status is None
 
 
 # ---------------------------------------------------------------- which record is shown
@@ -127,7 +130,7 @@ def test_play_starts_over_at_the_end_and_stops_there() -> None:
 def test_frusta_project_onto_the_corners_of_their_images(share: float, depth: float, width: int, height: int) -> None:
     k = Intrinsics(width, height, 300.0, 320.0, 0.4 * width, 0.6 * height)
     pose = orbit(share)
-    segments = frusta.frusta(frusta.stacked([pose]), [k], depth)
+    segments = frusta.frustum_edges(frusta.stack_poses([pose]), [k], depth)
     rim = segments[4:, 0]  # the first four edges lead from the apex to the corners
     in_camera = transformed(pose.camera_from_world, rim)
     np.testing.assert_allclose(in_camera[:, 2], depth, rtol=1e-5)
@@ -137,8 +140,8 @@ def test_frusta_project_onto_the_corners_of_their_images(share: float, depth: fl
 
 
 def test_no_poses_give_empty_drawings() -> None:
-    assert frusta.frusta(frusta.stacked([]), [], 1.0).shape == (0, 2, 3)
-    assert images.score_colours(np.zeros(0)).shape == (0, 3)
+    assert frusta.frustum_edges(frusta.stack_poses([]), [], 1.0).shape == (0, 2, 3)
+    assert colours.score_colours(np.zeros(0)).shape == (0, 3)
 
 
 @given(st.floats(0.3, 3), st.floats(-3, 3))
@@ -146,10 +149,10 @@ def test_looking_through_a_camera_shows_its_whole_image(aspect: float, roll: flo
     turn = np.eye(4)
     turn[:2, :2] = [[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]]
     pose = replace(orbit(0.2), world_from_camera=orbit(0.2).world_from_camera @ turn)
-    scene = frusta.extent(
+    scene = camera_views.scene_extent(
         np.zeros((0, 3), np.float32), [Camera(PHOTO, orbit(s)) for s in (0.0, 0.3, 0.6)], (0.0, 0.0, 1.0)
     )
-    view = frusta.through(Camera(PHOTO, pose), scene, aspect)
+    view = camera_views.view_through(Camera(PHOTO, pose), scene, aspect)
     forward = view.look_at - view.position
     forward /= np.linalg.norm(forward)
     np.testing.assert_allclose(forward, pose.axis_in_world, atol=1e-9)
@@ -166,17 +169,19 @@ def test_looking_through_a_camera_shows_its_whole_image(aspect: float, roll: flo
 @given(share=st.floats(0, 1))
 def test_over_the_shoulder_the_whole_frustum_is_seen_and_no_wall_between(share: float, wall: float | None) -> None:
     pose = orbit(share)
-    scene = frusta.extent(np.zeros((0, 3), np.float32), [Camera(PHOTO, orbit(s)) for s in (0.0, 0.3, 0.6)], None)
+    scene = camera_views.scene_extent(
+        np.zeros((0, 3), np.float32), [Camera(PHOTO, orbit(s)) for s in (0.0, 0.3, 0.6)], None
+    )
     across = np.random.default_rng(0).uniform(-1, 1, (5000 if wall else 0, 2))
     centres = transformed(pose.world_from_camera, np.column_stack([across, np.full(len(across), -(wall or 0))]))
-    view = frusta.behind(pose, scene, centres.astype(np.float32))
+    view = camera_views.view_from_behind(pose, scene, centres.astype(np.float32))
     distance = -(view.position - pose.position_in_world) @ pose.axis_in_world
     assert distance < (wall or 2)
     seen = look_at(view.position, view.look_at, view.up)
     focal = 50 / np.tan(view.fov_rad / 2)
-    corners = frusta.frusta(frusta.stacked([pose]), [PHOTO], scene.frustum).reshape(-1, 3)
+    corners = frusta.frustum_edges(frusta.stack_poses([pose]), [PHOTO], scene.frustum_depth).reshape(-1, 3)
     in_view = transformed(seen.camera_from_world, corners)
-    assert in_view[:, 2].min() > 1.15 * scene.frustum  # the near plane
+    assert in_view[:, 2].min() > 1.15 * scene.frustum_depth  # the near plane
     px = project(in_view, Intrinsics(100, 100, focal, focal, 50, 50))
     assert px.min() > 5
     assert px.max() < 95
@@ -185,17 +190,17 @@ def test_over_the_shoulder_the_whole_frustum_is_seen_and_no_wall_between(share: 
 def test_extent_ignores_floaters_and_survives_an_empty_scene() -> None:
     points = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
     points[:20] *= 1000
-    found = frusta.extent(points, [], None)
+    found = camera_views.scene_extent(points, [], None)
     assert found.radius < 4  # the 90 % quantile of a normal cloud is 2.5
     np.testing.assert_array_equal(found.up, [0, 0, 1])
-    assert frusta.extent(np.zeros((0, 3), np.float32), [], None).radius == 1.0
+    assert camera_views.scene_extent(np.zeros((0, 3), np.float32), [], None).radius == 1.0
 
 
 def test_up_comes_from_the_scene_else_from_its_cameras() -> None:
     cameras = [Camera(PHOTO, orbit(s)) for s in (0, 0.25, 0.5, 0.75)]
     nothing = np.zeros((0, 3), np.float32)
-    np.testing.assert_allclose(frusta.extent(nothing, cameras, None).up, [0, 0, 1], atol=1e-9)
-    np.testing.assert_allclose(frusta.extent(nothing, cameras, (0.0, -2.0, 0.0)).up, [0, -1, 0], atol=1e-9)
+    np.testing.assert_allclose(camera_views.scene_extent(nothing, cameras, None).up, [0, 0, 1], atol=1e-9)
+    np.testing.assert_allclose(camera_views.scene_extent(nothing, cameras, (0.0, -2.0, 0.0)).up, [0, -1, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize(("width", "height"), [(300, 400), (400, 300), (200, 200), (64, 900)])
@@ -207,9 +212,9 @@ def test_match_lines_end_where_the_matches_are(width: int, height: int) -> None:
     render[at_render[1], at_render[0]] = 255
     camera = Camera(Intrinsics(width // 2, height // 2, 100, 100, width / 4, height / 4), orbit(0))
     pixels = [np.float32([p]) + np.float32(0.5) for p in (at_photo, at_render)]
-    spots = [_centre(images.beside(photo * a, render * (1 - a)), 30) for a in (1, 0)]
-    plain = images.beside(photo * 0, render * 0)
-    lined = images.beside(photo * 0, render * 0, match_view(*pixels, camera), np.uint8([images.INLIER]))
+    spots = [_centre(images.side_by_side(photo * a, render * (1 - a)), 30) for a in (1, 0)]
+    plain = images.side_by_side(photo * 0, render * 0)
+    lined = images.side_by_side(photo * 0, render * 0, match_view(*pixels, camera), np.uint8([colours.INLIER_COLOUR]))
     drawn = np.abs(lined.astype(int) - plain).max(-1) > 100
     rows, columns = np.nonzero(drawn)
     for x, y in spots:
@@ -248,26 +253,26 @@ def test_colours_tell_inliers_and_residuals() -> None:
     view = match_view(px, px + np.float32([[0.1, 0], [5, 0], [300, 0], [9999, 0]]), camera)
     view = replace(view, inlier=np.array([True, False, True, True]))
     (green, red, *_), by_residual = (
-        images.match_colours(view, "inlier"),
-        images.match_colours(view, "residual"),
+        colours.match_colours(view, "inlier"),
+        colours.match_colours(view, "residual"),
     )
-    assert green.tolist() == list(images.INLIER)
-    assert red.tolist() == list(images.OUTLIER)
-    assert by_residual[0].tolist() == list(images.INLIER)  # below half a pixel
-    assert by_residual[2].tolist() == list(images.OUTLIER)  # beyond 50
+    assert green.tolist() == list(colours.INLIER_COLOUR)
+    assert red.tolist() == list(colours.OUTLIER_COLOUR)
+    assert by_residual[0].tolist() == list(colours.INLIER_COLOUR)  # below half a pixel
+    assert by_residual[2].tolist() == list(colours.OUTLIER_COLOUR)  # beyond 50
     assert by_residual[1][0] > 200  # 5 px: in the middle, yellow
     assert by_residual[1][1] > 200
-    assert images.match_colours(replace(view, residual_px=np.full(4, np.nan)), "residual")[0].tolist() == [150] * 3
+    assert colours.match_colours(replace(view, residual_px=np.full(4, np.nan)), "residual")[0].tolist() == [150] * 3
 
 
 def test_overlays_compare_pixel_by_pixel() -> None:
     photo, render = np.full((30, 40, 3), 100, np.uint8), np.full((15, 20, 3), 180, np.uint8)
     inside = (100, 400)
-    assert images.overlaid("blend", photo, render, 0.25)[inside].tolist() == [120, 120, 120]
-    assert images.overlaid("difference", photo, render)[inside].tolist() == [160, 160, 160]
-    assert images.overlaid("difference", photo, photo)[inside].max() == 0
-    assert images.overlaid("difference", photo * 0, render + 70)[inside].max() == 255  # doubled, not wrapped round
-    tiles = images.overlaid("checker", photo, render)[40::80, 40::80, 0]  # one pixel of each of 10 x 7 tiles
+    assert images.overlay("blend", photo, render, 0.25)[inside].tolist() == [120, 120, 120]
+    assert images.overlay("difference", photo, render)[inside].tolist() == [160, 160, 160]
+    assert images.overlay("difference", photo, photo)[inside].max() == 0
+    assert images.overlay("difference", photo * 0, render + 70)[inside].max() == 255  # doubled, not wrapped round
+    tiles = images.overlay("checker", photo, render)[40::80, 40::80, 0]  # one pixel of each of 10 x 7 tiles
     expected = np.where(np.indices(tiles.shape).sum(0) % 2 == 0, 100, 180)
     np.testing.assert_array_equal(tiles, expected)
     both = re.findall(r"base64,([^']+)", images.flicker_html(photo, render))
@@ -277,7 +282,7 @@ def test_overlays_compare_pixel_by_pixel() -> None:
 def test_arrows_go_from_the_renders_point_to_the_photos() -> None:
     camera = Camera(Intrinsics(400, 300, 300, 300, 200, 150), orbit(0))
     view = match_view(np.float32([[300, 100]]), np.float32([[100, 200]]), camera)
-    picture = images.flow(np.zeros((150, 200, 3), np.uint8), view, np.uint8([images.INLIER]))
+    picture = images.match_vectors_image(np.zeros((150, 200, 3), np.uint8), view, np.uint8([colours.INLIER_COLOUR]))
     rows, columns = np.nonzero(picture[..., 1] > 150)  # 800 wide: all at twice the photo's pixels
     assert (columns.min(), columns.max()) == (pytest.approx(200, abs=4), pytest.approx(600, abs=4))
     assert (rows.min(), rows.max()) == (pytest.approx(200, abs=8), pytest.approx(400, abs=4))
@@ -288,26 +293,26 @@ def test_arrows_go_from_the_renders_point_to_the_photos() -> None:
 def test_decoding_and_scaling() -> None:
     image = images.decode(fake_service.jpeg((200, 100, 50)))
     assert np.abs(image.reshape(-1, 3).mean(0) - [200, 100, 50]).max() < 3  # RGB, not BGR
-    assert images.reduced(image, 48).shape == (32, 48, 3)
+    assert images.shrink(image, 48).shape == (32, 48, 3)
     for garbage in (b"", b"not an image"):
         with pytest.raises(ValueError, match="not an image"):
             images.decode(garbage)
 
 
 def test_better_scores_are_brighter() -> None:
-    colours = images.score_colours(np.linspace(-3, 5, 50))
-    lightness = cv2.cvtColor(colours[None], cv2.COLOR_RGB2LAB)[0, :, 0].astype(int)
+    ramp = colours.score_colours(np.linspace(-3, 5, 50))
+    lightness = cv2.cvtColor(ramp[None], cv2.COLOR_RGB2LAB)[0, :, 0].astype(int)
     assert np.all(np.diff(lightness) >= 0)
     assert lightness[-1] - lightness[0] > 100
     assert np.array_equal(
-        images.score_colours(np.array([2.0, 2.0])),
-        images.score_colours(np.array([0.0, 1.0]))[[1, 1]],
+        colours.score_colours(np.array([2.0, 2.0])),
+        colours.score_colours(np.array([0.0, 1.0]))[[1, 1]],
     )
 
 
 def test_texts_escape_what_others_wrote() -> None:
-    answer = Answer("not_localized", "few_features", "Take it <sharper>.", 0.1, 3)
-    job = JobView("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
+    answer = JobOutcome("not_localized", "few_features", "Take it <sharper>.", 0.1, 3)
+    job = Job("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
     text = headline_html(job, 4, "")
     assert "not localized" in text
     assert "few features, score 0.10, 3 inliers" in text
@@ -360,7 +365,7 @@ def test_vectors_of_a_shift_are_parallel_and_of_a_roll_interwoven() -> None:
         assert found == pytest.approx(angle, abs=4)  # the grid is wider than high: 88 seen
     view = match_view(grid + np.float32([7, -3]), grid, camera)
     np.testing.assert_allclose(view.vectors_px, np.tile([7, -3], (63, 1)), atol=1e-4)
-    counts = match_geometry.angle_counts(view.vectors_px, 24)
+    counts = match_geometry.direction_histogram(view.vectors_px, 24)
     assert counts[round(np.degrees(np.arctan2(-3, 7)) / 15) % 24] == 63
     assert match_geometry.mean_angle_deg(np.zeros((5, 2))) is None
 
@@ -378,8 +383,8 @@ def test_pose_errors_are_those_of_a_known_motion() -> None:
 
 
 def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
-    told = [replace(r, loss=None if r.index == 3 else r.loss, num_matches=None) for r in records(6)]
-    drawn = charts.curves_html(told, told[-1].pose, 2)
+    shown = [replace(r, loss=None if r.index == 3 else r.loss, num_matches=None) for r in records(6)]
+    drawn = charts.curves_html(shown, shown[-1].pose, 2)
     titles = ("loss", "turned by the step", "moved by the step", "matches and inliers", "error of rotation")
     assert all(title in drawn for title in titles)
     loss = drawn.split("</svg>")[0]
@@ -389,40 +394,40 @@ def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
     assert re.findall(r"<title>step (\d): ([^<]*)</title>", loss) == [
         (str(k), f"{1 / (k + 1):.4g}") for k in (0, 1, 2, 4, 5)
     ]
-    assert "nan" not in drawn + charts.stages_html(told, 2)
+    assert "nan" not in drawn + charts.stages_html(shown, 2)
     assert "nothing to plot" in charts.curves_html([], None, 0)
     assert "no matches" in charts.vectors_html(None)
 
 
 def test_a_click_takes_the_nearest_frustum_on_its_ray() -> None:
-    poses = frusta.stacked([orbit(0.0), orbit(0.5), orbit(0.25)])
+    poses = frusta.stack_poses([orbit(0.0), orbit(0.5), orbit(0.25)])
     eye = np.array([10.0, 0.0, 1.0])
-    hit = frusta.nearest_to_ray(eye, np.array([-2.0, 0, 0]), poses, 0.3)
+    hit = frusta.hit_frustum(eye, np.array([-2.0, 0, 0]), poses, 0.3)
     assert hit == 0  # the one at the other side is on the ray, too, but farther
-    assert frusta.nearest_to_ray(eye, np.array([1.0, 0, 0]), poses, 0.3) is None  # behind
-    assert frusta.nearest_to_ray(eye, np.array([0.0, 1, 0]), poses, 0.3) is None
-    assert frusta.nearest_to_ray(eye, np.array([-2.0, 0, 0]), poses[:0], 0.3) is None
+    assert frusta.hit_frustum(eye, np.array([1.0, 0, 0]), poses, 0.3) is None  # behind
+    assert frusta.hit_frustum(eye, np.array([0.0, 1, 0]), poses, 0.3) is None
+    assert frusta.hit_frustum(eye, np.array([-2.0, 0, 0]), poses[:0], 0.3) is None
 
 
 # ---------------------------------------------------------------- following jobs
 
 
-def test_a_feed_follows_a_job_to_its_end() -> None:
+def test_a_stream_follows_a_job_to_its_end() -> None:
     fake = FakeService()
     job = fake.job("a", 2)
-    feed = JobStream(ServiceClient("http://fake", fake.transport), "a")
-    feed.start()
-    until(lambda: len(feed.records) == 2, "what there was before")
+    stream = JobStream(ServiceClient("http://fake", fake.transport), "a")
+    stream.start()
+    until(lambda: len(stream.records) == 2, "what there was before")
     job.add(records(3)[2])
-    until(lambda: len(feed.records) == 3, "what came then")
-    assert feed.job is not None
-    assert feed.job.answer is None
+    until(lambda: len(stream.records) == 3, "what came then")
+    assert stream.job is not None
+    assert stream.job.outcome is None
     job.finish(Status.UNCERTAIN, Reason.FEW_INLIERS)
-    until(lambda: feed.complete, "the end")
-    assert feed.job.answer is not None
-    assert (feed.job.answer.status, feed.job.answer.inliers) == ("uncertain", 212)
-    assert feed.job.answer.hint
-    until(lambda: not threads("feed-a"), "the thread's end")
+    until(lambda: stream.complete, "the end")
+    assert stream.job.outcome is not None
+    assert (stream.job.outcome.status, stream.job.outcome.inliers) == ("uncertain", 212)
+    assert stream.job.outcome.hint
+    until(lambda: not threads("job-a"), "the thread's end")
 
 
 def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -438,54 +443,54 @@ def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.M
             yield chunk
 
     monkeypatch.setattr(job, "events", events)
-    feed = JobStream(ServiceClient("http://fake", fake.transport), "b")
-    troubles: list[str] = []
-    feed.listeners.add(lambda: troubles.append(feed.trouble))
-    feed.start()
+    stream = JobStream(ServiceClient("http://fake", fake.transport), "b")
+    errors: list[str] = []
+    stream.listeners.add(lambda: errors.append(stream.error))
+    stream.start()
     job.finish()
-    until(lambda: feed.complete, "the end")
-    assert any("cut" in t for t in troubles)
-    assert [r.index for r in feed.records] == [0, 1, 2, 3]
-    assert feed.trouble == ""
+    until(lambda: stream.complete, "the end")
+    assert any("cut" in e for e in errors)
+    assert [r.index for r in stream.records] == [0, 1, 2, 3]
+    assert stream.error == ""
 
 
-def test_a_job_that_is_gone_is_told_and_not_asked_for_again() -> None:
+def test_a_job_that_is_gone_is_reported_and_not_requested_again() -> None:
     fake = FakeService()
-    feed = JobStream(ServiceClient("http://fake", fake.transport), "gone")
-    feed.start()
-    until(lambda: feed.trouble and not threads("feed-gone"), "the thread's end")
-    assert "no job gone" in feed.trouble
+    stream = JobStream(ServiceClient("http://fake", fake.transport), "gone")
+    stream.start()
+    until(lambda: stream.error and not threads("job-gone"), "the thread's end")
+    assert "no job gone" in stream.error
     assert fake.asked == ["/jobs/gone"]
 
 
-def test_a_feed_is_shared_and_ends_with_its_last_listener() -> None:
+def test_a_stream_is_shared_and_ends_with_its_last_listener() -> None:
     fake = FakeService()
     fake.job("c", 1)
-    library = Library(ServiceClient("http://fake", fake.transport))
+    shared = SharedData(ServiceClient("http://fake", fake.transport))
 
     def one() -> None: ...
     def two() -> None: ...
 
-    feed = library.follow("c", one)
-    assert library.follow("c", two) is feed
-    library.leave(feed, one)
-    assert threads("feed-c")
-    library.leave(feed, two)
-    until(lambda: not threads("feed-c"), "the thread's end")
-    assert library.follow("c", one) is not feed
-    library.close()
+    stream = shared.streams.follow("c", one)
+    assert shared.streams.follow("c", two) is stream
+    shared.streams.leave(stream, one)
+    assert threads("job-c")
+    shared.streams.leave(stream, two)
+    until(lambda: not threads("job-c"), "the thread's end")
+    assert shared.streams.follow("c", one) is not stream
+    shared.close()
 
 
 def test_pictures_and_scenes_are_fetched_once() -> None:
     fake = FakeService()
     fake.job("d", 3)
-    library = Library(ServiceClient("http://fake", fake.transport))
-    assert library.scene("ball") is library.scene("ball")
-    feed = JobStream(library.service, "d")
-    pose, matched = feed.render(1, matched=False), feed.render(1, matched=True)
+    shared = SharedData(ServiceClient("http://fake", fake.transport))
+    assert shared.scenes.get("ball") is shared.scenes.get("ball")
+    stream = JobStream(shared.client, "d")
+    pose, matched = stream.render(1, matched=False), stream.render(1, matched=True)
     for image, is_matched in ((pose, False), (matched, True)):
         # JPEG: 2 seen.
         assert np.abs(image.reshape(-1, 3).mean(0) - render_rgb(1, matched=is_matched)).max() < 4
-    assert feed.render(1, matched=False) is pose
-    assert feed.photo() is feed.photo()
+    assert stream.render(1, matched=False) is pose
+    assert stream.photo() is stream.photo()
     assert len(fake.asked) == len(set(fake.asked)) + 1  # the two renders have the same path

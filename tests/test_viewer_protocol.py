@@ -26,12 +26,13 @@ from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, u
 
 from service.results import Reason, Status
 from service.types import IntrinsicsCorrection
-from viewer import browser_session, frusta, viewer_server, viser_internals
+from viewer import camera_views, job_display, viewer_server, viser_internals
 from viewer import comparison_images as images
-from viewer.job_stream import JobStream, Library
+from viewer.job_stream import JobStream
 from viewer.replay import replay_html
+from viewer.scene_cache import SceneCache
 from viewer.service_client import ServiceClient, ServiceError
-from viewer.viewer_server import Viewer, job_of
+from viewer.viewer_server import Viewer, job_id_in_path
 
 
 @pytest.fixture
@@ -166,7 +167,7 @@ def test_nothing_grows_however_long_a_job_is(fake: FakeService, viewer: Viewer) 
 def test_browsers_do_not_disturb_one_another_and_leave_nothing(fake: FakeService, viewer: Viewer) -> None:
     fake.job("one", 3)
     fake.job("two", 6)
-    names = ("feed-one", "feed-two", "browser-0", "browser-1")
+    names = ("job-one", "job-two", "browser-0", "browser-1")
     with _browser(viewer, "/jobs/one") as first, _browser(viewer, "/jobs/two") as second:
         first.wait(lambda: first.widget("step")["value"] == 2 and "agree" in first.text(), "the first job")
         second.wait(lambda: second.widget("step")["value"] == 5 and "agree" in second.text(), "the second job")
@@ -176,7 +177,7 @@ def test_browsers_do_not_disturb_one_another_and_leave_nothing(fake: FakeService
         assert all(threads(name) for name in names)
     until(lambda: not any(threads(name) for name in names), "the end of all threads")
     assert not viewer._sessions
-    assert not viewer._library._feeds
+    assert len(viewer._shared.streams) == 0
 
 
 def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: Viewer) -> None:
@@ -209,8 +210,8 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
         there = records(3)[1].pose.position_in_world
         browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "looking through")
         browser.set("fly to result", True)
-        ball = viewer._library.scene("ball")
-        goal = frusta.behind(records(3)[-1].pose, ball.extent, ball.splats.centres)
+        ball = viewer._shared.scenes.get("ball")
+        goal = camera_views.view_from_behind(records(3)[-1].pose, ball.extent, ball.splats.centres)
         # viser leaves out changes below 1e-5 of the value.
         browser.wait(lambda: np.allclose(client.camera.position, goal.position, atol=1e-4), "arrival")
         browser.wait(lambda: np.allclose(client.camera.look_at, goal.look_at, atol=1e-4), "looking there")
@@ -219,7 +220,7 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
 def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
     fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(browser_session, "_ARRIVAL_S", 0.0)
+    monkeypatch.setattr(job_display, "ARRIVAL_S", 0.0)
     job = fake.job("j")
     fake.loading_s = 0.5
     with _browser(viewer, "/jobs/j") as browser:
@@ -229,8 +230,8 @@ def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
         job.finish()
         browser.wait(lambda: browser.widget("step")["value"] == 2 and "15 agree" in browser.text(), "the last step")
         (client,) = viewer.server.get_clients().values()
-        ball = viewer._library.scene("ball")
-        there = frusta.behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
+        ball = viewer._shared.scenes.get("ball")
+        there = camera_views.view_from_behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
         assert np.allclose(client.camera.position, there, atol=1e-4)
 
 
@@ -457,10 +458,10 @@ def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it
 def test_a_replay_has_the_splats_and_every_step(fake: FakeService) -> None:
     fake.job("saved", 3, finished=True)
     service = ServiceClient("http://fake", fake.transport)
-    feed = JobStream(service, "saved")
-    feed.start()
-    until(lambda: feed.complete, "the job")
-    page = replay_html(feed, Library(service).scene("ball"))
+    stream = JobStream(service, "saved")
+    stream.start()
+    until(lambda: stream.complete, "the job")
+    page = replay_html(stream, SceneCache(service).get("ball"))
     match = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
     assert match is not None
     data = base64.b64decode(match[1])
@@ -481,7 +482,7 @@ def test_a_scene_can_be_looked_at_without_a_job(fake: FakeService, viewer: Viewe
         assert browser.widget("follow newest")["value"] is False
 
 
-def test_play_goes_as_fast_as_it_is_told(fake: FakeService, viewer: Viewer) -> None:
+def test_play_has_the_chosen_speed(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 8, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: browser.widget("step")["value"] == 7 and "agree" in browser.text(), "the job")
@@ -493,7 +494,7 @@ def test_play_goes_as_fast_as_it_is_told(fake: FakeService, viewer: Viewer) -> N
         assert 0.2 < time.monotonic() - began < 3  # 7 steps in 0.35 s, drawing aside; at 2 a second it would be 3.5 s
 
 
-def test_an_unknown_job_is_told(viewer: Viewer) -> None:
+def test_an_unknown_job_is_reported(viewer: Viewer) -> None:
     with _browser(viewer, "/jobs/unknown") as browser:
         browser.wait(lambda: "no job unknown" in browser.text(), "the message")
 
@@ -536,14 +537,14 @@ def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     + [(p, None) for p in ("/jobs/../etc", "/jobs/a/b", "/jobs/%2e%2e", "/x/jobs/abc", "/jobs/" + 65 * "a")],
 )
 def test_only_plain_ids_are_taken_from_an_address(path: str, job: str | None) -> None:
-    assert job_of(path) == job
+    assert job_id_in_path(path) == job
 
 
-def test_a_path_that_cannot_be_told_means_the_newest_job(viewer: Viewer) -> None:
+def test_an_unknown_path_means_the_newest_job(viewer: Viewer) -> None:
     assert viser_internals.requested_path(viewer.server, 12345) == "/"
 
 
-def test_a_picture_that_cannot_be_had_is_told_and_the_rest_goes_on(
+def test_a_missing_image_is_reported_and_the_rest_is_shown(
     fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake.job("j", 3, finished=True)
@@ -559,7 +560,7 @@ def _refused(*_: object, **__: object) -> np.ndarray:
     raise ServiceError("/render", "", 503)
 
 
-def test_the_program_serves_until_it_is_told_to_end(fake: FakeService) -> None:
+def test_the_program_serves_until_sigterm(fake: FakeService) -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as free:
         port = free.getsockname()[1]
     command = [sys.executable, "-m", "viewer", "--service", "http://127.0.0.1:9", "--port", str(port)]

@@ -1,4 +1,4 @@
-"""`python -m viewer --service URL --port N`: show what a running service does. Ends with its parent."""
+"""`python -m viewer --service URL --port N`: serve the viewer of a running service; ends with its parent process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger("viewer")
 
 
 def main() -> None:
-    """Serve until SIGTERM or SIGINT, or until the process that started this one is gone."""
+    """Serve until SIGTERM or SIGINT, or until the process that started this one has ended."""
     parser = argparse.ArgumentParser(prog="viewer", description=__doc__)
     parser.add_argument("--service", required=True, help="base URL of the splatfix service")
     parser.add_argument("--port", type=int, required=True, help="port to serve browsers on")
@@ -33,7 +33,7 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     service = ServiceClient(arguments.service, key=os.environ.get("SPLATFIX_VIEWER_KEY", ""))
-    with redirect_stdout(io.StringIO()):  # viser prints an address that no one but the relay shall use
+    with redirect_stdout(io.StringIO()):  # viser prints its address, which only the relay uses
         viewer = Viewer(service, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())
     while not ended.wait(1.0) and os.getppid() == arguments.parent:

@@ -1,6 +1,6 @@
-"""Small charts as SVG in HTML: curves over the steps, histograms of match vectors, the strip of stages.
+"""Charts as SVG in HTML: curves over the steps, histograms of match vectors, a strip of stages; for a dark background.
 
-No viser, no HTTP. viser's own plots know neither gaps in a curve nor marks. Colours are for viser's dark ground.
+viser's own plots support neither gaps in a curve nor marks.
 """
 
 from __future__ import annotations
@@ -14,29 +14,33 @@ from jaxtyping import Float64
 
 from service.results import IterationRecord
 from service.types import Pose
-from viewer.match_geometry import SHORTEST_PX, MatchView, angle_counts, mean_angle_deg, pose_error
+from viewer.match_geometry import MIN_VECTOR_PX, MatchView, direction_histogram, mean_angle_deg, pose_error
 
-_BINS = 24
-_QUIET = "#9aa0a8"
-_SERIES = ("#f0953f", "#5cb3e8", "#7bd88f", "#d68ce6", "#e8d44d", "#ef6f6c", "#8fa3ff", "#c2b280")
+_DIRECTION_BINS = 24
+_GREY = "#9aa0a8"
+_SERIES_COLOURS = ("#f0953f", "#5cb3e8", "#7bd88f", "#d68ce6", "#e8d44d", "#ef6f6c", "#8fa3ff", "#c2b280")
+_WIDTH, _HEIGHT, _LEFT = 390, 104, 46
+"""Of a curve's chart, and of its left margin; SVG units."""
+_MAX_DOTS = 60
+"""Curves with more points have no dots with values: they would merge into a band, and take long to send."""
 
 
 def vectors_html(view: MatchView | None) -> str:
-    """The directions of the match vectors as a rose, their lengths as bars, and both in numbers."""
+    """Return a polar histogram of the match vectors' directions and a logarithmic one of their lengths."""
     if view is None or not len(view.inlier):
         return _note("This step has no matches.")
     angle = mean_angle_deg(view.vectors_px)
-    said = "no vector is long enough" if angle is None else f"{angle:.0f}° between two, on average"
+    angle_text = "no vector is long enough" if angle is None else f"{angle:.0f}° between two, on average"
     lengths = np.linalg.norm(view.vectors_px, axis=1)
     lengths = lengths[np.isfinite(lengths)]
     if not len(lengths):
         return _note("No match is in view here.")
     median = float(np.median(lengths))
-    long = f"below {SHORTEST_PX}" if median < SHORTEST_PX else f"{median:.3g}"
+    length_text = f"below {MIN_VECTOR_PX}" if median < MIN_VECTOR_PX else f"{median:.3g}"
     return (
         "<div style='display:flex;gap:.8em;padding:0 .6em;flex-wrap:wrap'>"
-        f"{_figure(_rose(angle_counts(view.vectors_px, _BINS)), f'angles: {said}')}"
-        f"{_figure(_bars(lengths), f'lengths: {long} px, the median')}"
+        f"{_figure(_polar_histogram(direction_histogram(view.vectors_px, _DIRECTION_BINS)), f'angles: {angle_text}')}"
+        f"{_figure(_length_histogram(lengths), f'lengths: {length_text} px, the median')}"
         "</div>"
         + _note(
             "From where the render has a point to where the photo has it. Turned about its axis or swung round what it "
@@ -46,7 +50,7 @@ def vectors_html(view: MatchView | None) -> str:
 
 
 def stages_html(records: Sequence[IterationRecord], index: int) -> str:
-    """The stages as a strip under the slider, with a mark at the step that is shown."""
+    """Return a strip under the slider that shows the stages, with a mark at step `index`."""
     if not records:
         return ""
     last = max(1, len(records) - 1)
@@ -76,15 +80,15 @@ def stages_html(records: Sequence[IterationRecord], index: int) -> str:
 
 
 def stage_colours(records: Sequence[IterationRecord]) -> dict[str, str]:
-    """A colour for each stage, in the order in which they come."""
+    """Return a colour for each stage, in order of first appearance; after eight they repeat."""
     names = dict.fromkeys(record.stage for record in records)
-    return {name: _SERIES[i % len(_SERIES)] for i, name in enumerate(names)}
+    return {name: _SERIES_COLOURS[i % len(_SERIES_COLOURS)] for i, name in enumerate(names)}
 
 
 def curves_html(records: Sequence[IterationRecord], truth: Pose | None, index: int) -> str:
-    """Loss, change, matches, and errors where the truth is known, over the steps; with a mark at the step shown."""
+    """Return curves over the steps: loss, step size, matches and, given the true pose, errors. `index` is marked."""
     loss = _column(records, "loss")
-    # A curve for each stage: losses of different stages can't be compared.
+    # One curve per stage, as losses of different stages aren't comparable.
     losses = {stage: np.where([r.stage == stage for r in records], loss, np.nan) for stage in stage_colours(records)}
     turned, moved = _column(records, "step_deg"), _column(records, "step_units")
     matches, inliers = _column(records, "num_matches"), _column(records, "num_inliers")
@@ -97,19 +101,16 @@ def curves_html(records: Sequence[IterationRecord], truth: Pose | None, index: i
     if truth is not None and records:
         errors = np.array([pose_error(r.pose, truth) for r in records]).T
         charts += [("error of rotation, degrees", {"": errors[0]}), ("error of position, units", {"": errors[1]})]
-    drawn = [_curves(title, series, records, index) for title, series in charts if _known(series).size]
+    drawn = [_curve_chart(title, series, records, index) for title, series in charts if _finite_values(series).size]
     return "".join(drawn) or _note("There is nothing to plot yet.")
 
 
-_WIDTH, _HEIGHT, _LEFT = 390, 104, 46
-
-
-def _curves(
+def _curve_chart(
     title: str, series: dict[str, Float64[np.ndarray, "n"]], records: Sequence[IterationRecord], index: int
 ) -> str:
-    known = _known(series)
-    log = bool(known.min() > 0 and known.max() > 30 * known.min())
-    low, high, ticks = _axis(known, log=log)
+    finite = _finite_values(series)
+    log = bool(finite.min() > 0 and finite.max() > 30 * finite.min())
+    low, high, ticks = _axis(finite, log=log)
     last = max(1, len(records) - 1)
 
     def x(step: float) -> float:
@@ -120,10 +121,10 @@ def _curves(
         return float(_HEIGHT - 14 - (_HEIGHT - 22) * share)
 
     colours = stage_colours(records)
-    palette = colours if set(series) <= set(colours) else dict(zip(series, _SERIES, strict=False))
+    palette = colours if set(series) <= set(colours) else dict(zip(series, _SERIES_COLOURS, strict=False))
     parts = [_bands(records, x)]
     for tick in ticks:
-        parts.append(f"<path d='M{_LEFT} {y(tick):.1f}H{_WIDTH - 4}' stroke='{_QUIET}' stroke-opacity='.25'/>")
+        parts.append(f"<path d='M{_LEFT} {y(tick):.1f}H{_WIDTH - 4}' stroke='{_GREY}' stroke-opacity='.25'/>")
         parts.append(_text(_LEFT - 5, y(tick) + 3, f"{tick:g}", "end"))
     parts.append(f"<path d='M{x(index):.1f} 6V{_HEIGHT - 12}' stroke='#fff' stroke-width='1.5'/>")
     for name, values in series.items():
@@ -137,25 +138,25 @@ def _curves(
     )
 
 
-def _known(series: dict[str, Float64[np.ndarray, "n"]]) -> Float64[np.ndarray, "k"]:
+def _finite_values(series: dict[str, Float64[np.ndarray, "n"]]) -> Float64[np.ndarray, "k"]:
     values = np.concatenate([np.zeros(0), *series.values()])
     return values[np.isfinite(values)]
 
 
-def _axis(known: Float64[np.ndarray, "k"], *, log: bool) -> tuple[float, float, list[float]]:
+def _axis(values: Float64[np.ndarray, "k"], *, log: bool) -> tuple[float, float, list[float]]:
     """Return the ends of an axis and a few round values between them."""
     if log:
-        low, high = 10.0 ** np.floor(np.log10(known.min())), 10.0 ** np.ceil(np.log10(known.max()))
+        low, high = 10.0 ** np.floor(np.log10(values.min())), 10.0 ** np.ceil(np.log10(values.max()))
         powers = np.arange(np.log10(low), np.log10(high) + 0.5)
         return float(low), float(high), [float(10.0**p) for p in powers[:: -(-len(powers) // 4)]]
-    low, high = min(0.0, float(known.min())), float(known.max()) or 1.0
+    low, high = min(0.0, float(values.min())), float(values.max()) or 1.0
     step = 10.0 ** np.floor(np.log10(high - low))
     step *= next(f for f in (0.2, 0.5, 1.0) if (high - low) / (f * step) <= 5) if (high - low) / step < 5 else 2.0
     return low, high, [float(t) for t in np.arange(np.ceil(low / step), high / step + 1e-9) * step]
 
 
 def _bands(records: Sequence[IterationRecord], x: Callable[[float], float]) -> str:
-    """The stages as coloured grounds."""
+    """Return the stages as coloured background rectangles."""
     colours, bands = stage_colours(records), []
     for stage, steps in groupby(records, lambda r: r.stage):
         indices = [r.index for r in steps]
@@ -167,23 +168,19 @@ def _bands(records: Sequence[IterationRecord], x: Callable[[float], float]) -> s
     return "".join(bands)
 
 
-_DOTS = 60
-"""Points that get a dot, and its value under the mouse; more would be a band, and long to send."""
-
-
 def _line(
     values: Float64[np.ndarray, "n"], x: Callable[[float], float], y: Callable[[float], float], colour: str
 ) -> str:
-    """A line with gaps where there is no value."""
+    """Return a polyline that is interrupted where there is no value, and a dot with a tooltip at each value."""
     path, dots, pen = [], [], "M"
-    known = np.flatnonzero(np.isfinite(values))
+    count = np.isfinite(values).sum()
     for i in range(len(values)):
         if not np.isfinite(values[i]):
             pen = "M"
             continue
         path.append(f"{pen}{x(i):.1f} {y(values[i]):.1f}")
         pen = "L"
-        if len(known) <= _DOTS:
+        if count <= _MAX_DOTS:
             dots.append(
                 f"<circle cx='{x(i):.1f}' cy='{y(values[i]):.1f}' r='2.6'>"
                 f"<title>step {i}: {values[i]:.4g}</title></circle>"
@@ -193,7 +190,7 @@ def _line(
 
 
 def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
-    return f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='{_QUIET}' font-size='9'>{text}</text>"
+    return f"<text x='{x:.1f}' y='{y:.1f}' text-anchor='{anchor}' fill='{_GREY}' font-size='9'>{text}</text>"
 
 
 def _column(records: Sequence[IterationRecord], name: str) -> Float64[np.ndarray, "n"]:
@@ -201,8 +198,8 @@ def _column(records: Sequence[IterationRecord], name: str) -> Float64[np.ndarray
     return np.array([np.nan if value is None else value for value in found], np.float64)
 
 
-def _rose(counts: Float64[np.ndarray, "bins"]) -> str:
-    """Wedges round a centre, area by count; right is right in the picture, down is down."""
+def _polar_histogram(counts: Float64[np.ndarray, "bins"]) -> str:
+    """Return wedges about a centre with areas proportional to the counts, in the image's directions."""
     reach = 62 * np.sqrt(counts / max(counts.max(), 1))
     half = np.pi / len(counts)
     wedges = []
@@ -211,16 +208,16 @@ def _rose(counts: Float64[np.ndarray, "bins"]) -> str:
             (r * np.cos(turn), r * np.sin(turn)) for turn in (2 * half * i - 0.9 * half, 2 * half * i + 0.9 * half)
         )
         wedges.append(f"<path d='M0 0L{ax:.1f} {ay:.1f}A{r:.1f} {r:.1f} 0 0 1 {bx:.1f} {by:.1f}Z'/>")
-    rings = "".join(f"<circle r='{r}' fill='none' stroke='{_QUIET}' stroke-opacity='.35'/>" for r in (31, 62))
+    rings = "".join(f"<circle r='{r}' fill='none' stroke='{_GREY}' stroke-opacity='.35'/>" for r in (31, 62))
     labels = "".join(
         _text(x, y, text) for x, y, text in ((72, 3, "0°"), (0, 74, "90°"), (-72, 3, "180°"), (0, -67, "270°"))
     )
-    return _svg("-84 -78 168 158", "directions", f"{rings}<g fill='{_SERIES[0]}'>{''.join(wedges)}</g>{labels}")
+    return _svg("-84 -78 168 158", "directions", f"{rings}<g fill='{_SERIES_COLOURS[0]}'>{''.join(wedges)}</g>{labels}")
 
 
-def _bars(lengths: Float64[np.ndarray, "m"]) -> str:
-    """Counts over a logarithmic axis of pixels."""
-    low = np.floor(np.log10(max(np.quantile(lengths, 0.02), SHORTEST_PX)))
+def _length_histogram(lengths: Float64[np.ndarray, "m"]) -> str:
+    """Return a histogram over a logarithmic axis of pixels."""
+    low = np.floor(np.log10(max(np.quantile(lengths, 0.02), MIN_VECTOR_PX)))
     high = np.ceil(np.log10(max(lengths.max(), 10**low * 10)))
     edges = np.linspace(low, high, int(4 * (high - low)) + 1)
     counts, _ = np.histogram(np.log10(np.clip(lengths, 10**low, 10**high)), edges)
@@ -231,7 +228,7 @@ def _bars(lengths: Float64[np.ndarray, "m"]) -> str:
         for i, c in enumerate(counts)
     )
     ticks = "".join(_text(164 * (p - low) / (high - low), 145, f"{10.0**p:g}") for p in np.arange(low, high + 1))
-    return _svg("-12 0 188 158", "lengths", f"<g fill='{_SERIES[1]}'>{bars}</g>{ticks}")
+    return _svg("-12 0 188 158", "lengths", f"<g fill='{_SERIES_COLOURS[1]}'>{bars}</g>{ticks}")
 
 
 def _svg(box: str, label: str, inner: str) -> str:

@@ -1,31 +1,37 @@
-"""The widgets of one browser: a control panel, and a window with pictures, match vectors and curves."""
+"""The widgets of one browser: a control panel, and a window with images, match vectors and curves."""
 
 from __future__ import annotations
 
-from typing import get_args
+from collections.abc import Callable
+from typing import Any, get_args
 
 import numpy as np
 import viser
 
-from viewer.comparison_images import MODES, ColourBy
-from viewer.scene_3d import Layer
+from viewer.colours import ColourBy
+from viewer.comparison_images import MODES
+from viewer.layers.layer import LayerName
 
 NO_JOB: str = "no job yet"
 NO_SCENE: str = "no scene yet"
+PLAY, PREVIOUS, NEXT = "play / pause", "◀ previous", "next ▶"
 _PANEL_WIDTH_PX = 340
 _WINDOW_WIDTH_PX = 420
+_REPLAY_LABEL = "save as replay file"
 _REPLAY_HINT = "One HTML file that plays this job from disk, without a service."
 _SPEEDS = ("1", "2", "5", "10", "20")
 
 
 class Controls:
-    """The handles, by what they are for. What happens on a click is wired in `session`."""
+    """Handles of the widgets by purpose. `BrowserSession` connects them to what they do."""
 
     def __init__(self, client: viser.ClientHandle, *, splats: bool) -> None:
-        """`splats`: whether the browser draws them, to begin with."""
+        """`splats`: whether the layer of splats is shown at first."""
         gui = client.gui
+        self.saving_replay = False
+        """Whether a replay file is being made."""
         self.flush = client.flush
-        """Send what has been set without waiting for more."""
+        """Send pending changes to the browser at once."""
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH_PX)
         gui.add_html(
@@ -36,15 +42,15 @@ class Controls:
         self.scenes = gui.add_dropdown("scene", (NO_SCENE,), initial_value=NO_SCENE)
         self.headline = gui.add_html("")
         self.step = gui.add_slider("step", 0, 0, 1, 0, disabled=True)
-        self.strip = gui.add_html("")
-        self.play = gui.add_button_group("", ("◀ previous", "play / pause", "next ▶"))
+        self.stages = gui.add_html("")
+        self.play = gui.add_button_group("", (PREVIOUS, PLAY, NEXT))
         self.speed = gui.add_dropdown("steps per second", _SPEEDS, initial_value="2")
         self.numbers = gui.add_html("")
         self.look_through = gui.add_button("look through this camera", disabled=True)
         self.fly = gui.add_button("fly to result", disabled=True)
-        self.replay = gui.add_button("save as replay file", disabled=True, hint=_REPLAY_HINT)
+        self.replay = gui.add_button(_REPLAY_LABEL, disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
-            self.layers = {layer: gui.add_checkbox(layer, layer != "splats" or splats) for layer in get_args(Layer)}
+            self.layers = {layer: gui.add_checkbox(layer, layer != "splats" or splats) for layer in get_args(LayerName)}
             self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
                 "exact render at rest",
@@ -60,15 +66,38 @@ class Controls:
         self.window = gui.add_panel(visible=False)
         with self.window.add_tab("photo and render"):
             self.mode = gui.add_button_group("compare", MODES)
-            self.picture = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88)
+            self.comparison = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88)
             self.flicker = gui.add_html("", visible=False)
             self.caption = gui.add_html("")
-            self.matches = gui.add_checkbox("match lines", True)
+            self.match_lines = gui.add_checkbox("match lines", True)
             self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
         with self.window.add_tab("match vectors"):
-            self.flow = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88, visible=False)
+            self.vectors_image = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88, visible=False)
             self.vectors = gui.add_html("")
         with self.window.add_tab("curves"):
             self.curves = gui.add_html("")
         self.window.dock_left()
         self.window.set_width(_WINDOW_WIDTH_PX)
+
+    def set_step_count(self, count: int) -> None:
+        """Enable what needs records, for so many of them."""
+        self.step.max = max(0, count - 1)
+        self.step.disabled = self.look_through.disabled = self.fly.disabled = count == 0
+        self.replay.disabled = count == 0 or self.saving_replay
+        self.window.visible = self.window.visible and count > 0
+
+    def set_saving_replay(self, saving: bool) -> None:
+        """Show whether a replay file is being made; meanwhile there is no other."""
+        self.saving_replay = saving
+        self.replay.disabled = saving or self.step.disabled
+        self.replay.label = "making the replay file…" if saving else _REPLAY_LABEL
+
+
+def on_user_change(widget: Any, react: Callable[[Any], None]) -> None:
+    """Call `react` with the widget's value whenever the user, not this program, has changed it."""
+
+    async def changed(event: Any) -> None:  # async: runs on viser's event loop, not in its pool of threads
+        if event.client is not None:
+            react(widget.value)
+
+    widget.on_update(changed)

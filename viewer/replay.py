@@ -1,4 +1,4 @@
-"""A job as one HTML file that plays from disk: the scene decimated, each step's render in its camera."""
+"""A job as one HTML file that plays without a service: the scene with fewer splats, and each step with its render."""
 
 from __future__ import annotations
 
@@ -8,83 +8,85 @@ from types import SimpleNamespace
 import viser
 
 from service.results import IterationRecord
-from viewer import frusta
-from viewer.comparison_images import match_colours, reduced
-from viewer.job_stream import JobStream, SceneContent
+from viewer.camera_views import Viewpoint, view_from_behind
+from viewer.colours import match_colours
+from viewer.comparison_images import shrink
+from viewer.job_stream import JobStream
 from viewer.match_geometry import matches_at_pose
 from viewer.scene_3d import Scene3D
-from viewer.service_client import JobView, Splats
+from viewer.scene_cache import SceneContent
+from viewer.service_client import Job, Splats
 from viewer.viser_internals import forbid_sharing
 
 MAX_SPLATS = 120_000
 """4 MB of the file."""
-_STEPS = 60
+_MAX_STEPS = 60
 _STEP_S, _END_S = 0.6, 2.0
-_TEXTURE_PX = 384
+_FRUSTUM_IMAGE_PX = 384
 
 
-def replay_html(feed: JobStream, content: SceneContent) -> str:
-    """Return the file's text; renders every step, which takes a while. Raises ServiceError, ValueError."""
-    job, records = feed.job, feed.records[:]
+def replay_html(stream: JobStream, content: SceneContent) -> str:
+    """Return the file's text: viser's page with a recording of at most 60 steps, evenly spaced, and the last.
+
+    Requests a render of each step, which takes a while. Raises ServiceError, ValueError.
+    """
+    job, records = stream.job, stream.records[:]
     if job is None or not records:
         raise ValueError("the job has no steps yet")
-    # viser records what a server shows: one of its own, on loopback, for as long as that takes.
+    # viser records what a server shows, so a server on loopback runs for as long as the recording takes.
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         forbid_sharing(server)
-        stage = Scene3D(_Tape(server))
-        stage.show_scene(_decimated(content), None)
-        stage.add_splats()
-        _look(server, frusta.behind(records[-1].pose, content.extent, content.splats.centres))
-        stage.show_trajectory(records, job)
-        tape = server.get_scene_serializer()
-        every = -(-len(records) // _STEPS)
+        scene = Scene3D(_RecordingCanvas(server))
+        scene.show_scene(_with_fewer_splats(content), None)
+        scene.splats.send()
+        _set_initial_view(server, view_from_behind(records[-1].pose, content.extent, content.splats.centres))
+        scene.trajectory.show(records, job)
+        recording = server.get_scene_serializer()
+        every = -(-len(records) // _MAX_STEPS)
         shown = records[::every] if (len(records) - 1) % every == 0 else [*records[::every], records[-1]]
         for record in shown:
-            _show(stage, feed, record.index)
-            stage.label(record.pose, _said(record, len(records), job))
-            tape.insert_sleep(_STEP_S)
-        tape.insert_sleep(_END_S)
-        page = tape.as_html(dark_mode=True)
+            _show_step(scene, stream, job, record)
+            scene.trajectory.show_label(record.pose, _label(record, len(records), job))
+            recording.insert_sleep(_STEP_S)
+        recording.insert_sleep(_END_S)
+        page = recording.as_html(dark_mode=True)
     finally:
         server.stop()
     return page.replace("<title>Viser</title>", f"<title>{html.escape(job.photo_name)} – splatfix</title>", 1)
 
 
-class _Tape:
-    """What `Scene3D` draws on; its camera is nobody's."""
+class _RecordingCanvas:
+    """A canvas for `Scene3D` without a browser, whose camera is set but not used."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self.scene, self.camera = server.scene, SimpleNamespace()
         self.atomic, self.flush = server.atomic, server.flush
 
 
-def _said(record: IterationRecord, count: int, job: JobView) -> str:
+def _label(record: IterationRecord, count: int, job: Job) -> str:
     text = f"step {record.index} of {count - 1}: {record.stage}"
-    ended = record.index == count - 1 and job.answer is not None
-    return f"{text}, {job.answer.status.replace('_', ' ')}" if ended and job.answer else text
+    if record.index < count - 1 or job.outcome is None:
+        return text
+    return f"{text}, {job.outcome.status.replace('_', ' ')}"
 
 
-def _show(stage: Scene3D, feed: JobStream, index: int) -> None:
-    record, job = feed.records[index], feed.job
-    if job is None:
-        return
-    render = reduced(feed.render(index, matched=False), _TEXTURE_PX)
-    stage.show_current(job.camera(record), render)
-    weighed = (r.candidates for r in reversed(feed.records[: index + 1]) if r.candidates)
-    stage.show_candidates(next(weighed, None), job.photo)
-    source = feed.matches(index)
-    view = matches_at_pose(source, job.camera(record), index) if source else None
-    stage.show_matches(view, None if view is None else match_colours(view, "inlier"))
+def _show_step(scene: Scene3D, stream: JobStream, job: Job, record: IterationRecord) -> None:
+    camera = job.camera(record)
+    scene.trajectory.show_current(camera, shrink(stream.render(record.index, matched=False), _FRUSTUM_IMAGE_PX))
+    scored = (r.candidates for r in reversed(stream.records[: record.index + 1]) if r.candidates)
+    scene.candidates.show(next(scored, None), job.photo)
+    source = stream.matches(record.index)
+    view = matches_at_pose(source, camera, record.index) if source else None
+    scene.matches.show(view, None if view is None else match_colours(view, "inlier"))
 
 
-def _look(server: viser.ViserServer, view: frusta.Viewpoint) -> None:
+def _set_initial_view(server: viser.ViserServer, view: Viewpoint) -> None:
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = view.position, view.look_at, view.up, view.fov_rad
 
 
-def _decimated(content: SceneContent) -> SceneContent:
-    splats = content.splats  # the most important ones first
-    n = MAX_SPLATS
-    few = Splats(splats.centres[:n], splats.covariances[:n], splats.rgba[:n], splats.total)
-    return SceneContent(content.view, few, content.extent)
+def _with_fewer_splats(content: SceneContent) -> SceneContent:
+    splats, n = content.splats, MAX_SPLATS  # in order of importance, so the first ones are kept
+    fewer = Splats(splats.centres[:n], splats.covariances[:n], splats.rgba[:n], splats.total)
+    return SceneContent(content.description, fewer, content.extent)

@@ -1,4 +1,4 @@
-"""The service as the viewer sees it: HTTP in, values of `service.types` and `results` out. The only file with httpx."""
+"""HTTP client of a splatfix service; returns `service.types` and `service.results`. The only file with httpx."""
 
 from __future__ import annotations
 
@@ -21,51 +21,55 @@ _JOBS_LISTED = 50
 
 
 class ServiceError(Exception):
-    """The service does not answer, or answers with an error."""
+    """The service doesn't respond, or responds with an error."""
 
     def __init__(self, path: str, problem: object, status: int | None = None) -> None:
         super().__init__(f"{path}: {problem if status is None else f'HTTP {status}'}")
         self.status = status
-        """HTTP status; None if there was no answer."""
+        """HTTP status; None if there was no response."""
 
 
 @dataclass(frozen=True, slots=True)
-class SceneView:
+class SceneDescription:
+    """A scene without its Gaussians."""
+
     id: str
     name: str
     gaussians: int
     background_rgb: tuple[float, float, float]
-    """Seen where there is no Gaussian; 0..1."""
+    """Colour of rays that meet no Gaussian; 0..1."""
     up_in_world: tuple[float, float, float] | None
     cameras: tuple[NamedCamera, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Splats:
-    """A scene's most important Gaussians, the greatest first."""
+    """A scene's Gaussians by descending importance, without view-dependent colour."""
 
     centres: Float32[np.ndarray, "n 3"]
     covariances: Float32[np.ndarray, "n 6"]
     """xx, xy, xz, yy, yz, zz; world frame."""
     rgba: UInt8[np.ndarray, "n 4"]
     total: int
-    """How many the scene has."""
+    """Number of Gaussians in the scene, of which these may be a part."""
 
 
 @dataclass(frozen=True, slots=True)
 class JobSummary:
+    """A job as the list of jobs has it."""
+
     id: str
     state: str
     scene: str
     created: str
     """ISO 8601, UTC."""
     status: str | None
-    """Of the result, when there is one."""
+    """Of the result; None while there is none."""
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """How a job ended, in words and numbers."""
+class JobOutcome:
+    """How a job ended."""
 
     status: str
     """localized, uncertain, not_localized; failed or cancelled where there is no result."""
@@ -76,7 +80,9 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True)
-class JobView:
+class Job:
+    """A job without its records."""
+
     id: str
     state: str
     scene: str
@@ -85,35 +91,37 @@ class JobView:
     photo: Intrinsics
     """Of the image that `ServiceClient.photo` returns."""
     truth: Pose | None
-    """As whoever sent the photo knows it."""
-    answer: Answer | None
-    """None until it has ended."""
+    """The true pose, where the request gave one."""
+    outcome: JobOutcome | None
+    """None until the job has ended."""
     photo_step: int | None = None
     """Of several photos, the step whose photo `ServiceClient.photo` returns; None: one photo, or not known yet."""
 
     def camera(self, record: IterationRecord) -> Camera:
-        """Return the photo's camera as a step has it: its pose, its estimate of the lens."""
+        """Return the photo's camera as a record estimates it: its pose, and the intrinsics with its correction."""
         return Camera(self.photo.corrected(record.lens), record.pose)
 
 
 class ServiceClient:
-    """One running splatfix service. Safe to use from several threads."""
+    """Client of one running service. Every method raises ServiceError. Safe to use from several threads."""
 
     def __init__(self, url: str, transport: httpx.BaseTransport | None = None, key: str = "") -> None:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        # Loopback: no proxy from the environment may stand between. A busy machine renders for seconds.
+        # No proxy from the environment, since the service is on loopback; a render takes seconds on a busy machine.
         self._http = httpx.Client(base_url=url, timeout=30.0, trust_env=False, transport=transport, headers=headers)
 
     def close(self) -> None:
+        """Close all connections."""
         self._http.close()
 
     def scenes(self) -> list[str]:
         """Return the ids of the scenes that are in memory."""
         return [s["id"] for s in self._json("/scenes")["scenes"] if s["gaussians"] is not None]
 
-    def scene(self, scene_id: str) -> SceneView:
+    def scene(self, scene_id: str) -> SceneDescription:
+        """Return a scene's description."""
         raw = self._json(f"/scenes/{scene_id}")
-        return SceneView(
+        return SceneDescription(
             raw["id"],
             raw["name"],
             raw["gaussians"] or 0,
@@ -123,17 +131,20 @@ class ServiceClient:
         )
 
     def splats(self, scene_id: str, limit: int) -> Splats:
-        return parsed_splats(self._bytes(f"/scenes/{scene_id}/splats", {"max": limit}))
+        """Return the `limit` most important Gaussians of a scene. Raises ValueError, too, for a truncated response."""
+        return parse_splats(self._bytes(f"/scenes/{scene_id}/splats", {"max": limit}))
 
     def jobs(self) -> list[JobSummary]:
         """Return the newest jobs, the newest first."""
         jobs = json.loads(self._bytes("/jobs", {"limit": _JOBS_LISTED}))["jobs"]
         return [JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in jobs]
 
-    def job(self, job_id: str) -> JobView:
+    def job(self, job_id: str) -> Job:
+        """Return a job."""
         return _job(self._json(f"/jobs/{job_id}"))
 
     def photo(self, job_id: str) -> bytes:
+        """Return a job's photo as an image file."""
         return self._bytes(f"/jobs/{job_id}/photo")
 
     def render(self, job_id: str, index: int, *, matched: bool) -> bytes:
@@ -142,11 +153,11 @@ class ServiceClient:
         return self._bytes(f"/jobs/{job_id}/iterations/{index}/render.jpg", query)
 
     def picture(self, scene_id: str, camera: Camera) -> bytes:
-        """Return a JPEG of the scene as a camera sees it, rendered by the service."""
+        """Return a render of a scene as a JPEG."""
         return self._rendered(scene_id, camera, "jpeg")
 
     def depth(self, scene_id: str, camera: Camera) -> Float32[np.ndarray, "h w"]:
-        """Return the z-depth of what a camera sees; 0 where that is nothing opaque."""
+        """Return a depth map of a scene: z-depth in scene units; 0 where nothing is opaque."""
         return np.load(io.BytesIO(self._rendered(scene_id, camera, "depth")), allow_pickle=False)
 
     def _rendered(self, scene_id: str, camera: Camera, kind: str) -> bytes:
@@ -155,16 +166,16 @@ class ServiceClient:
         pose = {"world_from_camera": camera.pose.world_from_camera.tolist()}
         path = f"/scenes/{scene_id}/render"
         try:
-            answer = self._http.post(path, json={"pose": pose, "intrinsics": size, "format": kind})
-            return answer.raise_for_status().content
+            response = self._http.post(path, json={"pose": pose, "intrinsics": size, "format": kind})
+            return response.raise_for_status().content
         except httpx.HTTPStatusError as error:
             raise ServiceError(path, error, error.response.status_code) from error
         except httpx.HTTPError as error:
             raise ServiceError(path, error) from error
 
-    def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | JobView]:
-        """Yield a job's records from the first one on, at last the finished job; less if `stop` is set."""
-        # Pings come every 15 s; a stream that is silent for longer is dead.
+    def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | Job]:
+        """Yield a job's records from the first one on, then the ended job; end early once `stop` is set."""
+        # The service sends a ping every 15 s; a stream that is silent for three of them is broken.
         timeout, path = httpx.Timeout(10.0, read=45.0), f"/jobs/{job_id}/events"
         try:
             with self._http.stream("GET", path, timeout=timeout) as response:
@@ -174,7 +185,7 @@ class ServiceClient:
                     if stop.is_set():
                         return
                     if event == "record":
-                        yield parsed_record(json.loads(data))
+                        yield parse_record(json.loads(data))
                     elif event in ("result", "error"):
                         yield _job(json.loads(data))
                         return
@@ -210,8 +221,8 @@ def sse_events(lines: Iterator[str]) -> Iterator[tuple[str, str]]:
             event, data = "message", []
 
 
-def parsed_splats(data: bytes) -> Splats:
-    """Read the layout of `/scenes/{id}/splats`. Raises ValueError if it is cut short."""
+def parse_splats(data: bytes) -> Splats:
+    """Return the splats in a response of `/scenes/{id}/splats`. Raises ValueError if it is truncated."""
     start = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:start])
     n = header["count"]
@@ -222,8 +233,8 @@ def parsed_splats(data: bytes) -> Splats:
     return Splats(floats[: 3 * n].reshape(n, 3), floats[3 * n :].reshape(n, 6), rgba.reshape(n, 4), header["total"])
 
 
-def parsed_record(raw: dict[str, Any]) -> IterationRecord:
-    """Read a record as `/jobs/{id}/events` gives it."""
+def parse_record(raw: dict[str, Any]) -> IterationRecord:
+    """Return the record in an event of `/jobs/{id}/events`, as decoded JSON."""
     matches, candidates = raw["matches"], raw["candidates"]
     scalars = ("loss", "num_matches", "num_inliers", "step_deg", "step_units", "index", "elapsed_s", "cpu_s")
     return IterationRecord(
@@ -246,8 +257,8 @@ def parsed_record(raw: dict[str, Any]) -> IterationRecord:
     )
 
 
-def _job(raw: dict[str, Any]) -> JobView:
-    return JobView(
+def _job(raw: dict[str, Any]) -> Job:
+    return Job(
         raw["id"],
         raw["state"],
         raw["scene"],
@@ -255,25 +266,25 @@ def _job(raw: dict[str, Any]) -> JobView:
         raw["photo"]["name"],
         _intrinsics(raw["photo"]["intrinsics"]),
         raw["truth"] and Pose(np.array(raw["truth"]["world_from_camera"]["matrix"], np.float64)),
-        _answer(raw),
+        _outcome(raw),
         _photo_step((raw["result"] or {}).get("frames")),
     )
 
 
 def _photo_step(frames: list[dict[str, Any]] | None) -> int | None:
-    """The service keeps the last photo that was localized; if none was, the last."""
+    """Return the step whose photo the service keeps: the last one localized, else the last one."""
     if not frames:
         return None
     return next((f["index"] for f in reversed(frames) if f["status"] == "localized"), frames[-1]["index"])
 
 
-def _answer(raw: dict[str, Any]) -> Answer | None:
+def _outcome(raw: dict[str, Any]) -> JobOutcome | None:
     result, error = raw["result"], raw["error"]
     if result:
-        return Answer(result["status"], result["reason"], result["hint"], result["score"], result["inliers"])
+        return JobOutcome(result["status"], result["reason"], result["hint"], result["score"], result["inliers"])
     if error:
-        return Answer(raw["state"], error["detail"], error["hint"])
-    return Answer(raw["state"], "", "") if raw["state"] in FINISHED else None
+        return JobOutcome(raw["state"], error["detail"], error["hint"])
+    return JobOutcome(raw["state"], "", "") if raw["state"] in FINISHED else None
 
 
 def _intrinsics(raw: dict[str, Any]) -> Intrinsics:

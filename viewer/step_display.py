@@ -1,8 +1,9 @@
-"""What one browser sees of one step of a job: numbers, camera, matches, pictures and charts.
+"""One step of a job in one browser: numbers, images, charts and 3D.
 
-Numbers follow a dragged slider at once (`show`). The rest comes when nothing else waits, one after the other (`go_on`):
-pictures and charts, the 3D, at last what the neighbouring steps will need. viser's page shows widgets as soon as they
-come; but a message that also has to do with the 3D waits for its next frame, so they go by messages of their own.
+The numbers follow a dragged slider at once (`show`). The rest is queued and done by `run_next` when the session has
+nothing else to do: images and charts, then the 3D, then the images of the neighbouring steps. viser's page shows
+widgets as soon as their message arrives, but holds back a message that also changes the 3D until its next frame; so
+both are sent in separate messages.
 """
 
 from __future__ import annotations
@@ -11,201 +12,118 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import cast
-
-import numpy as np
-from jaxtyping import UInt8
 
 from service.results import IterationRecord
-from viewer.charts import curves_html, stages_html, vectors_html
-from viewer.comparison_images import (
-    ColourBy,
-    Mode,
-    Overlay,
-    beside,
-    flicker_html,
-    flow,
-    match_colours,
-    overlaid,
-    reduced,
-)
+from viewer.charts import curves_html, stages_html
+from viewer.colours import match_colours
+from viewer.comparison_images import Mode, shrink
+from viewer.comparison_panel import ComparisonPanel, photo_of
 from viewer.controls import Controls
 from viewer.job_stream import JobStream
 from viewer.match_geometry import MatchView, matches_at_pose
-from viewer.playback import caption_html, flow_caption_html, record_html, small_html
+from viewer.panel_html import record_html, small_html
 from viewer.scene_3d import Scene3D
 from viewer.service_client import ServiceError
 
-_TEXTURE_PX = 512
-_KEPT_PICTURES = 4
-_APART_S = 0.02
-"""viser puts in one message what comes within a sixtieth of a second."""
+_FRUSTUM_IMAGE_PX = 512
+_MESSAGE_GAP_S = 0.02
+"""viser sends in one message what is set within 1/60 s."""
 
 
 class StepDisplay:
     """All methods are called from the session's thread."""
 
-    def __init__(self, panel: Controls, stage: Scene3D) -> None:
-        self.mode: Mode = "beside"
-        self._panel, self._stage = panel, stage
+    def __init__(self, controls: Controls, scene: Scene3D) -> None:
+        self._controls, self._scene = controls, scene
+        self._images = ComparisonPanel(controls)
         self._shown: tuple[str, int] | None = None
-        """Job and record that are shown."""
-        self._textured: tuple[str, int | None] | None = None
-        """Job, and of several photos the step, whose picture is in the camera that is shown."""
-        self._todo: list[tuple[float, Callable[[], None]]] = []
-        """What is still to be done for the step, and the earliest time for it."""
-        self._composed: dict[tuple[object, ...], UInt8[np.ndarray, "h w 3"]] = {}
-        """Pictures of this step and its neighbours, by what they show."""
+        """Ids of the job and record that are shown."""
+        self._frustum_image: tuple[str, int | None] | None = None
+        """Job, and of several photos the step, whose image is in the current frustum."""
+        self._queue: list[tuple[float, Callable[[], None]]] = []
+        """What remains to be done, each with its earliest time."""
 
     @property
-    def fresh(self) -> bool:
-        """Nothing of this job has been shown yet."""
+    def empty(self) -> bool:
+        """Whether no record of the job has been shown yet."""
         return self._shown is None
 
     @property
     def due_in_s(self) -> float | None:
-        """When `go_on` has something to do; None: all is done."""
-        return max(0.0, self._todo[0][0] - time.monotonic()) if self._todo else None
+        """Time until `run_next` may be called; None: nothing is queued."""
+        return max(0.0, self._queue[0][0] - time.monotonic()) if self._queue else None
 
-    def go_on(self) -> None:
-        """Do what is due next. Raises ServiceError, ValueError."""
-        self._todo.pop(0)[1]()
+    def run_next(self) -> None:
+        """Do the first thing in the queue. Raises ServiceError, ValueError."""
+        self._queue.pop(0)[1]()
 
     def clear(self) -> None:
-        self._shown = self._textured = None
-        self._todo = []
-        self._composed = {}
-        self._stage.clear_job()
+        """Show no job."""
+        self._shown = self._frustum_image = None
+        self._queue = []
+        self._images.clear()
+        self._scene.clear_job()
 
-    def show(self, feed: JobStream, index: int) -> None:
-        """Show a record; the rest follows with `go_on`."""
-        record, job = feed.records[index], feed.job
+    def set_mode(self, mode: Mode) -> None:
+        """Choose how photo and render are compared, from the next redraw on."""
+        self._images.mode = mode
+
+    def show(self, stream: JobStream, index: int) -> None:
+        """Show a record's numbers, and queue the rest if it is another record than before."""
+        record, job = stream.records[index], stream.job
         if job is None:
             return
-        self._panel.step.value = index
-        self._panel.numbers.content = record_html(record, job.truth)
-        self._panel.strip.content = stages_html(feed.records, index)
-        self._panel.flush()
-        if self._shown != (feed.id, index):
-            self._shown = feed.id, index
-            self.redraw(feed, index)
+        self._controls.step.value = index
+        self._controls.numbers.content = record_html(record, job.truth)
+        self._controls.stages.content = stages_html(stream.records, index)
+        self._controls.flush()
+        if self._shown != (stream.id, index):
+            self._shown = stream.id, index
+            self.redraw(stream, index)
 
-    def redraw(self, feed: JobStream, index: int) -> None:
-        """Let pictures, charts and 3D follow with `go_on`."""
-        nearby = [k for k in (index - 1, index + 1) if 0 <= k < len(feed.records)]
-        self._todo = [(0.0, partial(self._draw, feed, index))]
-        self._todo += [(0.0, partial(self._prepare, feed, feed.records[k])) for k in nearby]
+    def redraw(self, stream: JobStream, index: int) -> None:
+        """Queue images, charts and 3D of a record."""
+        neighbours = [k for k in (index - 1, index + 1) if 0 <= k < len(stream.records)]
+        self._queue = [(0.0, partial(self._draw_window, stream, index))]
+        self._queue += [(0.0, partial(self._prepare, stream, stream.records[k])) for k in neighbours]
 
-    def _draw(self, feed: JobStream, index: int) -> None:
-        """Bring pictures and charts up to the step."""
-        record, view = feed.records[index], None
+    def _draw_window(self, stream: JobStream, index: int) -> None:
+        record, view = stream.records[index], None
         try:
-            view = self._view(feed, record)
-            self._picture(feed, record, view)
-            self._panel.flush()
-            self._panel.vectors.content = flow_caption_html(view, self._colour_by) + vectors_html(view)
-            self._flow(feed, record, view)
+            view = _match_view(stream, record)
+            self._images.show_comparison(stream, record, view)
+            self._controls.flush()
+            self._images.show_match_vectors(stream, record, view)
         except (ServiceError, ValueError) as error:
-            self._panel.caption.content = small_html(f"There is no picture of this step: {error}")
-        truth = feed.job.truth if feed.job else None
-        self._panel.curves.content = curves_html(feed.records, truth, index)
-        self._panel.flush()
-        self._todo.insert(0, (time.monotonic() + _APART_S, partial(self._place, feed, record, view)))
+            self._controls.caption.content = small_html(f"There is no picture of this step: {error}")
+        truth = stream.job.truth if stream.job else None
+        self._controls.curves.content = curves_html(stream.records, truth, index)
+        self._controls.flush()
+        self._queue.insert(0, (time.monotonic() + _MESSAGE_GAP_S, partial(self._draw_3d, stream, record, view)))
 
-    def _place(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
-        """Bring the 3D up to the step."""
-        if feed.job is None:
+    def _draw_3d(self, stream: JobStream, record: IterationRecord, view: MatchView | None) -> None:
+        job = stream.job
+        if job is None:
             return
-        several = feed.job.photo_step is not None
-        picture, textured = None, (feed.id, record.index if several else None)
-        if self._textured != textured:
-            picture = _photo(feed, record)
-            if picture is None and several:
-                picture = feed.render(record.index, matched=False)
-        self._stage.show_current(feed.job.camera(record), None if picture is None else reduced(picture, _TEXTURE_PX))
-        self._textured = textured
-        weighed = (r.candidates for r in reversed(feed.records[: record.index + 1]) if r.candidates)
-        self._stage.show_candidates(next(weighed, None), feed.job.photo)
-        self._stage.show_matches(view, None if view is None else match_colours(view, self._colour_by))
+        several = job.photo_step is not None
+        image, frustum_image = None, (stream.id, record.index if several else None)
+        if self._frustum_image != frustum_image:  # sent once for all steps of a single photo
+            image = photo_of(stream, record)
+            if image is None and several:
+                image = stream.render(record.index, matched=False)
+        camera = job.camera(record)
+        self._scene.trajectory.show_current(camera, None if image is None else shrink(image, _FRUSTUM_IMAGE_PX))
+        self._frustum_image = frustum_image
+        scored = (r.candidates for r in reversed(stream.records[: record.index + 1]) if r.candidates)
+        self._scene.candidates.show(next(scored, None), job.photo)
+        colours = None if view is None else match_colours(view, self._images.colour_by)
+        self._scene.matches.show(view, colours)
 
-    def _prepare(self, feed: JobStream, record: IterationRecord) -> None:
-        """Have at hand the picture of a step."""
+    def _prepare(self, stream: JobStream, record: IterationRecord) -> None:
         with suppress(ServiceError, ValueError):
-            photo, view = _photo(feed, record), self._view(feed, record)
-            if photo is None:
-                feed.render(record.index, matched=False)
-            elif self.mode == "flicker":
-                self._render(feed, record, view)
-            else:
-                self._compared(feed, record, view, photo)
-
-    def _view(self, feed: JobStream, record: IterationRecord) -> MatchView | None:
-        """Return the match vectors as the step sees them."""
-        source = feed.matches(record.index)
-        return matches_at_pose(source, feed.job.camera(record), record.index) if source and feed.job else None
-
-    def _flow(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
-        """Draw the match vectors over the photo, or over what it should look like."""
-        self._panel.flow.visible = view is not None
-        if view is not None:
-            photo = _photo(feed, record)
-            ground = feed.render(record.index, matched=False) if photo is None else photo
-            self._panel.flow.image = flow(ground, view, match_colours(view, self._colour_by))
-
-    def _picture(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> None:
-        """Compose photo and render."""
-        panel, mode = self._panel, self.mode
-        panel.matches.visible = mode == "beside"
-        panel.weight.visible, panel.flicker.visible = mode == "blend", mode == "flicker"
-        panel.picture.visible = mode != "flicker"
-        photo = _photo(feed, record)
-        if photo is None:
-            step = feed.job.photo_step if feed.job else None
-            why = "the photo was deleted after the job" if step is None else f"only the photo of step {step} is kept"
-            panel.picture.image, panel.picture.visible = feed.render(record.index, matched=False), True
-            panel.caption.content = small_html(f"The render at this step's pose; {why}.")
-            panel.window.visible, panel.flicker.visible = True, False
-            return
-        if mode == "flicker":
-            panel.flicker.content = flicker_html(photo, self._render(feed, record, view))
-        else:
-            panel.picture.image = self._compared(feed, record, view, photo)
-        panel.caption.content = caption_html(mode, view if self._with_lines else None, self._colour_by)
-        panel.window.visible = True
-
-    def _compared(
-        self, feed: JobStream, record: IterationRecord, view: MatchView | None, photo: UInt8[np.ndarray, "h w 3"]
-    ) -> UInt8[np.ndarray, "a b 3"]:
-        """Return photo and render in one picture; the last few are kept."""
-        mode, by, weight = self.mode, self._colour_by, self._panel.weight.value
-        key = feed.id, feed.complete, record.index, mode, by, weight, self._with_lines
-        if key not in self._composed:
-            render = self._render(feed, record, view)
-            if mode == "beside":
-                lines = view if self._with_lines else None
-                picture = beside(photo, render, lines, None if lines is None else match_colours(lines, by))
-            else:
-                picture = overlaid(cast(Overlay, mode), photo, render, weight)
-            kept = list(self._composed.items())[1 - _KEPT_PICTURES :]
-            self._composed = dict([*kept, (key, picture)])
-        return self._composed[key]
-
-    def _render(self, feed: JobStream, record: IterationRecord, view: MatchView | None) -> UInt8[np.ndarray, "h w 3"]:
-        """Return what stands beside the photo."""
-        # Matches of this very step may refer to another view than its pose: then it is that view.
-        matched = self._with_lines and view is not None and view.carried_from is None
-        return feed.render(record.index, matched=matched)
-
-    @property
-    def _with_lines(self) -> bool:
-        return self.mode == "beside" and self._panel.matches.value
-
-    @property
-    def _colour_by(self) -> ColourBy:
-        return cast(ColourBy, self._panel.colour_by.value)
+            self._images.prepare(stream, record, _match_view(stream, record))
 
 
-def _photo(feed: JobStream, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the photo that a step is about; None: it isn't there (any more). Raises ServiceError, ValueError."""
-    of = feed.job.photo_step if feed.job else None
-    return feed.photo() if of in (None, record.index) else None
+def _match_view(stream: JobStream, record: IterationRecord) -> MatchView | None:
+    source = stream.matches(record.index)
+    return matches_at_pose(source, stream.job.camera(record), record.index) if source and stream.job else None

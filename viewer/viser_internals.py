@@ -1,4 +1,4 @@
-"""viser's private parts, all of them that are used, as they were in viser 1.1."""
+"""All uses of viser's private attributes, as they are in viser 1.1."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ log = logging.getLogger(__name__)
 
 
 def requested_path(server: viser.ViserServer, client_id: int) -> str:
-    """Return the path of a browser's websocket, which viser keeps private; "/" where it can't be told."""
+    """Return the path of a browser's WebSocket request; "/" if viser no longer exposes it."""
     try:
         return server._websock_server._live_connections[client_id].request.path  # type: ignore[union-attr]
     except (AttributeError, KeyError):
-        log.warning("viser does not tell the path of client %s; it is shown the newest job", client_id)
+        log.warning("no path is known of client %s; it is shown the newest job", client_id)
         return "/"
 
 
 def forbid_sharing(server: viser.ViserServer) -> None:
-    """Take away viser's handler by which any browser could open a public tunnel to this server.
+    """Remove viser's handler by which any browser could open a public tunnel to this server.
 
-    Raises RuntimeError if it isn't where it was: better no viewer than an open one.
+    Raises RuntimeError, after stopping the server, if the handler isn't found.
     """
     handlers = getattr(server._websock_server, "_incoming_handlers", {})
     if handlers.pop(_messages.ShareUrlRequest, None) is None:
@@ -31,5 +31,5 @@ def forbid_sharing(server: viser.ViserServer) -> None:
 
 
 def disconnect_all(server: viser.ViserServer) -> None:
-    """Close all connections: viser's own stop() leaves that to callbacks that it has just switched off."""
+    """Close all connections; viser's stop() leaves them to callbacks that it has already disabled."""
     server._websock_server.disconnect_all_clients()

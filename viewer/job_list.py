@@ -1,0 +1,71 @@
+"""The service's lists of jobs and of scenes, polled while a browser is connected."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+
+from viewer.service_client import JobSummary, ServiceClient, ServiceError
+
+log = logging.getLogger(__name__)
+
+_POLL_S = 0.5
+
+Listener = Callable[[], None]
+
+
+class JobList:
+    """Polls on one background thread, never in viser's pool of callbacks, which long requests would exhaust."""
+
+    def __init__(self, client: ServiceClient) -> None:
+        self.jobs: tuple[JobSummary, ...] | None = None
+        """Newest first; up to date while there are listeners; None before the first answer."""
+        self.scenes: tuple[str, ...] = ()
+        """Ids of the scenes in the service's memory."""
+        self._client = client
+        self._listeners: set[Listener] = set()
+        self._has_listeners = threading.Event()
+        self._closed = threading.Event()
+        self._lock = threading.Lock()
+
+    def start(self) -> None:
+        """Start the background thread."""
+        threading.Thread(target=self._poll, name="job-list", daemon=True).start()
+
+    def close(self) -> None:
+        """End the background thread at its next poll."""
+        self._closed.set()
+        self._has_listeners.set()
+
+    def listen(self, listener: Listener) -> None:
+        """Call `listener` on the background thread whenever one of the lists has changed, until `ignore`."""
+        with self._lock:
+            self._listeners.add(listener)
+        self._has_listeners.set()
+
+    def ignore(self, listener: Listener) -> None:
+        """Remove a listener; without listeners polling pauses."""
+        with self._lock:
+            self._listeners.discard(listener)
+            if not self._listeners:
+                self._has_listeners.clear()
+
+    def _poll(self) -> None:
+        logged = ""
+        while self._has_listeners.wait() and not self._closed.is_set():
+            try:
+                lists = tuple(self._client.jobs()), tuple(self._client.scenes())
+                logged = ""
+            except (ServiceError, ValueError, KeyError) as error:
+                if str(error) != logged:  # once, not at every poll
+                    logged = str(error)
+                    log.warning("list of jobs: %s", error)
+                lists = self.jobs, self.scenes
+            if lists != (self.jobs, self.scenes):
+                self.jobs, self.scenes = lists
+                with self._lock:
+                    listeners = tuple(self._listeners)
+                for listener in listeners:
+                    listener()
+            self._closed.wait(_POLL_S)

@@ -1,0 +1,194 @@
+"""Texts of the control panel as HTML: status, numbers, captions and legends. No viser, no HTTP."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from html import escape
+
+import numpy as np
+
+from service.results import IterationRecord
+from service.types import Pose
+from viewer.colours import (
+    CURRENT_COLOUR,
+    ERROR_COLOUR,
+    INITIAL_COLOUR,
+    INLIER_COLOUR,
+    OUTLIER_COLOUR,
+    PENDING_COLOUR,
+    RGB,
+    STATUS_COLOURS,
+    TRAINING_COLOUR,
+    TRUTH_COLOUR,
+    ColourBy,
+    outcome_colour,
+    score_colours,
+)
+from viewer.comparison_images import Mode
+from viewer.match_geometry import MatchView, pose_error
+from viewer.service_client import Job, JobOutcome, JobSummary
+
+
+def job_label(job: JobSummary) -> str:
+    """Return a job's line in the list of jobs; the id's first digits make it unique."""
+    started = datetime.fromisoformat(job.created).astimezone()
+    return f"{started:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"
+
+
+def headline_html(job: Job | None, records: int, error: str) -> str:
+    """Return status, reason and hint of a job, or its progress; instead, an error."""
+    if error:
+        return _block(_badge("no connection", ERROR_COLOUR), error)
+    if job is None:
+        return _block(_badge("no job", PENDING_COLOUR), "Drop a photo on the start page, or choose a job above.")
+    title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
+    link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>its result page</a>"
+    if job.outcome is None:
+        word = "queued" if not records else "running"
+        return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title, link=link)
+    outcome = job.outcome
+    return _block(
+        _badge(outcome.status.replace("_", " "), STATUS_COLOURS[outcome.status]),
+        _reason(outcome),
+        title,
+        outcome.hint,
+        link,
+    )
+
+
+def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
+    """Return a record's numbers as a table, with its errors where the true pose is given."""
+    error_deg, error_units = pose_error(record.pose, truth) if truth else (None, None)
+    rows = [
+        ("stage", escape(record.stage)),
+        ("after", f"{record.elapsed_s * 1000:.0f} ms"),
+        ("CPU time", f"{record.cpu_s * 1000:.0f} ms"),
+        ("matches", _or_dash(record.num_matches, "d")),
+        ("inliers", _or_dash(record.num_inliers, "d")),
+        ("loss", _or_dash(record.loss, ".4g")),
+        ("turned", _or_dash(record.step_deg, ".3g", "°")),
+        ("moved, units", _or_dash(record.step_units, ".3g")),
+    ]
+    if truth:
+        rows += [("turned off", _or_dash(error_deg, ".3g", "°")), ("away, units", _or_dash(error_units, ".3g"))]
+    cells = "".join(
+        f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
+        for name, value in rows
+    )
+    return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>")
+
+
+_CAPTIONS: dict[Mode, str] = {
+    "beside": "photo, and render at this step's pose",
+    "blend": "photo and render at this step's pose on top of one another",
+    "checker": "photo and render at this step's pose, in turns: edges should run on from tile to tile",
+    "difference": "of photo and render at this step's pose, doubled: black is agreement",
+    "flicker": "photo and render at this step's pose, one after the other: what jumps is off",
+}
+
+
+def caption_html(mode: Mode, view: MatchView | None, colour_by: ColourBy = "inlier") -> str:
+    """Return the caption of the comparison of photo and render."""
+    if view is None:
+        return _small(f"<b>{mode}</b>: {_CAPTIONS[mode]}")
+    if view.carried_from is None:
+        what = "photo, and the render that was matched"
+    else:
+        what = f"photo, and render at this step's pose with the matches of step {view.carried_from}"
+    return _small(f"<b>{mode}</b>: {what}; lines: {_colours_text(view, colour_by)}")
+
+
+def vectors_caption_html(view: MatchView | None, colour_by: ColourBy) -> str:
+    """Return the caption of the image of the match vectors."""
+    if view is None:
+        return ""
+    of = "" if view.carried_from is None else f" of step {view.carried_from}"
+    return _small(
+        f"matches{of}, each from where the render has it to where the photo has it: {_colours_text(view, colour_by)}"
+    )
+
+
+def _colours_text(view: MatchView, colour_by: ColourBy) -> str:
+    if colour_by == "residual":
+        known = view.residual_px[np.isfinite(view.residual_px)]
+        middle = f"; median {np.median(known):.2g} px" if len(known) else ""
+        return f"off by {_coloured('½ px', INLIER_COLOUR)} to {_coloured('50 px', OUTLIER_COLOUR)}{middle}"
+    inliers = int(view.inlier.sum())
+    outliers = len(view.inlier) - inliers
+    return f"{_coloured(f'{inliers} agree', INLIER_COLOUR)}, {_coloured(f'{outliers} do not', OUTLIER_COLOUR)}"
+
+
+def legend_html(outcome: JobOutcome | None, *, truth: bool) -> str:
+    """Return the legend of the cameras' colours in 3D."""
+    cameras = [("start", INITIAL_COLOUR), ("this step", CURRENT_COLOUR)]
+    if outcome:
+        cameras.append(("answer", outcome_colour(outcome)))
+    if truth:
+        cameras.append(("true", TRUTH_COLOUR))
+    cameras.append(("training", TRAINING_COLOUR))
+    named = " ".join(f"<span style='white-space:nowrap'>{_swatch(f'rgb{c}')}{name}</span>" for name, c in cameras)
+    ramp = ",".join(f"rgb{tuple(map(int, colour))}" for colour in score_colours(np.linspace(0, 1, 5)))
+    scores = f"{_swatch(f'linear-gradient(90deg,{ramp})', '2.4em')}candidates, worst to best score"
+    return _small(f"cameras: {named}<br>{scores}")
+
+
+def _swatch(ground: str, width: str = ".7em") -> str:
+    return (
+        f"<i style='display:inline-block;width:{width};height:.7em;border-radius:2px;margin:0 .3em;"
+        f"background:{ground}'></i>"
+    )
+
+
+def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:
+    """Return how many of a scene's splats the browser draws; `drawn` 0: the service renders all of them."""
+    of = f"{drawn:,} splats" if drawn == total else f"{drawn:,} of {total:,} splats, the most important ones"
+    splats = f"{of}, without view-dependent colour" if drawn else f"{total:,} Gaussians, drawn by the service"
+    return _small(f"{escape(name)}: {splats}; {cameras} training cameras")
+
+
+def _reason(outcome: JobOutcome) -> str:
+    words = [outcome.reason.replace("_", " ")]
+    if outcome.score is not None:
+        words.append(f"score {outcome.score:.2f}")
+    if outcome.inliers:  # tracking finds poses without matches
+        words.append(f"{outcome.inliers} inliers")
+    return ", ".join(w for w in words if w)
+
+
+def _block(badge: str, text: str, title: str = "", hint: str = "", link: str = "") -> str:
+    parts = [f"{badge} <span>{escape(text)}</span>"]
+    if title:
+        parts.append(f"<div style='opacity:.7;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}; {link}</div>")
+    if hint:
+        parts.append(f"<div style='margin-top:.3em'>{escape(hint)}</div>")
+    return _padded("".join(parts))
+
+
+def _badge(text: str, colour: RGB) -> str:
+    # Black text on a light colour, white on a dark one.
+    ink = "#000" if 0.3 * colour[0] + 0.6 * colour[1] + 0.1 * colour[2] > 120 else "#fff"
+    return (
+        f"<span style='background:rgb{colour};color:{ink};border-radius:.3em;padding:.1em .6em;"
+        f"font-weight:600'>{escape(text)}</span>"
+    )
+
+
+def small_html(text: str) -> str:
+    """Return a plain text as a line in small type."""
+    return _small(escape(text))
+
+
+def _small(html: str) -> str:
+    return f"<div style='padding:0 .6em .2em;font-size:.8em;opacity:.75'>{html}</div>"
+
+
+def _coloured(text: str, colour: RGB) -> str:
+    return f"<b style='color:rgb{colour}'>{text}</b>"
+
+
+def _padded(inner: str) -> str:
+    return f"<div style='padding:.2em .6em;font-size:.9em;line-height:1.5'>{inner}</div>"
+
+
+def _or_dash(value: float | int | None, spec: str, unit: str = "") -> str:
+    return "–" if value is None else f"{value:{spec}}{unit}"

@@ -1,0 +1,27 @@
+"""What the sessions of all browsers share."""
+
+from __future__ import annotations
+
+from viewer.job_list import JobList
+from viewer.job_stream import JobStreams
+from viewer.scene_cache import SceneCache
+from viewer.service_client import ServiceClient
+
+
+class SharedData:
+    """The service's client, and everything that is requested once for all browsers."""
+
+    def __init__(self, client: ServiceClient) -> None:
+        self.client = client
+        self.lists = JobList(client)
+        self.streams = JobStreams(client)
+        self.scenes = SceneCache(client)
+
+    def start(self) -> None:
+        """Start polling the lists of jobs and scenes."""
+        self.lists.start()
+
+    def close(self) -> None:
+        """Stop all background threads."""
+        self.lists.close()
+        self.streams.close()
