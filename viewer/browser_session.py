@@ -121,13 +121,10 @@ class BrowserSession:
         self._client.scene.on_click()(
             lambda event: post(partial(self._job.click, event.ray_origin, event.ray_direction))
         )
-        for name, hotkey, button in (
-            ("Next step", "N", NEXT),
-            ("Previous step", "P", PREVIOUS),
-            ("Play or pause", "space", PLAY),
-        ):
-            command = self._client.gui.add_command(name, hotkey=hotkey)
-            command.on_trigger(lambda _, button=button: post(partial(self._job.press, button)))
+        command = self._client.gui.add_command
+        command("Next step", hotkey="N").on_trigger(lambda _: post(partial(self._job.press, NEXT)))
+        command("Previous step", hotkey="P").on_trigger(lambda _: post(partial(self._job.press, PREVIOUS)))
+        command("Play or pause", hotkey="space").on_trigger(lambda _: post(partial(self._job.press, PLAY)))
 
     def _lists_changed(self) -> None:
         self._queue.post(self._selection.sync)
