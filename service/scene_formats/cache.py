@@ -1,9 +1,9 @@
-"""A scene in the form it has in memory, as files that are mapped: opening one takes milliseconds, whatever its size.
+"""Cache of loaded scenes: their arrays as memory-mapped files, so that opening one takes milliseconds at any size.
 
     CACHE/scenes/KEY/  means.npy quats.npy scales.npy opacities.npy sh.npy  scene.json (all else)
 
-The key is made of the names, sizes and times of change of the scene's own files, so that nothing of them is read.
-Files written by `numpy.save` and opened without pickle; a damaged or older one is made anew.
+The key is a hash of the names, sizes and modification times of the scene's files, which are not read for it. Arrays
+are written by `numpy.save` and opened without pickle; a damaged or outdated entry is rebuilt.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 
 def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
-    """Read a scene folder or file as `load_scene` does, or map what an earlier call has left. Raises SceneError."""
+    """Return the scene of a folder or file as `load_scene` does, mapped from the cache; fills it. Raises SceneError."""
     if not path.exists():
         return load_scene(path)
     folder = cache_dir / "scenes" / _key(path)
@@ -38,21 +38,22 @@ def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
     except FileNotFoundError:
         pass
     except (OSError, ValueError, TypeError, KeyError) as error:
-        _log.warning("%s is made anew: %s", folder, error)
+        _log.warning("%s is rebuilt: %s", folder, error)
         shutil.rmtree(folder, ignore_errors=True)
     scene = load_scene(path)
     try:
         _write(folder, scene)
         return _opened(folder)
-    except OSError as error:  # a full disk: the scene is there all the same
-        _log.warning("the scene is not kept for the next start: %s", error)
+    except OSError as error:  # a full disk: the scene is in memory all the same
+        _log.warning("the scene is not cached: %s", error)
     return scene
 
 
 def release(scene: GaussianScene) -> None:
-    """Give the memory of a mapped scene's arrays back; what is touched again is read from disk again."""
+    """Return the memory of a mapped scene's arrays to the system; pages that are used again are read from disk."""
     for name in _ARRAYS:
         array: Any = getattr(scene, name)
+        # Through the views (slices, reshapes) down to the mapping itself.
         while array is not None and not isinstance(array, np.memmap):
             array = array.base
         if array is not None and hasattr(mmap, "MADV_DONTNEED"):
@@ -60,7 +61,7 @@ def release(scene: GaussianScene) -> None:
 
 
 def _key(path: Path) -> str:
-    """Of everything that `load_scene` may read."""
+    """Hash the stamps of all files that `load_scene` may read."""
     files = [path] if path.is_file() else [*path.iterdir(), *(path / "sparse" / "0").glob("*")]
     stamps = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(files) if f.is_file()]
     return hashlib.sha256(repr((_VERSION, str(path.resolve()), stamps)).encode()).hexdigest()[:32]
@@ -77,12 +78,14 @@ def _opened(folder: Path) -> GaussianScene:
 
 
 def _write(folder: Path, scene: GaussianScene) -> None:
+    # Written beside its place and renamed: another process sees all of it or nothing.
     draft = folder.with_name(f"{folder.name}.{os.getpid()}")
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     try:
         for name in _ARRAYS:
             np.save(draft / f"{name}.npy", getattr(scene, name), allow_pickle=False)
+        # The anchor holds an array, which `asdict` would copy but JSON can't write.
         info = asdict(replace(scene.info, geo_anchor=None))
         anchor = scene.info.geo_anchor
         info["geo_anchor"] = anchor and asdict(anchor) | {"enu_from_world": anchor.enu_from_world.tolist()}

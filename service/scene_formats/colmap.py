@@ -1,8 +1,8 @@
-"""Training cameras from a COLMAP model (`sparse/0`), binary or text.
+"""Read training cameras from a COLMAP model (`sparse/0`), binary or text.
 
-COLMAP's axes, pixel centres and quaternion order are ours; it stores camera_from_world. Of a distorted
-camera the pinhole part is kept: 3DGS trains on undistorted photos, and views of the scene are rendered by a
-pinhole anyway.
+COLMAP has the axes (x right, y down, z forward), pixel centres at half integers and the quaternion order wxyz that are
+used here; it stores camera_from_world. Of a distorted camera the pinhole part is kept: 3DGS trains on undistorted
+photos, and views of the scene are rendered by a pinhole anyway. Formats: https://colmap.github.io/format.html
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class _Image:
 
 
 def read_cameras(folder: Path, keep: Callable[[str], bool]) -> tuple[NamedCamera, ...]:
-    """Return the cameras of the photos whose names are to be kept, by name. Raises CorruptScene."""
+    """Return the cameras of the photos for whose names `keep` is true, sorted by name. Raises CorruptScene."""
     binary = (folder / "images.bin").is_file()
     suffix = "bin" if binary else "txt"
     paths = [folder / f"{name}.{suffix}" for name in ("cameras", "images")]
@@ -58,7 +58,7 @@ def read_cameras(folder: Path, keep: Callable[[str], bool]) -> tuple[NamedCamera
 
 
 def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
-    data, at = path.read_bytes(), 8
+    data, at = path.read_bytes(), 8  # behind the count
     result = {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
@@ -69,12 +69,13 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
 
 
 def _binary_images(path: Path) -> list[_Image]:
-    data, at = path.read_bytes(), 8
+    data, at = path.read_bytes(), 8  # behind the count
     result = []
     for _ in range(struct.unpack_from("<Q", data)[0]):
         values = struct.unpack_from("<i7di", data, at)
         end = data.index(b"\0", at + 64)
         name = data[at + 64 : end].decode("utf-8", "replace")
+        # Each image's 2D points follow (x, y, id of the 3D point: 24 bytes); they are skipped.
         (points,) = struct.unpack_from("<Q", data, end + 1)
         at = end + 9 + 24 * points
         if at > len(data):
@@ -93,12 +94,12 @@ def _text_cameras(path: Path) -> dict[int, Intrinsics]:
 
 
 def _text_images(path: Path) -> list[_Image]:
-    """Two lines an image; the second one, its points, may be empty."""
+    """Parse images.txt: two lines an image; the second one, its points, may be empty."""
     lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
     result = []
     for line in lines[::2]:
         if line.strip():
-            words = line.split(maxsplit=9)
+            words = line.split(maxsplit=9)  # a file name may contain spaces
             pose = tuple(float(word) for word in words[1:8])
             result.append(_Image(words[9].strip(), int(words[8]), pose))
     return result
@@ -115,6 +116,7 @@ def _camera(image: _Image, intrinsics: Intrinsics) -> NamedCamera:
     quat, translation = np.array(image.quat_translation[:4]), np.array(image.quat_translation[4:])
     if not np.linalg.norm(quat) > 1e-9:
         raise ValueError(f"the quaternion of '{image.name}' has length zero")
+    # The inverse of (R, t) is (R^T, -R^T t).
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = rotation_from_quat(quat).T
     world_from_camera[:3, 3] = -world_from_camera[:3, :3] @ translation

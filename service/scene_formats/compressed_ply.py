@@ -1,7 +1,7 @@
-"""PlayCanvas' compressed .ply: chunks of 256 Gaussians with bounds, four packed uint32 each, SH as bytes.
+"""Read PlayCanvas' compressed .ply: chunks of 256 Gaussians with bounds, four packed uint32 each, SH as bytes.
 
 Position, scale: 11 + 10 + 11 bits between the chunk's bounds (scales as logarithms); colour: 4 x 8 bits, the last is
-the opacity; rotation: 2 bits say which component is the largest, 3 x 10 bits are the others in +-1/sqrt(2).
+the opacity; rotation: 2 bits with the index of the largest component, 3 x 10 bits for the others in +-1/sqrt(2).
 
 Our own decoder: gsply's checks no bounds, and runs on numba's default thread pool, which is documented as not safe
 for concurrent callers. A file that gsply wrote is the golden one in the tests.
@@ -29,12 +29,12 @@ SUFFIXES = (".ply",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:
-    """Tell by the chunks in the header."""
+    """Whether it is a PLY with chunks in its header."""
     return head.startswith(b"ply") and b"\nelement chunk " in head
 
 
 def read(path: Path) -> RawGaussians:
-    """Raises SceneError before anything is allocated."""
+    """Return the decoded Gaussians. Raises SceneError, for a wrong layout before anything is allocated."""
     header = read_header(path)
     _check_layout(header, path)
     chunks = element_records(path, header, "chunk")
@@ -81,7 +81,7 @@ def _check_layout(header: PlyHeader, path: Path) -> None:
 
 
 def _unpacked(packed: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float32[np.ndarray, "n c"]:
-    """Split into fields of the given widths, the first in the highest bits, each scaled to 0..1."""
+    """Split integers into fields of the given widths in bits, the first in the highest bits, each scaled to 0..1."""
     shifts = np.uint32(32) - np.cumsum(bits).astype(np.uint32)
     masks = (np.uint32(1) << np.array(bits, np.uint32)) - np.uint32(1)
     return ((packed[:, None] >> shifts) & masks).astype(np.float32) / masks.astype(np.float32)
@@ -90,25 +90,28 @@ def _unpacked(packed: UInt32[np.ndarray, "n"], bits: tuple[int, ...]) -> Float32
 def _between(
     share: Float32[np.ndarray, "n 3"], chunks: np.ndarray, of_vertex: np.ndarray, names: tuple[str, str, str]
 ) -> Float32[np.ndarray, "n 3"]:
-    """Interpolate between the bounds of each Gaussian's chunk."""
+    """Interpolate, by `share` in 0..1, between the bounds of each Gaussian's chunk."""
     low = np.stack([chunks[f"min_{name}"] for name in names], 1).astype(np.float32)[of_vertex]
     high = np.stack([chunks[f"max_{name}"] for name in names], 1).astype(np.float32)[of_vertex]
     return low + share * (high - low)
 
 
 def _quaternions(packed: UInt32[np.ndarray, "n"]) -> Float32[np.ndarray, "n 4"]:
+    """Decode the "smallest three" of unit quaternions (wxyz): the largest component follows from the others."""
     largest = (packed >> np.uint32(30)).astype(np.intp)
     others = (_unpacked(packed << np.uint32(2), (10, 10, 10)) - np.float32(0.5)) * np.float32(np.sqrt(2))
     rows = np.arange(len(packed))[:, None]
+    # The three stored components go to the columns other than the largest one's, in order.
     columns = np.arange(3) + (np.arange(3) >= largest[:, None])
     quats = np.empty((len(packed), 4), np.float32)
     quats[rows, columns] = others
+    # Positive: q and -q are the same rotation. Rounding may bring the sum of squares above 1.
     quats[rows[:, 0], largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(1)))
     return quats
 
 
 def _rest(path: Path, header: PlyHeader) -> Float32[np.ndarray, "n k 3"]:
-    """Bytes 1..254 stand for the middle of one of 256 steps over -4..4, 0 and 255 for its ends."""
+    """Decode the SH of degree 1 to 3: bytes 1..254 are the middles of 256 steps over -4..4, 0 and 255 its ends."""
     records = element_records(path, header, "sh")
     names = [f"f_rest_{i}" for i in range(len(records.dtype.names or ()))]
     if set(names) != set(records.dtype.names or ()):

@@ -1,4 +1,4 @@
-"""Which scenes lie at a path, without reading them."""
+"""Find the scenes at a path by file names, without reading them."""
 
 from __future__ import annotations
 
@@ -23,5 +23,5 @@ def find_scenes(path: Path) -> list[Path]:
 
 
 def _is_scene(folder: Path) -> bool:
-    """A broken scene is one, too: it shall be refused by name, not overlooked."""
+    """Whether a folder has a manifest or a scene file; a broken scene counts: it is refused by name, not overlooked."""
     return (folder / MANIFEST).is_file() or any(is_scene_file(p) for p in folder.iterdir())

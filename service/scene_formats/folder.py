@@ -32,13 +32,13 @@ def load_scene(
     cameras: bool = True,
     training: Sequence[NamedCamera] | None = None,
 ) -> GaussianScene:
-    """Read a scene folder, or a bare scene file. Raises SceneError.
+    """Read a scene folder, or a bare scene file, into the world frame. Raises SceneError.
 
+    The Gaussians and cameras of the folder are checked and moved by the manifest's `world_from_scene`.
     `without_photos` are names of photos whose cameras are not even read (a bench's queries); see `same_photo`.
     With `cameras=False` nothing is taken from the training cameras but the size of their photos. `training` are
-    cameras in the scene file's frame in the place of those that the folder has.
+    cameras in the scene file's frame that replace those of the folder.
     """
-    path = Path(path)
     if not path.exists():
         raise SceneNotFound("there is no such file or folder.", where=str(path))
     manifest = read_manifest(path) if path.is_dir() else Manifest()
@@ -49,6 +49,7 @@ def load_scene(
     def keep(name: str) -> bool:
         return not any(same_photo(name, photo) for photo in without_photos)
 
+    # A bare file has neither manifest nor cameras: what lies beside it may belong to another scene.
     found = _training(path, manifest, keep) if path.is_dir() and training is None else _Training(tuple(training or ()))
     size = manifest.training_size or _median_size(found.cameras)
     used = found.cameras if cameras else ()
@@ -56,9 +57,10 @@ def load_scene(
     if manifest.world_from_scene is not None:
         raw = moved_gaussians(raw, manifest.world_from_scene)
         used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
+    name = path.resolve().name if path.is_dir() else path.stem  # resolved: "." has no name
     info = SceneInfo(
-        id=path.resolve().name if path.is_dir() else path.stem,
-        name=manifest.name or (path.resolve().name if path.is_dir() else path.stem),
+        id=name,
+        name=manifest.name or name,
         sha256=_digest(file, path, used, (found.background, size, focal_px)),
         format=reader.__name__.rsplit(".", 1)[-1],
         background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
@@ -90,14 +92,14 @@ def _parts(name: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Training:
-    """What a folder's camera files say, in the scene file's frame."""
+    """Cameras and background of a folder's camera files, in the scene file's frame."""
 
     cameras: tuple[NamedCamera, ...] = ()
     background: tuple[float, float, float] | None = None
 
 
 def _training(folder: Path, manifest: Manifest, keep: Callable[[str], bool]) -> _Training:
-    """transforms*.json wins over sparse/0: where both are, it was made from the other for this scene."""
+    """Read the training cameras; transforms*.json before sparse/0, from which it was converted where both exist."""
     transforms = transforms_path(folder)
     if transforms is not None:
         file = TransformsFile.open(transforms)
@@ -109,7 +111,7 @@ def _training(folder: Path, manifest: Manifest, keep: Callable[[str], bool]) -> 
 
 
 def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
-    """Return the scene file and its reader. Raises SceneNotFound, UnsupportedFormat, CorruptScene."""
+    """Find the scene file and its reader. Raises SceneNotFound, UnsupportedFormat, CorruptScene."""
     if path.is_file():
         candidates = [path]
     elif manifest.file:
@@ -126,6 +128,7 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
             where=str(path),
             hint=f'Name one in {MANIFEST}: {{"file": "{candidates[0].name}"}}.',
         )
+    # Formats are recognized by their first bytes: the suffix .ply stands for two.
     with candidates[0].open("rb") as file:
         head = file.read(_HEAD_BYTES)
     if not head:
@@ -140,6 +143,7 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
 
 
 def _median_size(cameras: tuple[NamedCamera, ...]) -> tuple[int, int] | None:
+    """Return the median (width, height) of the photos: a few of another size must not count."""
     if not cameras:
         return None
     sizes = [(c.camera.intrinsics.width, c.camera.intrinsics.height) for c in cameras]
@@ -147,7 +151,7 @@ def _median_size(cameras: tuple[NamedCamera, ...]) -> tuple[int, int] | None:
 
 
 def _training_focal_px(cameras: tuple[NamedCamera, ...], size: tuple[int, int] | None) -> float | None:
-    """The median focal length, at the size of training if the camera file is of larger photos."""
+    """Return the median focal length in pixels, scaled to the size of training if the cameras are of larger photos."""
     if not cameras:
         return None
     each = [c.camera.intrinsics for c in cameras]
@@ -159,7 +163,7 @@ def _moved(camera: NamedCamera, world_from_scene: np.ndarray) -> NamedCamera:
 
 
 def _digest(file: Path, path: Path, cameras: tuple[NamedCamera, ...], *facts: object) -> str:
-    """sha256 of everything that a render or an index of the scene depends on."""
+    """Return the sha256 of everything that a render or an index of the scene depends on."""
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256")
     if (path / MANIFEST).is_file():

@@ -1,4 +1,4 @@
-"""The readers of scene files: which there are, and which suffixes their files have."""
+"""The registry of scene formats, and what follows from it: suffixes, and the reader of a file."""
 
 from __future__ import annotations
 

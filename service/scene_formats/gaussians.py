@@ -1,4 +1,4 @@
-"""What a scene file holds, and the checks that every format shares."""
+"""The content of a scene file, and the checks and conversions that all formats share."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from service.errors import CorruptScene
 MAX_GAUSSIANS = 20_000_000
 """More than any published scene; with SH degree 3 they would fill 5 GB."""
 MAX_COORDINATE = 1e9
-"""Scene units. Squares of larger numbers leave the range in which float32 renderers work."""
+"""Scene units. Squares of larger numbers exceed the range of float32 renderers."""
 SH_C0 = 0.28209479177387814
 """The constant basis function: 1 / (2 sqrt(pi))."""
 
 
 @dataclass(frozen=True, slots=True)
 class RawGaussians:
-    """A file's Gaussians with activated values, in the file's own frame, not checked yet."""
+    """A file's Gaussians with activated values (scales, not logarithms), in the file's own frame, not checked yet."""
 
     means: Float32[np.ndarray, "n 3"]
     quats: Float32[np.ndarray, "n 4"]
@@ -29,22 +29,22 @@ class RawGaussians:
     opacities: Float32[np.ndarray, "n"]
     sh: Float32[np.ndarray, "n k 3"]
     render_mode: str | None = None
-    """What the file says of how it was trained: default, antialiased, or a mode that we don't know."""
+    """How the scene was trained, if the file has it: default, antialiased, or a mode that is not supported."""
 
 
 def require_count(count: int, where: str) -> None:
     """Raise CorruptScene unless a file may hold `count` Gaussians; call it before anything is allocated."""
     if count <= 0:
-        raise CorruptScene(f"the scene is empty: it says that it has {count} Gaussians.", where=where)
+        raise CorruptScene(f"the scene is empty: it has {count} Gaussians by its header.", where=where)
     if count > MAX_GAUSSIANS:
         raise CorruptScene(f"{count} Gaussians; the limit is {MAX_GAUSSIANS}.", where=where)
 
 
 def checked(raw: RawGaussians, where: str) -> RawGaussians:
-    """Return the Gaussians with unit quaternions. Raises CorruptScene at the first bad one.
+    """Check the Gaussians and normalize their quaternions. Raises CorruptScene with the first bad one.
 
-    Strict on purpose: one NaN spoils every pixel that it touches, and silently dropping Gaussians would
-    hide a broken export.
+    Strict on purpose: one NaN makes every pixel that it reaches NaN, and dropping Gaussians silently would hide a
+    broken export.
     """
     for name in ("means", "scales", "opacities", "sh", "quats"):
         values = getattr(raw, name)
@@ -52,13 +52,14 @@ def checked(raw: RawGaussians, where: str) -> RawGaussians:
     _require_none((np.abs(raw.means) > MAX_COORDINATE).any(1), f"means beyond {MAX_COORDINATE:g} units", where)
     _require_none((raw.scales > MAX_COORDINATE).any(1), f"scales beyond {MAX_COORDINATE:g} units", where)
     _require_none((raw.scales < 0).any(1), "negative scales", where)
+    # float64: squares of tiny components would vanish in float32.
     lengths = np.linalg.norm(raw.quats.astype(np.float64), axis=1)
     _require_none(lengths < 1e-12, "quaternions of length zero", where)
     return replace(raw, quats=(raw.quats / lengths[:, None]).astype(np.float32))
 
 
 def _require_none(bad: Any, what: str, where: str) -> None:
-    """`bad` is one bool a Gaussian; numpy's stubs don't know."""
+    """Raise CorruptScene if any Gaussian is bad; `bad` has one bool each, which numpy's stubs don't express."""
     count = int(np.count_nonzero(bad))
     if count:
         raise CorruptScene(

@@ -1,4 +1,4 @@
-"""The optional `scene.json` of a scene folder: what a scene file cannot say of itself.
+"""The optional `scene.json` of a scene folder: facts that a scene file has no field for.
 
     {"name": "Studio", "file": "scene.ply", "convention": "opengl", "up": [0, 0, 1], "metres_per_unit": 0.5,
      "world_from_scene": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
@@ -6,7 +6,7 @@
      "geo_anchor": {"latitude": 47.3, "longitude": 8.5, "height": 450.0,
                     "enu_from_world": [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [0, 0, 0.5, 0], [0, 0, 0, 1]]}}
 
-Every key may be left out; an unknown one is an error, because a misspelt key would be ignored without a word.
+Every key may be left out; an unknown one is an error: a misspelt key would be ignored silently.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Manifest:
     up: tuple[float, float, float] | None = None
     """In the world frame, that is after `world_from_scene`; unit length."""
     world_from_scene: Float64[np.ndarray, "4 4"] | None = None
-    """Turns, shifts and scales evenly the Gaussians and the training cameras."""
+    """Similarity (rotation, translation, one scale) that is applied to the Gaussians and the training cameras."""
     metres_per_unit: float | None = None
     """Of the world frame."""
     background: tuple[float, float, float] | None = None
@@ -62,7 +62,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Return the object in a file of bounded size. Raises CorruptScene."""
+    """Parse a JSON file of bounded size that holds an object. Raises CorruptScene."""
     if path.stat().st_size > MAX_JSON_BYTES:
         raise CorruptScene(f"larger than {MAX_JSON_BYTES} bytes.", where=path.name)
     try:
@@ -70,7 +70,7 @@ def read_json(path: Path) -> dict[str, Any]:
         data = json.loads(text)
         if "\\ud" in text.lower():  # half of a surrogate pair is no text that could be sent or stored
             json.dumps(data, ensure_ascii=False).encode()
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # nested deeper than Python's stack
         raise CorruptScene(f"not JSON: {str(error)[:200]}.", where=path.name) from None
     if not isinstance(data, dict):
         raise CorruptScene("must be a JSON object.", where=path.name)
@@ -80,7 +80,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def numbers(
     value: Any, shape: tuple[int, ...], where: str, error: type[SceneError] = CorruptScene
 ) -> Float64[np.ndarray, "..."]:
-    """Return finite numbers in the given shape from nested lists; raises `error`."""
+    """Return nested lists of finite numbers as an array of the given shape; raises `error` for anything else."""
     try:
         result = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -131,12 +131,13 @@ def _direction(key: str, value: Any) -> tuple[float, float, float]:
 
 def _similarity(key: str, value: Any) -> Float64[np.ndarray, "4 4"]:
     matrix = numbers(value, (4, 4), f"{MANIFEST}: {key}")
+    # A similarity has A A^T = s^2 I; a negative determinant would mirror.
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     gram = matrix[:3, :3] @ matrix[:3, :3].T
     # 1e-4: matrices printed with 5 digits pass.
     if not 1e-6 < scale < 1e6 or np.abs(gram / scale**2 - np.eye(3)).max() > 1e-4:
         raise CorruptScene(
-            "must turn, shift and scale evenly: no mirroring, no shear, one scale in 1e-6..1e6.",
+            "must rotate, translate and scale uniformly: no mirroring, no shear, one scale in 1e-6..1e6.",
             where=f"{MANIFEST}: {key}",
         )
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
@@ -171,7 +172,7 @@ def _geo_anchor(key: str, value: Any) -> GeoAnchor:
 
 
 def require_render_mode(mode: Any, where: str) -> Literal["default", "antialiased"]:
-    """Return the mode if we can render it. Raises UnsupportedFormat, which names it."""
+    """Return the render mode if it is supported. Raises UnsupportedFormat, which names it."""
     if mode == "default" or mode == "antialiased":
         return mode
     raise UnsupportedFormat(

@@ -1,8 +1,8 @@
-"""Training cameras from `transforms*.json` of nerfstudio and Blender (NeRF-Synthetic).
+"""Read training cameras from `transforms*.json` of nerfstudio and Blender (NeRF-Synthetic).
 
-Their camera axes are OpenGL's (+y up, -z forward) unless the manifest says opencv. Intrinsics stand in the
-frame or in the whole file; Blender's files give `camera_angle_x` only. Distortion is left out, as in
-`colmap`.
+Their camera axes are OpenGL's (+y up, -z forward) unless the manifest has "convention": "opencv". Intrinsics are given
+for a frame or for the whole file; Blender's files have only `camera_angle_x`, the horizontal field of view in radians.
+Distortion is left out, as in `colmap`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp")
 
 @dataclass(frozen=True, slots=True)
 class TransformsFile:
-    """A file whose frames are looked at one by one: one that nobody asks for can't do harm."""
+    """A parsed file. A frame is checked when its camera is requested: a broken one that is not used is no error."""
 
     path: Path
     data: dict[str, Any]
@@ -35,7 +35,7 @@ class TransformsFile:
 
     @classmethod
     def open(cls, path: Path) -> TransformsFile:
-        """Raises CorruptScene."""
+        """Parse the file and index its frames by photo. Raises CorruptScene."""
         data = read_json(path)
         frames = data.get("frames")
         if not isinstance(frames, list):
@@ -58,7 +58,7 @@ class TransformsFile:
         return [normalized(n) for n in names]
 
     def training_photos(self) -> list[str]:
-        """Photos in `train_filenames`; without that list, all but those of the other lists."""
+        """Return the photos in `train_filenames`; without that list, all but those of the other lists."""
         listed = self.split("train")
         if listed is not None:
             return [name for name in self.frames if name in set(listed)]
@@ -66,17 +66,19 @@ class TransformsFile:
         return [name for name in self.frames if name not in others]
 
     def background(self) -> tuple[float, float, float] | None:
+        """Return the background colour (0..1) that the scene was trained with, if the file has one."""
         value = self.data.get("background")
         return None if value is None else colour(f"{self.path.name}: background", value)
 
     def camera(self, photo: str, manifest: Manifest) -> NamedCamera:
-        """Raises CorruptScene if the frame is incomplete or broken."""
+        """Return a photo's camera, in the scene file's frame and OpenCV axes. Raises CorruptScene."""
         frame = self.frames[photo]
         where = f"{self.path.name}, frame '{photo[:100]}'"
         matrix = numbers(frame.get("transform_matrix"), (4, 4), f"{where}: transform_matrix")
         if manifest.convention == "opengl":
             matrix = matrix @ OPENCV_FROM_OPENGL
         try:
+            # A frame's own values take precedence over the file's.
             intrinsics = self._intrinsics({**self.data, **frame}, photo, manifest, where)
             return NamedCamera(photo, Camera(intrinsics, Pose(matrix)))
         except (InvalidIntrinsics, InvalidPrior) as error:
@@ -114,8 +116,8 @@ class TransformsFile:
         )
 
     def photo_file(self, photo: str) -> Path | None:
-        """Return the photo if it is there, within the folder."""
-        folder = self.path.parent.resolve()
+        """Return the path of the photo if it exists within the folder."""
+        folder = self.path.parent.resolve()  # a path out of the folder, or a link, must not be followed
         try:
             files = [(folder / (photo + suffix)).resolve() for suffix in _SUFFIXES]
             return next((f for f in files if f.is_relative_to(folder) and f.is_file()), None)
@@ -124,7 +126,7 @@ class TransformsFile:
 
 
 def transforms_path(folder: Path) -> Path | None:
-    """Return the file that lists the training cameras: transforms_train.json before transforms.json."""
+    """Find the file with the training cameras: transforms_train.json, then transforms.json, then any other."""
     for name in ("transforms_train.json", "transforms.json"):
         if (folder / name).is_file():
             return folder / name

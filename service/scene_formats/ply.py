@@ -1,4 +1,4 @@
-"""The .ply of 3DGS trainers, read by property name: any order, any number type, with normals or without."""
+"""Read the .ply of 3DGS trainers (Inria's layout) by property name: any order, any number type, normals or none."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ SUFFIXES = (".ply",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:
-    """Any PLY without the chunks of the compressed kind."""
+    """Whether it is a PLY without the chunks of the compressed kind."""
     return head.startswith(b"ply") and b"\nelement chunk " not in head
 
 
 def read(path: Path) -> RawGaussians:
-    """Scales are stored as logarithms, opacities as logits, f_rest channel by channel."""
+    """Return the activated Gaussians; stored are logarithms of scales, logits of opacities, f_rest channel by channel.
+
+    Raises UnsupportedFormat, CorruptScene.
+    """
     header = read_header(path)
     vertex = header.element("vertex")
     if vertex is None or vertex.dtype is None:
@@ -42,6 +45,7 @@ def read(path: Path) -> RawGaussians:
             for name, columns in _COLUMNS.items():
                 for i, column in enumerate(columns):
                     values[name][place, i] = records[column]
+            # f_rest has all of red, then green, then blue; the renderers read coefficient by coefficient.
             for channel in range(3):
                 sh[place, 0, channel] = records[f"f_dc_{channel}"]
                 for k in range(1, sh.shape[1]):
@@ -58,7 +62,7 @@ def read(path: Path) -> RawGaussians:
 
 
 def _sh_degree(names: tuple[str, ...], path: Path) -> int:
-    """Check the property names and return the degree that they amount to."""
+    """Check the property names and return the degree of the spherical harmonics by their number."""
     if "scale_0" in names and "scale_2" not in names:
         raise UnsupportedFormat("a 2DGS scene (it has no scale_2); only 3DGS scenes can be rendered.", where=path.name)
     rest = [name for name in names if name.startswith("f_rest_")]
@@ -73,7 +77,7 @@ def _sh_degree(names: tuple[str, ...], path: Path) -> int:
 
 
 def _render_mode(comments: tuple[str, ...]) -> str | None:
-    """Brush writes 'SplatRenderMode: default|mip|2dgs', Postshot 'antialiased 0|1'; the last one wins."""
+    """Return the last render mode: Brush writes 'SplatRenderMode: default|mip|2dgs', Postshot 'antialiased 0|1'."""
     mode = None
     for comment in comments:
         words = comment.lower().replace(":", " ").split()

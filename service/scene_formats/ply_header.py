@@ -1,4 +1,4 @@
-"""The header of a PLY file, parsed with limits: nothing in it is trusted before the file was measured."""
+"""Parse the header of a PLY file, with limits: its counts are compared with the file's size before anything is read."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ MAX_HEADER_BYTES = 64 * 1024
 """A 3DGS header has 2 KB."""
 MAX_PROPERTIES = 512
 BLOCK = 16_384
+"""Records read at once: 4 MB at SH degree 3, which fit a processor's cache."""
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1",
     "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
@@ -38,11 +39,12 @@ class PlyHeader:
     data_offset: int
 
     def element(self, name: str) -> PlyElement | None:
+        """Return the element of this name, if there is one."""
         return next((e for e in self.elements if e.name == name), None)
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Raises CorruptScene, or UnsupportedFormat for a text PLY."""
+    """Parse the header. Raises CorruptScene, or UnsupportedFormat for a text PLY."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
     end = head.find(b"\nend_header")
@@ -72,6 +74,7 @@ def _elements(lines: list[str], order: str, path: Path) -> tuple[PlyElement, ...
     for number, line in enumerate(lines, 1):
         words = line.split()
         if words[:1] == ["element"]:
+            # 18 digits fit an int64; int() of a longer text could take long.
             if len(words) != 3 or not words[2].isdecimal() or len(words[2]) > 18:
                 raise CorruptScene(f"not 'element NAME COUNT': '{line[:80]}'.", where=f"{path.name}:{number}")
             found.append((words[1], int(words[2]), []))
@@ -105,7 +108,7 @@ def element_records(path: Path, header: PlyHeader, name: str) -> np.ndarray:
 
 
 def element_blocks(path: Path, header: PlyHeader, name: str) -> Iterator[tuple[slice, np.ndarray]]:
-    """Read an element's records in blocks that fit a cache, each with its place. Raises as `element_records`."""
+    """Yield an element's records in blocks that fit a cache, each with its slice. Raises as `element_records`."""
     element, offset = _located(path, header, name)
     with path.open("rb") as file:
         file.seek(offset)
@@ -115,7 +118,8 @@ def element_blocks(path: Path, header: PlyHeader, name: str) -> Iterator[tuple[s
 
 
 def _located(path: Path, header: PlyHeader, name: str) -> tuple[PlyElement, int]:
-    """Return the element and the byte at which it begins, having measured the file."""
+    """Return the element and its first byte. Raises CorruptScene unless the file's size fits the header."""
+    # Elements follow one another in the header's order, records without padding.
     offset = header.data_offset
     for element in header.elements:
         if element.dtype is None:
@@ -130,13 +134,13 @@ def _located(path: Path, header: PlyHeader, name: str) -> tuple[PlyElement, int]
     if there < needed:
         whole = max(0, there // max(element.dtype.itemsize, 1))
         raise CorruptScene(
-            f"truncated: the header promises {element.count} of '{name}', the file ends after {whole}.",
+            f"truncated: the header has {element.count} of '{name}', the file ends after {whole}.",
             where=f"{path.name}, byte {path.stat().st_size}",
             hint="Copy or export it again.",
         )
     if element is header.elements[-1] and there > needed:
         raise CorruptScene(
-            f"{there - needed} bytes follow the {element.count} of '{name}' that the header promises.",
+            f"{there - needed} bytes follow the {element.count} of '{name}' in the header.",
             where=f"{path.name}, byte {offset + needed}",
         )
     return element, offset

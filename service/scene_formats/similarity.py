@@ -1,4 +1,4 @@
-"""Move a scene by a rotation, shift and even scale: Gaussians with their colours, and cameras."""
+"""Apply a similarity (rotation, translation, one scale) to a scene: Gaussians with their colours, and cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.types import Pose
 
 
 def moved_gaussians(raw: RawGaussians, world_from_scene: Float64[np.ndarray, "4 4"]) -> RawGaussians:
-    """Return the Gaussians in the world frame; quaternions must be unit."""
+    """Return the Gaussians in the world frame, spherical harmonics included; quaternions must be unit."""
     rotation, scale = _parts(world_from_scene)
     means = raw.means.astype(np.float64) @ world_from_scene[:3, :3].T + world_from_scene[:3, 3]
     w, x, y, z = quat_from_rotation(rotation)
@@ -29,7 +29,7 @@ def moved_gaussians(raw: RawGaussians, world_from_scene: Float64[np.ndarray, "4 
 
 
 def moved_pose(pose: Pose, world_from_scene: Float64[np.ndarray, "4 4"]) -> Pose:
-    """Return the camera's pose in the world frame; its rotation stays one whatever the scale."""
+    """Return the camera's pose in the world frame; the scale moves its position only."""
     rotation, _ = _parts(world_from_scene)
     matrix = world_from_scene @ pose.world_from_camera
     matrix[:3, :3] = rotation @ pose.world_from_camera[:3, :3]
@@ -37,30 +37,31 @@ def moved_pose(pose: Pose, world_from_scene: Float64[np.ndarray, "4 4"]) -> Pose
 
 
 def _parts(world_from_scene: Float64[np.ndarray, "4 4"]) -> tuple[Float64[np.ndarray, "3 3"], float]:
-    """The nearest rotation, and the scale."""
+    """Split into the nearest rotation (by SVD) and the scale."""
     u, singular, vt = np.linalg.svd(world_from_scene[:3, :3])
     return u @ vt, float(singular.mean())
 
 
 def _rotated_sh(sh: np.ndarray, rotation: Float64[np.ndarray, "3 3"]) -> np.ndarray:
-    """Coefficients c' with sum c'_i Y_i(d) = sum c_i Y_i(R^T d): each band turns within itself.
+    """Return coefficients c' with sum c'_i Y_i(d) = sum c_i Y_i(R^T d), band by band.
 
-    A band's matrix is found from sampled directions: exact up to rounding, as the band is closed under
-    rotation.
+    A band's matrix is solved for from sampled directions by least squares: exact up to rounding, since each band is
+    closed under rotation.
     """
+    # 64 directions for 7 unknowns in the largest band: any well-spread set will do, so the seed is fixed.
     directions = np.random.default_rng(0).normal(size=(64, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     here, there = sh_basis(directions), sh_basis(directions @ rotation)
     result = sh.copy()
     for degree in range(1, round(np.sqrt(sh.shape[1]))):
         band = slice(degree**2, (degree + 1) ** 2)
-        turn = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
-        result[:, band] = np.einsum("ij,njc->nic", turn.astype(np.float32), sh[:, band])
+        matrix = np.linalg.lstsq(here[:, band], there[:, band], rcond=None)[0]
+        result[:, band] = np.einsum("ij,njc->nic", matrix.astype(np.float32), sh[:, band])
     return result
 
 
 def sh_basis(directions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 16"]:
-    """The real spherical harmonics of degree 0 to 3 in the order and with the signs of 3DGS."""
+    """Evaluate the real spherical harmonics of degree 0 to 3 at unit vectors, in the order and signs of 3DGS."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
     c1, c2, c3 = (np.sqrt(k / np.pi) for k in (3 / 4, 15 / 4, 35 / 32))

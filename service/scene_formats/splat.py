@@ -1,4 +1,4 @@
-"""The .splat format of web viewers: records of 32 bytes, no header, colours without view dependence."""
+"""Read the .splat format of web viewers: records of 32 bytes, no header, colours without view dependence."""
 
 from __future__ import annotations
 
@@ -14,13 +14,16 @@ SUFFIXES = (".splat",)
 
 
 def accepts(head: bytes, suffix: str) -> bool:
-    """Tell by the suffix: the format has no header."""
+    """Whether the suffix is the format's, which has no header to recognize it by."""
     return suffix in SUFFIXES
 
 
 def read(path: Path) -> RawGaussians:
-    """Scales are stored as they are, quaternions (wxyz) as 128 + 128 q."""
-    size = path.stat().st_size
+    """Return the Gaussians; scales are stored as they are, quaternions (wxyz) as 128 + 128 q, colours as bytes.
+
+    Raises CorruptScene.
+    """
+    size = path.stat().st_size  # the only check that a format without a header allows
     if size % _RECORD.itemsize:
         raise CorruptScene(
             f"{size} bytes are not a whole number of {_RECORD.itemsize}-byte records.",
