@@ -6,6 +6,7 @@ import re
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 from api_server import ROOT
 
@@ -26,9 +27,12 @@ class Block:
         return f"{self.document}:{self.line}"
 
 
+def pages() -> list[Path]:
+    return [path for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.md"))]
+
+
 def blocks() -> list[Block]:
-    paths = [path for folder in FOLDERS for path in sorted((ROOT / folder).glob("*.md"))]
-    return [block for path in paths for block in blocks_of(str(path.relative_to(ROOT)), path.read_text("utf-8"))]
+    return [block for path in pages() for block in blocks_of(str(path.relative_to(ROOT)), path.read_text("utf-8"))]
 
 
 def blocks_of(name: str, text: str) -> Iterator[Block]:

@@ -19,11 +19,12 @@ import typer.core
 import typer.main
 import yaml
 from api_server import ROOT, operations
-from documents import Block, blocks, blocks_of, commands_of, lines_of
+from documents import Block, blocks, blocks_of, commands_of, lines_of, pages
 
 from service.cli.app import app
 
 BLOCKS = blocks()
+PAGES = pages()
 TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"), re.M))
 
 
@@ -38,6 +39,21 @@ def test_each_claim_of_security_names_tests_that_exist():
             tree = ast.parse((ROOT / "tests" / file).read_text("utf-8"))
             functions = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
             assert name in functions, f"{file}::{name}"
+
+
+def slug(heading: str) -> str:
+    """The anchor that GitHub gives a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_to_files_and_headings(path):
+    for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", path.read_text("utf-8")):
+        found = (path.parent / target).resolve() if target else path
+        assert found.exists(), f"{path.name}: {target}"
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", found.read_text("utf-8"), re.M)
+            assert anchor in map(slug, headings), f"{path.name}: {target}#{anchor}"
 
 
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
