@@ -291,18 +291,18 @@ def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monk
 def test_bench_paper_shows_how_far_it_is():
     from rich.console import Console
 
-    from service.bench.paper.runs import Standing
-    from service.cli.bench_paper import _standing_table
+    from service.bench.paper.runs import Progress
+    from service.cli.bench_paper import _progress_table
 
     cells = ("table2/mc_do/hard", "table2/icomma/hard", "table5/mc_do:mc/random")
-    standing = Standing(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})
+    standing = Progress(total={(scene, cell): 5 for scene in ("chair", "fern") for cell in cells})
     standing.done |= {("chair", cells[0]): 3, ("chair", cells[1]): 1}
     standing.within |= {("chair", cells[0]): 2}
     standing.seconds |= {cells[0]: [4.0, 6.0], cells[1]: [60.0]}
     # mc_do: 7 to go at 5 s; icomma: 9 at 60 s; the third has no pace yet: 10 at the mean of all, 70 / 3 s
     assert standing.eta_s == pytest.approx(35 + 540 + 700 / 3)
     console = Console(width=100, record=True, file=io.StringIO())
-    console.print(_standing_table(standing))
+    console.print(_progress_table(standing))
     told = console.export_text()
     assert re.search(r"mc_do/hard .*2 / 3 / 5 .*0 / 0 / 5", told)
     assert "table5" not in told

@@ -40,14 +40,14 @@ def fake_answers(patch, pause_s: float = 0.0) -> list[tuple[str, int]]:
     patch(bench.LoadedScene, "of", of)
     patch(runs, "answered", answered)
     patch(runs, "_warm", lambda one: None)
-    patch(runs, "_curve", lambda estimate, trial, one: [(0, 30.0, 1.0), (7, 0.1, 0.001)])
+    patch(runs, "_curve", lambda estimate, trial, one, points: [(0, 30.0, 1.0), (7, 0.1, 0.001)])
     return asked
 
 
-def asked_for(folder: Path, **more) -> runs.Asked:
+def asked_for(folder: Path, **more) -> runs.RunSpec:
     cells = plan.chosen(methods=("view_index", "mc_do", "icomma"), studies=("table2",))
     given = {"scenes": {"s": (folder, None)}, "cells": cells, "out": folder.parent / "out", "trials": 6}
-    return runs.Asked(**given | {"slow_trials": 2} | more)
+    return runs.RunSpec(**given | {"slow_trials": 2} | more)
 
 
 @pytest.fixture
@@ -280,14 +280,14 @@ class TestTables:
         assert ("median units", "l1", "0.01", "", "0.01", "", "", "", "") in self.named("table1").rows
 
     def test_claims_compare_the_same_queries(self):
-        held = {claim.said: claim for claim in claims.claims(self.LINES)}
+        held = {claim.statement: claim for claim in claims.claims(self.LINES)}
         assert held["Table 5: MC alone is ahead of DO alone"].holds is True
-        assert held["Table 2: mc_do is ahead of icomma"].found == "mc_do 1/1, icomma 0/1"
+        assert held["Table 2: mc_do is ahead of icomma"].finding == "mc_do 1/1, icomma 0/1"
         assert held["Table 1: L1 succeeds as often as any loss near the optimum"].holds is True
         nearest = held["Ours: L1 ends nearest of all losses, by the median error"]
-        assert (nearest.holds, nearest.found[:17]) == (True, "l1 0.01, blur 0.0")
+        assert (nearest.holds, nearest.finding[:17]) == (True, "l1 0.01, blur 0.0")
         default = held["Ours: view_index is never worse than mc_do, and faster: chair, start 'hard'"]
-        assert (default.holds, default.found) == (True, "1/1 in 0.20 s of CPU time, 1/1 in 3.00 s")
+        assert (default.holds, default.finding) == (True, "1/1 in 0.20 s of CPU time, 1/1 in 3.00 s")
 
 
 def test_the_published_numbers_are_the_supplements():

@@ -16,7 +16,7 @@ from service.errors import InvalidRequest
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from service.bench.paper.runs import Standing
+    from service.bench.paper.runs import Progress
 
 
 def bench_paper(
@@ -39,7 +39,7 @@ def bench_paper(
     from service.bench.paper.plan import chosen
     from service.localize import DEFAULT_MATCHER
 
-    asked = runs.Asked(
+    spec = runs.RunSpec(
         scenes=_scene_arguments(scenes),
         cells=chosen(study or (), method or (), protocol or ()),
         out=folder,
@@ -54,12 +54,12 @@ def bench_paper(
     if run:
         print_machine()
         with _live_table() as show:
-            runs.run(asked, show)
+            runs.run(spec, show)
     if report:
         from service.bench.paper.report import write
 
         with err.status("drawing"):
-            write(asked, report)
+            write(spec, report)
         out.print(str(report / "index.html"), highlight=False, soft_wrap=True)
 
 
@@ -76,35 +76,35 @@ def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
 
 
 @contextmanager
-def _live_table() -> Iterator[Callable[[Standing], None]]:
+def _live_table() -> Iterator[Callable[[Progress], None]]:
     """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
     from rich.live import Live
 
-    told = time.monotonic()
+    printed_s = time.monotonic()
     with Live(console=err, auto_refresh=False, transient=True) as live:
 
-        def show(standing: Standing) -> None:
-            nonlocal told
+        def show(progress: Progress) -> None:
+            nonlocal printed_s
             if err.is_terminal:
-                live.update(_standing_table(standing), refresh=True)
-            elif time.monotonic() - told > 60:
-                told = time.monotonic()
-                done, total = sum(standing.done.values()), sum(standing.total.values())
-                err.print(f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go", highlight=False)
+                live.update(_progress_table(progress), refresh=True)
+            elif time.monotonic() - printed_s > 60:
+                printed_s = time.monotonic()
+                done, total = sum(progress.done.values()), sum(progress.total.values())
+                err.print(f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go", highlight=False)
 
         yield show
 
 
-def _standing_table(standing: Standing) -> Table:
+def _progress_table(progress: Progress) -> Table:
     from rich.table import Table
 
-    scenes = list(dict.fromkeys(scene for scene, _ in standing.total))
+    scenes = list(dict.fromkeys(scene for scene, _ in progress.total))
     table = Table("study / method / start", *scenes, title="within 5 deg / 0.05, of done, of all")
-    for cell in dict.fromkeys(cell for _, cell in standing.total):
+    for cell in dict.fromkeys(cell for _, cell in progress.total):
         places = [(scene, cell) for scene in scenes]
-        if any(standing.done.get(place) for place in places):
-            counts = [(standing.within.get(p, 0), standing.done.get(p, 0), standing.total[p]) for p in places]
+        if any(progress.done.get(place) for place in places):
+            counts = [(progress.within.get(p, 0), progress.done.get(p, 0), progress.total[p]) for p in places]
             table.add_row(cell, *(f"{a} / {b} / {c}" for a, b, c in counts))
-    done, total = sum(standing.done.values()), sum(standing.total.values())
-    table.caption = f"{done} of {total} queries, {standing.eta_s / 60:.0f} minutes to go"
+    done, total = sum(progress.done.values()), sum(progress.total.values())
+    table.caption = f"{done} of {total} queries, {progress.eta_s / 60:.0f} minutes to go"
     return table

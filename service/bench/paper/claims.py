@@ -1,4 +1,4 @@
-"""What the supplement says of the methods, held against the results: which is ahead, and by which counts."""
+"""Checks claims about the methods, the supplement's and ours, against the results: which is ahead, by which counts."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ REFINING = ("l1", "blur", "relative", "l2", "feature", "corner")
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    said: str
-    """By whom, and what."""
-    found: str
+    statement: str
+    """Source and content."""
+    finding: str
+    """Counts of the results."""
     holds: bool | None
     """None: the counts are equal, or there are none."""
 
 
 def claims(lines: Sequence[Line]) -> list[Claim]:
-    """Return the claims of which there are results."""
+    """Return the claims that there are results for."""
     return [claim for claim in (*_stages(lines), *_methods(lines), *_losses(lines), *_default(lines)) if claim]
 
 
@@ -33,21 +34,21 @@ def _within(lines: Sequence[Line], key: str = "within_5deg_0p05", **wanted: str)
     return sum(bool(line[key]) for line in chosen), len(chosen)
 
 
-def _ahead(said: str, better: tuple[str, tuple[int, int]], worse: tuple[str, tuple[int, int]]) -> Claim | None:
+def _ahead(statement: str, better: tuple[str, tuple[int, int]], worse: tuple[str, tuple[int, int]]) -> Claim | None:
     (name, (a, n)), (other, (b, m)) = better, worse
     if not n or not m:
         return None
     difference = a / n - b / m
-    return Claim(said, f"{name} {a}/{n}, {other} {b}/{m}", None if difference == 0 else difference > 0)
+    return Claim(statement, f"{name} {a}/{n}, {other} {b}/{m}", None if difference == 0 else difference > 0)
 
 
 def _stages(lines: Sequence[Line]) -> Iterator[Claim | None]:
     of_table = [line for line in lines if line["study"] == "table5"]
 
-    def ahead(said: str, better: str, worse: str, key: str = "within_5deg_0p05") -> Claim | None:
+    def ahead(statement: str, better: str, worse: str, key: str = "within_5deg_0p05") -> Claim | None:
         both = _common(of_table, f"mc_do:{better}", f"mc_do:{worse}")
         counts = [(name, _within(both, key, method=f"mc_do:{name}")) for name in (better, worse)]
-        return _ahead(said, *counts)
+        return _ahead(statement, *counts)
 
     yield ahead("Table 5: MC alone is ahead of DO alone", "mc", "do")
     yield ahead("Table 5: MC + DO is ahead of MC alone", "mc+do", "mc")
@@ -68,7 +69,7 @@ def _methods(lines: Sequence[Line]) -> Iterator[Claim | None]:
 
 
 def _common(lines: Sequence[Line], *methods: str) -> list[Line]:
-    """Keep the queries that all of the methods answered: otherwise counts would compare different queries."""
+    """Return the lines of queries that all of the methods answered, so that counts compare the same queries."""
     answered = [
         {(line["scene"], line["photo"], line["trial"]) for line in lines if line["method"] == method}
         for method in methods
@@ -84,17 +85,17 @@ def _losses(lines: Sequence[Line]) -> Iterator[Claim | None]:
         return
     shares = {loss: _within(each) for loss, each in of_loss.items()}
     ranked = sorted(shares, key=lambda loss: -shares[loss][0] / shares[loss][1])
-    told = ", ".join(f"{loss} {shares[loss][0]}/{shares[loss][1]}" for loss in ranked)
+    finding = ", ".join(f"{loss} {shares[loss][0]}/{shares[loss][1]}" for loss in ranked)
     best, ours = (shares[loss][0] / shares[loss][1] for loss in (ranked[0], "l1"))
-    yield Claim("Table 1: L1 succeeds as often as any loss near the optimum", told, ours >= best)
+    yield Claim("Table 1: L1 succeeds as often as any loss near the optimum", finding, ours >= best)
     errors = {loss: float(np.median([line["translation_units"] for line in each])) for loss, each in of_loss.items()}
     ranked = sorted(errors, key=lambda loss: errors[loss])
-    told = ", ".join(f"{loss} {errors[loss]:.2g}" for loss in ranked) + " units"
-    yield Claim("Ours: L1 ends nearest of all losses, by the median error", told, ranked[0] == "l1")
+    finding = ", ".join(f"{loss} {errors[loss]:.2g}" for loss in ranked) + " units"
+    yield Claim("Ours: L1 ends nearest of all losses, by the median error", finding, ranked[0] == "l1")
 
 
 def _default(lines: Sequence[Line]) -> Iterator[Claim | None]:
-    """The default against the paper's method, on the queries that both answered."""
+    """Compare the default with the paper's method, on the queries that both answered."""
     for protocol in ("hard", "easy", "none"):
         chosen = [line for line in lines if line["study"] == "table2" and line["protocol"] == protocol]
         for scene in dict.fromkeys(line["scene"] for line in chosen):
@@ -102,10 +103,12 @@ def _default(lines: Sequence[Line]) -> Iterator[Claim | None]:
             ours, paper = (_within(both, method=name) for name in ("view_index", "mc_do"))
             if ours[1]:
                 times = [_median_s(both, name) for name in ("view_index", "mc_do")]
-                told = f"{ours[0]}/{ours[1]} in {times[0]:.2f} s of CPU time, {paper[0]}/{paper[1]} in {times[1]:.2f} s"
+                finding = (
+                    f"{ours[0]}/{ours[1]} in {times[0]:.2f} s of CPU time, {paper[0]}/{paper[1]} in {times[1]:.2f} s"
+                )
                 holds = ours[0] >= paper[0] and times[0] < times[1]
-                said = f"Ours: view_index is never worse than mc_do, and faster: {scene}, start '{protocol}'"
-                yield Claim(said, told, holds)
+                statement = f"Ours: view_index is never worse than mc_do, and faster: {scene}, start '{protocol}'"
+                yield Claim(statement, finding, holds)
 
 
 def _median_s(lines: Sequence[Line], method: str) -> float:

@@ -1,4 +1,4 @@
-"""The supplement's figures, and other benches', drawn with matplotlib. Data comes in; nothing is run or rendered."""
+"""Draws the supplement's figures, and other benches', with matplotlib: from data, nothing is run or rendered here."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ COLOURS = {"view_index": "#1b1b1b", "mc_do": "#2f6fde", "icomma": "#d1372c", "in
 
 @dataclass(frozen=True, slots=True)
 class Vectors:
-    """Match vectors over a photo: from where points are rendered to where the photo shows them."""
+    """Match vectors over a photo: from the pixels of rendered points to those where the photo shows them."""
 
     title: str
     photo: UInt8[np.ndarray, "h w 3"]
@@ -36,17 +36,19 @@ class Vectors:
 
 @dataclass(frozen=True, slots=True)
 class Path3D:
-    """Where a method's camera went."""
+    """The poses of a method's trace."""
 
     name: str
     positions: Float[np.ndarray, "n 3"]
+    """Normalized units, world axes."""
     rotation_deg: Float[np.ndarray, "n"]
+    """Error."""
 
 
 def vectors_and_paths(
     rows: Sequence[Sequence[Vectors]], paths: Sequence[Path3D], truth: Float[np.ndarray, "3"]
 ) -> bytes:
-    """Figure 1: rows of match vectors, and below them the paths of the cameras and their rotation errors."""
+    """Draw Figure 1: rows of match vectors, below them the cameras' paths and their rotation errors."""
     columns = max(len(row) for row in rows)
     figure = Figure(figsize=(3.1 * columns, 2.9 * (len(rows) + 1)), layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(len(rows), 1))
@@ -72,7 +74,7 @@ def vectors_and_paths(
 def pictures(
     rows: Sequence[Sequence[UInt8[np.ndarray, "_ _ 3"] | None]], columns: Sequence[str], names: Sequence[str]
 ) -> bytes:
-    """Figures 2 and 3: a row a query, a column a method; None: there is no answer of it."""
+    """Draw Figures 2 and 3: a row a query, a column a method; None where it has no answer."""
     figure = Figure(figsize=(1.9 * len(columns), 1.75 * len(rows) + 0.3), layout="constrained")
     axes = figure.subplots(len(rows), len(columns), squeeze=False)
     for r, row in enumerate(rows):
@@ -92,7 +94,7 @@ def pictures(
 
 
 def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequence[float], int]]]) -> bytes:
-    """Figure 4: for each start a panel; method -> steps, share of queries within the bound, number of queries."""
+    """Draw Figure 4, a panel a start; by method: steps, shares of queries within the bounds, number of queries."""
     figure = Figure(figsize=(5.2 * len(panels), 3.6), layout="constrained")
     axes = figure.subplots(1, len(panels), squeeze=False)[0]
     for place, (title, methods) in zip(axes, panels.items(), strict=True):
@@ -107,7 +109,7 @@ def shares_by_step(panels: Mapping[str, Mapping[str, tuple[Sequence[float], Sequ
 
 
 def _box_of(shown: Sequence[Vectors]) -> tuple[float, float, float, float]:
-    """Return left, right, bottom, top of what the photo shows of all matches, with a margin."""
+    """Return left, right, bottom, top of the matches' extent in the photo, with a margin."""
     ends = np.concatenate([np.concatenate([vectors.rendered_px, vectors.photo_px]) for vectors in shown])
     height, width = shown[0].photo.shape[:2]
     (left, top), (right, bottom) = np.percentile(ends, [0.5, 99.5], axis=0)
@@ -123,7 +125,7 @@ def _box_of(shown: Sequence[Vectors]) -> tuple[float, float, float, float]:
 def _draw_vectors(place: Axes, vectors: Vectors, box: tuple[float, float, float, float]) -> None:
     faded = 255 - (255 - vectors.photo.astype(float)) * 0.45
     place.imshow(faded.astype(np.uint8))
-    a, b = vectors.rendered_px - 0.5, vectors.photo_px - 0.5  # matplotlib has the first pixel's centre at 0
+    a, b = vectors.rendered_px - 0.5, vectors.photo_px - 0.5  # matplotlib puts the first pixel's centre at 0
     shift = b - a
     place.quiver(*a.T, *shift.T, angles="xy", scale_units="xy", scale=1, width=0.003, color="#3a3a3a")
     place.scatter(*a.T, s=7, facecolors="none", edgecolors=RED, linewidths=0.8)
@@ -133,7 +135,7 @@ def _draw_vectors(place: Axes, vectors: Vectors, box: tuple[float, float, float,
 
 
 def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "3"]) -> None:
-    """In the plane in which they extend most."""
+    """Draw positions in the plane in which they extend most."""
     every = np.concatenate([path.positions for path in paths] + [truth[None]])
     axes = np.linalg.svd(every - every.mean(0), full_matrices=False)[2][:2]
     for path in paths:
@@ -145,9 +147,9 @@ def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "
 
 
 def reliability(models: Mapping[str, Sequence[Mapping[str, float]]]) -> bytes:
-    """Draw what share of poses came true against the probability that was said, and how many poses that were.
+    """Draw a reliability diagram: the share of right poses against their predicted probability, and their number.
 
-    Each model has rows of `said`, `true`, `count`, `from`, `to`.
+    Each model has rows of `said` (the mean prediction), `true` (the share), `count`, and the bin's `from` and `to`.
     """
     figure = Figure(figsize=(6.0, 5.4), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))

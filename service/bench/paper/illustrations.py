@@ -1,9 +1,9 @@
-"""What the figures show, run and rendered: match vectors with and without decoupling, and methods' answers."""
+"""Runs and renders the content of the figures: match vectors with and without decoupling, and methods' answers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,37 +20,50 @@ from service.photos.images import read_query, resized
 from service.results import IterationRecord, PoseEstimate
 from service.types import Camera, Pose, Query
 
-PICTURE_PX = 240
-ONLY_TURNED_DEG, ONLY_SHIFTED = 20.0, 0.35
-"""Figure 1 (a): about the scene's centre; units, sidewards."""
-BOTH_DEG, BOTH_UNITS = (18.0, -14.0, 22.0), (0.3, -0.2, 0.25)
-"""Figure 1 (b): per axis."""
-SHOWN_STEPS = 4
 METHODS = ("inerf", "inerf_dagger", "icomma", "mc_do", "view_index")
 
 
-def figure_1(one: Subject) -> bytes:
-    """Run DO and, without decoupling, iComMa from the same start on the first test photo."""
+@dataclass(frozen=True, slots=True)
+class FigureConfig:
+    rotation_deg: float = 20.0
+    """Figure 1 (a): about the scene's centre..."""
+    translation_units: float = 0.35
+    """...or sidewards, in normalized units."""
+    start_deg: tuple[float, float, float] = (18.0, -14.0, 22.0)
+    """Figure 1 (b): the start's rotation about the world's axes..."""
+    start_units: tuple[float, float, float] = (0.3, -0.2, 0.25)
+    """...and its translation along them."""
+    shown_steps: int = 4
+    """Of the optimization, in Figure 1 (b)."""
+    picture_px: int = 240
+    """Long side of the pictures of Figures 2 and 3."""
+
+
+FIGURES = FigureConfig()
+
+
+def figure_1(one: Subject, config: FigureConfig = FIGURES) -> bytes:
+    """Return Figure 1 as PNG: DO and, without decoupling, iComMa from the same start on the first test photo."""
     trial = next(trials_of(one, "none", 1, 0))
     truth = trial.truth.pose
-    turned = _moved(one, truth, np.radians([0.0, ONLY_TURNED_DEG, 0.0]), np.zeros(3))
-    sidewards = ONLY_SHIFTED * truth.world_from_camera[:3, 0]
+    turned = _moved(one, truth, np.radians([0.0, config.rotation_deg, 0.0]), np.zeros(3))
+    sidewards = config.translation_units * truth.world_from_camera[:3, 0]
     shifted = _moved(one, truth, np.zeros(3), sidewards)
-    both = _moved(one, truth, np.radians(BOTH_DEG), np.array(BOTH_UNITS))
+    both = _moved(one, truth, np.radians(config.start_deg), np.array(config.start_units))
     first = {"hypotheses": 0, "iterations": 1, "refinement_steps": 0}
     causes = [
-        _shown(f"(a) {name}", trial, one, _ran(one, trial, start, "mc_do", first).records, 1)[0]
+        _shown(f"(a) {name}", trial, one, _run(one, trial, start, "mc_do", first).records, 1)[0]
         for name, start in (
-            (f"turned about the centre, {ONLY_TURNED_DEG:g} deg", turned),
-            (f"shifted, {ONLY_SHIFTED:g} units", shifted),
+            (f"turned about the centre, {config.rotation_deg:g} deg", turned),
+            (f"shifted, {config.translation_units:g} units", shifted),
         )
     ]
-    decoupled = _ran(one, trial, both, "mc_do", {"hypotheses": 0, "iterations": 10, "refinement_steps": 0})
-    joint = _ran(one, trial, both, "icomma", {"rematch_every": 10, "long_side_px": 256})
+    decoupled = _run(one, trial, both, "mc_do", {"hypotheses": 0, "iterations": 10, "refinement_steps": 0})
+    joint = _run(one, trial, both, "icomma", {"rematch_every": 10, "long_side_px": 256})
     rows = [
         causes,
-        _shown("(b) not decoupled", trial, one, joint.records, SHOWN_STEPS),
-        _shown("(b) decoupled", trial, one, decoupled.records, SHOWN_STEPS),
+        _shown("(b) not decoupled", trial, one, joint.records, config.shown_steps),
+        _shown("(b) decoupled", trial, one, decoupled.records, config.shown_steps),
     ]
     paths = [
         _path("not decoupled (icomma)", joint, truth, one),
@@ -60,7 +73,7 @@ def figure_1(one: Subject) -> bytes:
 
 
 def _moved(one: Subject, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> Pose:
-    """Turn about the focus, then shift in normalized units; both in world axes."""
+    """Rotate the camera about the focus by angles (rad) per axis, then translate it (normalized units); world axes."""
     rotation = np.eye(3)
     for axis in range(3):
         rotation = so3_exp(angles[axis] * np.eye(3)[axis]) @ rotation
@@ -71,7 +84,7 @@ def _moved(one: Subject, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> P
     return Pose(matrix)
 
 
-def _ran(one: Subject, trial: Trial, start: Pose, estimator: str, changed: Mapping[str, Any]) -> PoseEstimate:
+def _run(one: Subject, trial: Trial, start: Pose, estimator: str, changed: Mapping[str, Any]) -> PoseEstimate:
     options = ESTIMATORS.load(estimator).Options(**changed)
     return localize(replace(_query(one, trial), prior=start), one.loaded, Request(estimator, options))
 
@@ -83,7 +96,7 @@ def _query(one: Subject, trial: Trial) -> Query:
 def _shown(
     title: str, trial: Trial, one: Subject, records: Sequence[IterationRecord], count: int
 ) -> list[figures.Vectors]:
-    """Return the match vectors of some steps: the first ones tell most, so they are spread geometrically."""
+    """Return the match vectors of `count` steps, geometrically spread: most changes in the first ones."""
     photo = _query(one, trial).rgb
     matched = [(number, record.matches) for number, record in enumerate(records) if record.matches is not None]
     picked = np.unique(np.geomspace(1, len(matched), count).round().astype(int)) - 1 if matched else []
@@ -105,8 +118,10 @@ def _path(name: str, estimate: PoseEstimate, truth: Pose, one: Subject) -> figur
     return figures.Path3D(name, positions, np.array([max(pose_distance(p, truth)[0], 1e-3) for p in poses]))
 
 
-def figures_2_and_3(subjects: Mapping[str, Subject], lines: Sequence[Line]) -> tuple[bytes, bytes] | None:
-    """Render each method's answer to one query of each scene, blended with the photo, and as it is."""
+def figures_2_and_3(
+    subjects: Mapping[str, Subject], lines: Sequence[Line], config: FigureConfig = FIGURES
+) -> tuple[bytes, bytes] | None:
+    """Return two PNGs: each method's answer to one query of each scene, blended with the photo, and as it is."""
     blended, plain, names = [], [], []
     for scene, one in subjects.items():
         of_query = _most_answered([line for line in lines if line["scene"] == scene and line["protocol"] == "hard"])
@@ -115,7 +130,7 @@ def figures_2_and_3(subjects: Mapping[str, Subject], lines: Sequence[Line]) -> t
         trial = next(
             t for t in trials_of(one, "none", len(one.photos), 0) if t.photo == next(iter(of_query.values()))["photo"]
         )
-        photo, camera = _photo_and_camera(one, trial)
+        photo, camera = _photo_and_camera(one, trial, config.picture_px)
         start = next(iter(of_query.values()))["start_world_from_camera"]
         matrices = [start, *(of_query[m]["world_from_camera"] if m in of_query else None for m in METHODS)]
         renders = [None if m is None else _rendered(one, camera, np.array(m)) for m in matrices]
@@ -138,11 +153,11 @@ def _most_answered(lines: Sequence[Line]) -> dict[str, Line]:
     return max(queries.values(), key=len, default={})
 
 
-def _photo_and_camera(one: Subject, trial: Trial) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
+def _photo_and_camera(one: Subject, trial: Trial, long_side_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
     query = _query(one, trial)
-    lens = query.intrinsics.with_long_side(PICTURE_PX)
-    photo = resized(query.rgb.astype(np.float32), lens.width, lens.height)
-    return np.rint(photo).astype(np.uint8), Camera(lens, trial.truth.pose)
+    intrinsics = query.intrinsics.with_long_side(long_side_px)
+    photo = resized(query.rgb.astype(np.float32), intrinsics.width, intrinsics.height)
+    return np.rint(photo).astype(np.uint8), Camera(intrinsics, trial.truth.pose)
 
 
 def _rendered(one: Subject, camera: Camera, world_from_camera: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
@@ -151,7 +166,7 @@ def _rendered(one: Subject, camera: Camera, world_from_camera: np.ndarray) -> UI
 
 
 def figure_4(lines: Sequence[Line]) -> bytes | None:
-    """Return the share of queries within 5 deg and 0.05 units after each step."""
+    """Return Figure 4 as PNG: the share of queries within 5 deg and 0.05 units after each step."""
     panels: dict[str, dict[str, tuple[Sequence[float], Sequence[float], int]]] = {}
     for protocol in ("easy", "hard"):
         chosen = [line for line in lines if line["protocol"] == protocol and line.get("curve")]
@@ -163,7 +178,7 @@ def figure_4(lines: Sequence[Line]) -> bytes | None:
 
 
 def _share_curve(curves: Sequence[Sequence[Sequence[float]]]) -> tuple[list[float], list[float]]:
-    """A query that has ended stays where it is."""
+    """Return steps, and the share of queries within the bounds at each; an ended query keeps its last errors."""
     steps = sorted({point[0] for curve in curves for point in curve})
     good = np.zeros(len(steps))
     for curve in curves:

@@ -1,7 +1,7 @@
-"""What is run: methods with their options, and studies, each a method under a protocol.
+"""The experiments: methods with their options, and studies, whose cells are a method under a protocol each.
 
-Baselines have the supplement's parameters, less what two cores can't do in five minutes a trial: that is their
-two-core profile, and it is named beside every number. `mc_do` and `view_index` have their defaults.
+Baselines have the supplement's parameters, reduced where two cores would need more than five minutes a trial: that is
+their two-core profile, which is stated beside every number. `mc_do` and `view_index` have their defaults.
 """
 
 from __future__ import annotations
@@ -19,12 +19,32 @@ from service.pose.descent.losses import LOSSES
 
 SLOW = ("inerf", "inerf_dagger", "pnerf", "icomma")
 """Methods that get few trials."""
-STEPS_OF_TABLE_1 = 120
-"""Of the descent. Its rates fall: in 60 steps they go 1.4 degrees about an axis; near starts are up to 2 off."""
-IMAGES_OF_TABLE_5 = 5
-"""Of each scene; with 40 trials a cell they have ten starts each, as published, and five where stages are left out."""
 STEP_CURVES = ("icomma", "inerf_dagger", "mc_do", "view_index")
 """Methods of Figure 4, whose errors are kept step by step."""
+
+
+@dataclass(frozen=True, slots=True)
+class StudyConfig:
+    """Sizes of the studies."""
+
+    table1_steps: int = 120
+    """Of the descent. Its rates fall: in 60 steps they add up to 1.4 degrees about an axis; near starts are up to 2
+    off."""
+    table5_photos: int = 5
+    """Of each scene; with 40 trials a cell they have ten starts each, as published, and five where stages are left
+    out."""
+    resolutions_px: tuple[int, ...] = (208, 416, 800)
+    """Long sides of renders, for section C."""
+    ranges_deg: tuple[float, ...] = (15.0, 30.0, 60.0, 120.0)
+    """Of the hypotheses per axis, for section H."""
+    slow_share: float = 0.25
+    """Of the trials, for baselines in Table 2 and for tables 1 and H."""
+    resolution_share: float = 0.125
+    table5_share: float = 1.25
+    """For the complete method; half of it where stages are left out."""
+
+
+STUDIES = StudyConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,28 +52,28 @@ class Method:
     name: str
     estimator: str
     changed: Mapping[str, Any] = field(default_factory=dict)
-    """Options other than the estimator's defaults."""
+    """Options that differ from the estimator's defaults."""
     profile: str = ""
-    """What the changes mean, for the reader of a number."""
+    """The changes in words, stated beside the method's numbers."""
 
     @property
     def options(self) -> Any:
         return ESTIMATORS.load(self.estimator).Options(**self.changed)
 
     def config(self) -> dict[str, Any]:
-        """Return all that decides what the method does."""
+        """Return all that determines the method's results, as JSON values."""
         return {"estimator": self.estimator, "options": dataclasses.asdict(self.options), "profile": self.profile}
 
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A method under a protocol: what one number of a table is made of, on every scene."""
+    """A method under a protocol, on every scene: its lines make up the numbers of one table cell."""
 
     study: str
     method: Method
     protocol: str
     share: float = 1.0
-    """Of the number of trials that is asked for."""
+    """Of the run's number of trials."""
     photos: int | None = None
     """Of the scene's test photos, evenly spread; None: all."""
 
@@ -68,7 +88,7 @@ def _mc_do(name: str, **changed: Any) -> Method:
 
 _NO_STAGE = {"hypotheses": 0, "iterations": 0, "refinement_steps": 0}
 _STAGES: dict[str, dict[str, Any]] = {
-    # A start from anywhere says nothing of where to look.
+    # A random start holds no information about the pose, so hypotheses are drawn over the whole scene.
     "mc": {"hypotheses": 64, "around": "scene"},
     "do": {"iterations": 10},
     "loss": {"refinement_steps": 60},
@@ -85,38 +105,43 @@ MAIN = (
     ),
 )
 ABLATION = {"": ("loss",), "mc": ("mc",), "do": ("do",), "mc+do": ("mc", "do"), "mc+do+loss": ("mc", "do", "loss")}
-"""Table 5's rows. Of its first one the supplement doesn't say what is left; here it is the descent alone."""
-RESOLUTIONS_PX = (208, 416, 800)
-RANGES_DEG = (15.0, 30.0, 60.0, 120.0)
+"""Table 5's rows. The supplement doesn't say which stage its first one has; here it is the descent alone."""
 
 
 @cache
-def cells() -> tuple[Cell, ...]:
-    """Return all there is to run, in the order of worth."""
+def cells(config: StudyConfig = STUDIES) -> tuple[Cell, ...]:
+    """Return the cells of all studies, the most important first, and the slowest last."""
     starts = (("table2", "hard"), ("table2", "none"), ("table2", "easy"), ("pnerf", "pnerf"))
     found = [Cell(study, method, start) for study, start in starts for method in MAIN[:2]]
-    found += [Cell(study, method, start, 0.25) for study, start in starts if start != "none" for method in MAIN[2:]]
+    found += [
+        Cell(study, method, start, config.slow_share)
+        for study, start in starts
+        if start != "none"
+        for method in MAIN[2:]
+    ]
     for row, stages in ABLATION.items():
         options = _NO_STAGE | {key: value for stage in stages for key, value in _STAGES[stage].items()}
         method = _mc_do(f"mc_do:{row or 'descent'}", **options)
-        share = 1.25 if len(stages) == len(_STAGES) else 0.625
-        found.append(Cell("table5", method, "random", share=share, photos=IMAGES_OF_TABLE_5))
-    found.append(Cell("table5", MAIN[0], "random", share=1.25, photos=IMAGES_OF_TABLE_5))
+        share = config.table5_share if len(stages) == len(_STAGES) else 0.5 * config.table5_share
+        found.append(Cell("table5", method, "random", share=share, photos=config.table5_photos))
+    found.append(Cell("table5", MAIN[0], "random", share=config.table5_share, photos=config.table5_photos))
     for loss in LOSSES:
-        method = _mc_do(f"mc_do:{loss}", **_NO_STAGE | {"refinement_steps": STEPS_OF_TABLE_1, "loss": loss})
-        found.append(Cell("table1", method, "near", share=0.25))
-    for degrees in RANGES_DEG:
-        found.append(Cell("range", _mc_do(f"mc_do:range{degrees:g}", range_deg=degrees), "hard", share=0.25))
-    for pixels in RESOLUTIONS_PX:
+        method = _mc_do(f"mc_do:{loss}", **_NO_STAGE | {"refinement_steps": config.table1_steps, "loss": loss})
+        found.append(Cell("table1", method, "near", share=config.slow_share))
+    for degrees in config.ranges_deg:
+        found.append(
+            Cell("range", _mc_do(f"mc_do:range{degrees:g}", range_deg=degrees), "hard", share=config.slow_share)
+        )
+    for pixels in config.resolutions_px:
         sizes = {"hypothesis_px": pixels, "render_px": pixels}
-        found.append(Cell("resolution", _mc_do(f"mc_do:{pixels}px", **sizes), "hard", share=0.125))
+        found.append(Cell("resolution", _mc_do(f"mc_do:{pixels}px", **sizes), "hard", share=config.resolution_share))
     return tuple(sorted(found, key=lambda cell: cell.method.name == "pnerf"))  # a trial of it takes longest
 
 
 def chosen(
     studies: Collection[str] = (), methods: Collection[str] = (), protocols: Collection[str] = ()
 ) -> tuple[Cell, ...]:
-    """Return the cells of these; an empty choice is all. Raises UnknownName."""
+    """Return the cells of these studies, methods and protocols; an empty choice means all. Raises UnknownName."""
     for protocol in protocols:
         require_kind(protocol)
     for what, names, known in (

@@ -1,4 +1,4 @@
-"""Writes the tables and figures of a run: PNG files, tables.json, and one HTML page that needs nothing else."""
+"""Writes the report of a run: PNG files, tables.json, and one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from service.bench.paper.claims import Claim, claims
-from service.bench.paper.runs import Asked, load, read_lines
+from service.bench.paper.runs import RunSpec, load, read_lines
 from service.bench.paper.tables import Line, Table, published, tables
 from service.errors import BackendMissing, InvalidRequest
 
@@ -38,30 +38,30 @@ FIGURES = {
 }
 
 
-def write(asked: Asked, folder: Path) -> None:
-    """Write the report of the results in `asked.out`. Raises InvalidRequest, BackendMissing."""
+def write(spec: RunSpec, folder: Path) -> None:
+    """Write the report of the results in `spec.out`. Raises InvalidRequest, BackendMissing."""
     if find_spec("matplotlib") is None:
         raise BackendMissing("figures need matplotlib; install splatfix[bench].", where="--report")
-    lines = [line for line in read_lines(asked.out / "results.jsonl") if line["scene"] in asked.scenes]
+    lines = [line for line in read_lines(spec.out / "results.jsonl") if line["scene"] in spec.scenes]
     if not lines:
-        raise InvalidRequest("there are no results.", where=str(asked.out))
-    config = json.loads((asked.out / "config.json").read_text("utf-8"))
-    config["scenes"] = {name: config["scenes"][name] for name in asked.scenes if name in config["scenes"]}
-    found, held = tables(lines, config), claims(lines)
+        raise InvalidRequest("there are no results.", where=str(spec.out))
+    config = json.loads((spec.out / "config.json").read_text("utf-8"))
+    config["scenes"] = {name: config["scenes"][name] for name in spec.scenes if name in config["scenes"]}
+    found, checked = tables(lines, config), claims(lines)
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = _pictures(asked, lines)
+    pictures = _pictures(spec, lines)
     for name, png in pictures.items():
         (folder / f"{name}.png").write_bytes(png)
     machine_readable = {"tables": [dataclasses.asdict(table) for table in found]}
-    machine_readable |= {"claims": [dataclasses.asdict(claim) for claim in held], "config": config}
+    machine_readable |= {"claims": [dataclasses.asdict(claim) for claim in checked], "config": config}
     (folder / "tables.json").write_text(json.dumps(machine_readable, indent=1) + "\n", encoding="utf-8")
-    (folder / "index.html").write_text(page(found, held, pictures, _facts(lines, config)), encoding="utf-8")
+    (folder / "index.html").write_text(page(found, checked, pictures, _facts(lines, config)), encoding="utf-8")
 
 
-def _pictures(asked: Asked, lines: Sequence[Line]) -> dict[str, bytes]:
+def _pictures(spec: RunSpec, lines: Sequence[Line]) -> dict[str, bytes]:
     from service.bench.paper import illustrations  # loads matplotlib
 
-    subjects = {name: load(asked, name) for name in asked.scenes}
+    subjects = {name: load(spec, name) for name in spec.scenes}
     found = {"figure1": illustrations.figure_1(next(iter(subjects.values())))}
     both = illustrations.figures_2_and_3(subjects, lines)
     if both:
@@ -72,29 +72,29 @@ def _pictures(asked: Asked, lines: Sequence[Line]) -> dict[str, bytes]:
 
 
 def _facts(lines: Sequence[Line], config: Mapping[str, Any]) -> list[str]:
-    """Return what has to be known of all numbers."""
+    """Return the paragraphs that hold for all numbers: scenes, seed, units, versions, source of published ones."""
     versions = Counter(line["code"] for line in lines)
     scenes = [
-        f"{name} ({facts['gaussians']:,} Gaussians, {facts['test_photos']} test photos, {facts['layout']} layout)"
-        for name, facts in config["scenes"].items()
+        f"{name} ({scene['gaussians']:,} Gaussians, {scene['test_photos']} test photos, {scene['layout']} layout)"
+        for name, scene in config["scenes"].items()
     ]
-    told = [f"Scenes: {', '.join(scenes)}. The test photos were not trained on."]
-    told.append(f"{len(lines)} queries, seed {config['general']['seed']}, matcher {config['general']['matcher']}.")
-    told.append(
+    facts = [f"Scenes: {', '.join(scenes)}. The test photos were not trained on."]
+    facts.append(f"{len(lines)} queries, seed {config['general']['seed']}, matcher {config['general']['matcher']}.")
+    facts.append(
         "Units: the training cameras' median distance from the scene's focus is 4. Success: rotation and translation "
-        "errors within both bounds, as published; the verdict of the gate is not asked."
+        "errors within both bounds, as published; whatever the verdict."
     )
     if len(versions) > 1:
         each = ", ".join(f"{code} {count}" for code, count in versions.items())
-        told.append(f"The lines are of {len(versions)} versions of the code (digest, lines): {each}.")
-    told.append(f"Published numbers: {published()['source']} Their scenes' models, photos and hardware are others.")
-    return told
+        facts.append(f"The lines are of {len(versions)} versions of the code (digest, lines): {each}.")
+    facts.append(f"Published numbers: {published()['source']} Their scenes' models, photos and hardware are others.")
+    return facts
 
 
-def page(found: Sequence[Table], held: Sequence[Claim], pictures: Mapping[str, bytes], facts: Sequence[str]) -> str:
-    """Return the HTML page."""
+def page(found: Sequence[Table], checked: Sequence[Claim], pictures: Mapping[str, bytes], facts: Sequence[str]) -> str:
+    """Return the HTML page of tables, claims and pictures (PNG bytes by name)."""
     parts = ["<h1>splatfix: the paper, reproduced</h1>", *(f"<p>{escape(fact)}</p>" for fact in facts)]
-    parts += ["<h2>What the paper says, and what is found here</h2>", _claims_html(held)]
+    parts += ["<h2>The paper's claims, and the results here</h2>", _claims_html(checked)]
     parts += [_table_html(table) for table in found]
     for name, png in pictures.items():
         source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
@@ -107,14 +107,14 @@ def page(found: Sequence[Table], held: Sequence[Claim], pictures: Mapping[str, b
     )
 
 
-def _claims_html(held: Sequence[Claim]) -> str:
+def _claims_html(checked: Sequence[Claim]) -> str:
     words = {True: ("yes", "holds"), False: ("no", "does not hold"), None: ("", "equal")}
     rows = [
-        f"<tr><td>{escape(claim.said)}</td><td>{escape(claim.found)}</td>"
+        f"<tr><td>{escape(claim.statement)}</td><td>{escape(claim.finding)}</td>"
         f'<td class="{words[claim.holds][0]}">{words[claim.holds][1]}</td></tr>'
-        for claim in held
+        for claim in checked
     ]
-    head = "<thead><tr><th>claim</th><th>found, queries that both answered</th><th></th></tr></thead>"
+    head = "<thead><tr><th>claim</th><th>result, on queries that both methods answered</th><th></th></tr></thead>"
     return f'<div class="scroll"><table>{head}<tbody>{"".join(rows)}</tbody></table></div>'
 
 

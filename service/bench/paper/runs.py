@@ -1,9 +1,9 @@
-"""Runs what is planned, one JSON line a query, and goes on where it was stopped.
+"""Runs the planned queries, writes one JSON line for each, and resumes an interrupted run.
 
-A folder of results has `config.json` (what decides a result: seed, matcher, each method's options, each scene's
-digest) and `results.jsonl`. A run with other values for any of these is refused; more scenes, methods or trials
-may join. A line is written whole, and on disk before the next query begins: what a kill leaves of a line is
-dropped and run again.
+A folder of results has `config.json` (what determines a result: seed, matcher, each method's options, each scene's
+digest) and `results.jsonl`. A run with other values for any of these is refused; scenes, methods and trials may be
+added. A line is written whole, and synced to disk before the next query begins; an incomplete last line, left by a
+kill, is dropped and its query run again.
 """
 
 from __future__ import annotations
@@ -27,16 +27,13 @@ from service.errors import InvalidRequest
 from service.localize import Request
 from service.results import PoseEstimate
 
-CURVE_POINTS = 120
-WAVES = ((5, 1), (15, 2), (None, None))
-"""Trials of every cell and scene, of fast and of slow methods, that are run before any cell gets more."""
 Key = tuple[str, str, str, int]
 """Scene, cell, photo, number of the trial."""
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
-    """What a call of the bench asks for."""
+class RunSpec:
+    """What a call of the bench runs, and how."""
 
     scenes: Mapping[str, tuple[Path, Path | None]]
     """Name -> scene, and its data set where that is elsewhere."""
@@ -49,30 +46,36 @@ class Asked:
     layout: str = "auto"
     background: str = "scene"
     cache_dir: Path | None = None
+    waves: tuple[tuple[int | None, int | None], ...] = ((5, 1), (15, 2), (None, None))
+    """Trials of every cell and scene, of fast and of slow methods, run before any cell gets more; None: all."""
+    curve_points: int = 120
+    """Records of a query's trace whose errors are kept, at most."""
 
     def count(self, cell: Cell, scene_photos: int) -> int:
+        """Return the number of trials of a cell on a scene with so many test photos."""
         wanted = self.slow_trials if cell.method.name in SLOW else max(1, round(cell.share * self.trials))
         return wanted if cell.protocol != "none" else min(wanted, scene_photos)
 
 
 @dataclass(slots=True)
-class Standing:
-    """How far the run is."""
+class Progress:
+    """Of a run, by scene and cell."""
 
     done: dict[tuple[str, str], int] = field(default_factory=dict)
-    """By scene and cell."""
+    """Queries answered."""
     total: dict[tuple[str, str], int] = field(default_factory=dict)
     within: dict[tuple[str, str], int] = field(default_factory=dict)
     """Answers within 5 degrees and 0.05 units."""
     seconds: dict[str, list[float]] = field(default_factory=dict)
-    """What queries of a cell took, in this call."""
-    known_s: float = 10.0
+    """Wall times of a cell's queries, in this call."""
+    expected_s: float = 10.0
+    """Seconds a query, before there is any to go by."""
 
     @property
     def eta_s(self) -> float:
-        """Seconds to go, at the mean pace of each cell, or of all where it has none yet."""
+        """Estimated seconds left: at each cell's mean time a query, or that of all cells where it has none yet."""
         every = [s for each in self.seconds.values() for s in each]
-        usual = sum(every) / len(every) if every else self.known_s
+        usual = sum(every) / len(every) if every else self.expected_s
         left = 0.0
         for (scene, cell), total in self.total.items():
             pace = self.seconds.get(cell)
@@ -81,43 +84,43 @@ class Standing:
         return left
 
 
-def run(asked: Asked, on_standing: Callable[[Standing], None] | None = None) -> list[dict[str, Any]]:
-    """Run what is not there yet, and return all lines. Raises SceneError, InvalidRequest."""
-    asked.out.mkdir(parents=True, exist_ok=True)
-    subjects = {name: load(asked, name) for name in asked.scenes}
-    _settle_config(asked, subjects)
-    file = asked.out / "results.jsonl"
-    lines = read_lines(file, mend=True)
-    standing = _begun(asked, subjects, lines)
+def run(spec: RunSpec, on_progress: Callable[[Progress], None] | None = None) -> list[dict[str, Any]]:
+    """Run the queries that have no line yet; return all lines. Raises SceneError, InvalidRequest."""
+    spec.out.mkdir(parents=True, exist_ok=True)
+    subjects = {name: load(spec, name) for name in spec.scenes}
+    _check_config(spec, subjects)
+    file = spec.out / "results.jsonl"
+    lines = read_lines(file, repair=True)
+    progress = _progress_so_far(spec, subjects, lines)
     done, warm = {_key(line) for line in lines}, set[str]()
     with file.open("a", encoding="utf-8") as stream:
-        for scene, cell, trial in _todo(asked, subjects):
+        for scene, cell, trial in _todo(spec, subjects):
             if (scene, cell.name, trial.photo, trial.number) in done:
                 continue
             if scene not in warm:
                 _warm(subjects[scene])
                 warm.add(scene)
             began = time.perf_counter()
-            line = _answer(scene, subjects[scene], cell, trial, asked.seed)
+            line = _answer(scene, subjects[scene], cell, trial, spec)
             stream.write(json.dumps(line) + "\n")
             stream.flush()
             os.fsync(stream.fileno())
             lines.append(line)
             done.add(_key(line))
-            _count(standing, line)
-            standing.seconds.setdefault(cell.name, []).append(time.perf_counter() - began)
-            if on_standing:
-                on_standing(standing)
+            _count(progress, line)
+            progress.seconds.setdefault(cell.name, []).append(time.perf_counter() - began)
+            if on_progress:
+                on_progress(progress)
     return lines
 
 
-def read_lines(file: Path, mend: bool = False) -> list[dict[str, Any]]:
-    """Return the results; with `mend`, cut off what a kill left of the last line. Raises InvalidRequest."""
+def read_lines(file: Path, repair: bool = False) -> list[dict[str, Any]]:
+    """Return the results in a file; with `repair`, cut off an incomplete last line. Raises InvalidRequest."""
     if not file.is_file():
         return []
     data = file.read_bytes()
     whole = data[: data.rfind(b"\n") + 1]
-    if mend and len(whole) < len(data):
+    if repair and len(whole) < len(data):
         with file.open("r+b") as stream:
             stream.truncate(len(whole))
     try:
@@ -126,39 +129,39 @@ def read_lines(file: Path, mend: bool = False) -> list[dict[str, Any]]:
         raise InvalidRequest(f"a line is not JSON: {error}", where=str(file)) from None
 
 
-def load(asked: Asked, name: str) -> Subject:
-    """Read a scene and its data set."""
-    scene, data = asked.scenes[name]
-    settings = {"layout": asked.layout, "background": asked.background, "matcher": asked.matcher}
-    return subject(scene, data, **settings, cache_dir=asked.cache_dir)
+def load(spec: RunSpec, name: str) -> Subject:
+    """Load a scene of the run with its test photos and truth. Raises SceneError."""
+    scene, data = spec.scenes[name]
+    settings = {"layout": spec.layout, "background": spec.background, "matcher": spec.matcher}
+    return subject(scene, data, **settings, cache_dir=spec.cache_dir)
 
 
 def _warm(one: Subject) -> None:
-    """Answer one query for nothing: the first one loads kernels and networks."""
+    """Answer one query untimed: the first one loads kernels and networks."""
     for trial in trials_of(one, "none", 1, 0):
         answered(one, trial, Request())
 
 
-def _settle_config(asked: Asked, subjects: Mapping[str, Subject]) -> None:
-    """Write the configuration down, or hold it against the one that is there. Raises InvalidRequest."""
-    file = asked.out / "config.json"
-    there = json.loads(file.read_text("utf-8")) if file.is_file() else {}
+def _check_config(spec: RunSpec, subjects: Mapping[str, Subject]) -> None:
+    """Write the configuration, merged with the folder's. Raises InvalidRequest if the two contradict each other."""
+    file = spec.out / "config.json"
+    stored = json.loads(file.read_text("utf-8")) if file.is_file() else {}
     now = {
-        "general": {"seed": asked.seed, "matcher": asked.matcher, "layout": asked.layout},
-        "methods": {cell.method.name: cell.method.config() for cell in asked.cells},
+        "general": {"seed": spec.seed, "matcher": spec.matcher, "layout": spec.layout},
+        "methods": {cell.method.name: cell.method.config() for cell in spec.cells},
         "scenes": {name: _scene_facts(one) for name, one in subjects.items()},
     }
     now = json.loads(json.dumps(now))
     for part, entries in now.items():
         for name, value in entries.items():
-            before = there.get(part, {}).get(name, value)
+            before = stored.get(part, {}).get(name, value)
             if before != value:
                 raise InvalidRequest(
                     f"the results there were made with another {part}: {name}, {_difference(before, value)}.",
-                    where=str(asked.out),
+                    where=str(spec.out),
                     hint="Name another folder.",
                 )
-    merged = {part: there.get(part, {}) | entries for part, entries in now.items()}
+    merged = {part: stored.get(part, {}) | entries for part, entries in now.items()}
     file.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
 
 
@@ -180,35 +183,36 @@ def _scene_facts(one: Subject) -> dict[str, Any]:
 
 
 def trajectory_radius(one: Subject) -> float:
-    """Return the cameras' mean distance from their own centre, in normalized units."""
+    """Return the training cameras' mean distance from their centroid, in normalized units."""
     positions = np.stack([camera.pose.position_in_world for camera in one.training])
     return float(np.linalg.norm(positions - positions.mean(0), axis=1).mean() * one.units.units_per_scene_unit)
 
 
-def _todo(asked: Asked, subjects: Mapping[str, Subject]) -> Iterator[tuple[str, Cell, Trial]]:
-    """All queries: first a few of everything, then the rest."""
-    for fast, slow in WAVES:
-        for cell in asked.cells:
+def _todo(spec: RunSpec, subjects: Mapping[str, Subject]) -> Iterator[tuple[str, Cell, Trial]]:
+    """Yield all queries: a few of every cell and scene first, then more (see `waves`)."""
+    for fast, slow in spec.waves:
+        for cell in spec.cells:
             most = slow if cell.method.name in SLOW else fast
             for scene, one in subjects.items():
-                few = _of_cell(one, cell)
-                count = asked.count(cell, len(few.photos))
-                for trial in trials_of(few, cell.protocol, min(count, most or count), asked.seed):
+                chosen = _photos_of_cell(one, cell)
+                count = spec.count(cell, len(chosen.photos))
+                for trial in trials_of(chosen, cell.protocol, min(count, most or count), spec.seed):
                     yield scene, cell, trial
 
 
-def _of_cell(one: Subject, cell: Cell) -> Subject:
+def _photos_of_cell(one: Subject, cell: Cell) -> Subject:
     if cell.photos is None or cell.photos >= len(one.photos):
         return one
     step = len(one.photos) / cell.photos
     return replace(one, photos=tuple(one.photos[int(i * step)] for i in range(cell.photos)))
 
 
-def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, seed: int) -> dict[str, Any]:
+def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, spec: RunSpec) -> dict[str, Any]:
+    """Answer one query; return its line."""
     method = cell.method
     one.loaded.prepare(method.estimator)
     wall, cpu = time.perf_counter(), time.process_time()
-    estimate = answered(one, trial, Request(method.estimator, method.options, seed))
+    estimate = answered(one, trial, Request(method.estimator, method.options, spec.seed))
     spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
     outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, one.units), *spent)
     line: dict[str, Any] = {
@@ -224,14 +228,14 @@ def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, seed: int) -> di
     line |= {"stages_cpu_ms": {timing.stage: 1e3 * timing.cpu_s for timing in estimate.timings}}
     line |= {"world_from_camera": estimate.pose.world_from_camera.tolist(), "code": code_digest()}
     if method.name in STEP_CURVES and cell.study == "table2":
-        line["curve"] = _curve(estimate, trial, one)
+        line["curve"] = _curve(estimate, trial, one, spec.curve_points)
     return line
 
 
-def _curve(estimate: PoseEstimate, trial: Trial, one: Subject) -> list[tuple[int, float, float]]:
-    """Errors after some of the steps: number, degrees, units."""
+def _curve(estimate: PoseEstimate, trial: Trial, one: Subject, points: int) -> list[tuple[int, float, float]]:
+    """Return errors at evenly spread records of the trace: number, degrees, normalized units."""
     records = estimate.records
-    stride = max(1, -(-len(records) // CURVE_POINTS))
+    stride = max(1, -(-len(records) // points))
     kept = sorted({*range(0, len(records), stride), len(records) - 1})
     found = []
     for number in kept:
@@ -240,22 +244,22 @@ def _curve(estimate: PoseEstimate, trial: Trial, one: Subject) -> list[tuple[int
     return found
 
 
-def _begun(asked: Asked, subjects: Mapping[str, Subject], lines: Sequence[Mapping[str, Any]]) -> Standing:
-    standing = Standing()
-    for cell in asked.cells:
+def _progress_so_far(spec: RunSpec, subjects: Mapping[str, Subject], lines: Sequence[Mapping[str, Any]]) -> Progress:
+    progress = Progress()
+    for cell in spec.cells:
         for scene, one in subjects.items():
-            standing.total[scene, cell.name] = asked.count(cell, len(_of_cell(one, cell).photos))
-    for line in lines:  # of an earlier call there may be more than this one asks for
+            progress.total[scene, cell.name] = spec.count(cell, len(_photos_of_cell(one, cell).photos))
+    for line in lines:  # an earlier call may have run more trials
         place = line["scene"], line["cell"]
-        if standing.done.get(place, 0) < standing.total.get(place, 0):
-            _count(standing, line)
-    return standing
+        if progress.done.get(place, 0) < progress.total.get(place, 0):
+            _count(progress, line)
+    return progress
 
 
-def _count(standing: Standing, line: Mapping[str, Any]) -> None:
+def _count(progress: Progress, line: Mapping[str, Any]) -> None:
     place = line["scene"], line["cell"]
-    standing.done[place] = standing.done.get(place, 0) + 1
-    standing.within[place] = standing.within.get(place, 0) + bool(line["within_5deg_0p05"])
+    progress.done[place] = progress.done.get(place, 0) + 1
+    progress.within[place] = progress.within.get(place, 0) + bool(line["within_5deg_0p05"])
 
 
 def _key(line: Mapping[str, Any]) -> Key:
@@ -264,9 +268,9 @@ def _key(line: Mapping[str, Any]) -> Key:
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the source that decides results: a report says how many versions its lines are of."""
+    """Return a digest of the source that determines results; a report lists the versions of its lines."""
     root, digest = Path(__file__).parents[2], hashlib.sha256()
     for folder in ("estimators", "pose", "render", "matchers"):
-        for file in sorted((root / folder).glob("*.py")):
+        for file in sorted((root / folder).rglob("*.py")):
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]

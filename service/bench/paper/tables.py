@@ -1,7 +1,7 @@
-"""The supplement's tables from result lines, beside what was published.
+"""The supplement's tables from result lines, beside the published numbers.
 
-Success is as published: the answer is within both bounds, whatever the verdict says. Every number stands with its
-counts; above every table are the measured mean errors of the starts that it rests on.
+Success is as published: the answer is within both bounds, whatever the verdict. Every number is shown with its counts;
+the note of every table has the measured mean errors of the starts that it is based on.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from service.bench.paper.plan import ABLATION, MAIN, RANGES_DEG, RESOLUTIONS_PX, STEPS_OF_TABLE_1
+from service.bench.paper.plan import ABLATION, MAIN, STUDIES
 from service.pose.descent.losses import LOSSES
 
 Line = Mapping[str, Any]
@@ -38,8 +38,9 @@ STARTS = {
 
 
 ABOUT_TABLE_5 = (
-    "All scenes together. 'descent': the L1 refinement alone; of its row the paper marks nothing. MC samples the whole "
-    "scene here, as the start says nothing. The published starts are nearer: half of them come home without MC and DO."
+    "All scenes together. 'descent': the L1 refinement alone; the paper's first row names no stage. MC samples "
+    "the whole scene here, because random starts hold no information. The published starts are nearer: half of them "
+    "converge without MC and DO."
 )
 ERRORS = ("rotation_deg", "translation_units")
 
@@ -59,7 +60,7 @@ def published() -> dict[str, Any]:
 
 
 def tables(lines: Sequence[Line], config: Mapping[str, Any]) -> list[Table]:
-    """Return every table of which there is at least one number."""
+    """Return every table that has at least one number."""
     scenes = list(config["scenes"])
     found = [
         *_successes(lines, scenes),
@@ -76,7 +77,7 @@ def tables(lines: Sequence[Line], config: Mapping[str, Any]) -> list[Table]:
 def start_note(lines: Sequence[Line]) -> str:
     """Return how far the starts of some lines were from the truth, in the mean."""
     protocols = sorted({line["protocol"] for line in lines})
-    told = []
+    sentences = []
     for protocol in protocols:
         begun = [line for line in lines if line["protocol"] == protocol and line["start_rotation_deg"] is not None]
         # A start that several methods share counts once.
@@ -85,15 +86,15 @@ def start_note(lines: Sequence[Line]) -> str:
         if each:
             degrees, units = (np.mean([line[f"start_{key}"] for line in each]) for key in ERRORS)
             errors = f"; mean start error {degrees:.1f} deg, {units:.2f} units ({len(each)} starts)"
-        told.append(f"Start '{protocol}': {STARTS.get(protocol, protocol)}{errors}.")
-    return " ".join(told)
+        sentences.append(f"Start '{protocol}': {STARTS.get(protocol, protocol)}{errors}.")
+    return " ".join(sentences)
 
 
 def profile_note(lines: Sequence[Line]) -> str:
-    """Return which baselines ran with the two-core profile, and what it is."""
+    """Return the sentence that lists the baselines of the two-core profile, with their changes."""
     profiles = {line["method"]: line["profile"] for line in lines if line["profile"]}
-    told = [f"{method}: {profile}" for method, profile in profiles.items()]
-    return f"Marked *, two-core profile: {'; '.join(told)}." if told else ""
+    sentences = [f"{method}: {profile}" for method, profile in profiles.items()]
+    return f"Marked *, two-core profile: {'; '.join(sentences)}." if sentences else ""
 
 
 def _notes(lines: Sequence[Line], *more: str) -> tuple[str, ...]:
@@ -105,7 +106,7 @@ def _of(lines: Sequence[Line], **wanted: str) -> list[Line]:
 
 
 def _share(lines: Sequence[Line], holds: Callable[[Line], bool]) -> str:
-    """'38/40 = .95'."""
+    """Return count and share, such as '38/40 = .95'."""
     if not lines:
         return ""
     count = sum(map(holds, lines))
@@ -117,7 +118,7 @@ def _fraction(value: float) -> str:
 
 
 def _named(methods: Sequence[str], lines: Sequence[Line]) -> tuple[str, ...]:
-    """Mark the methods whose numbers are made with the two-core profile."""
+    """Return the methods' names, with a star where their numbers are of the two-core profile."""
     marked = {line["method"] for line in lines if line["profile"]}
     return tuple(f"{method}*" if method in marked else method for method in methods)
 
@@ -212,7 +213,8 @@ def _table_1(lines: Sequence[Line], scenes: Sequence[str]) -> Iterator[Table]:
         "table1",
         "Table 1: losses near the optimum",
         _notes(
-            chosen, f"The descent alone, {STEPS_OF_TABLE_1} steps, from the start; the published starts are not known."
+            chosen,
+            f"The descent alone, {STUDIES.table1_steps} steps, from the start; the published starts are not known.",
         ),
         ("bound", "loss", *scenes, "all here", *(f"published, {g}" for g in groups)),
         tuple(rows),
@@ -278,7 +280,7 @@ def _spent(lines: Sequence[Line]) -> tuple[str, ...]:
 def _ranges(lines: Sequence[Line]) -> Iterator[Table]:
     chosen = _of(lines, study="range")
     rows = []
-    for degrees in RANGES_DEG:
+    for degrees in STUDIES.ranges_deg:
         here = _of(chosen, method=f"mc_do:range{degrees:g}")
         if here:
             share = _share(here, lambda line: line["within_5deg_0p05"])
@@ -295,7 +297,7 @@ def _ranges(lines: Sequence[Line]) -> Iterator[Table]:
 def _resolutions(lines: Sequence[Line], config: Mapping[str, Any]) -> Iterator[Table]:
     chosen = _of(lines, study="resolution")
     rows = []
-    for pixels in RESOLUTIONS_PX:
+    for pixels in STUDIES.resolutions_px:
         for scene, facts in config["scenes"].items():
             here = _of(chosen, method=f"mc_do:{pixels}px", scene=scene)
             if here:
