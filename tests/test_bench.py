@@ -13,11 +13,11 @@ from PIL import Image
 
 from service.bench import localize as bench
 from service.bench import render as render_bench
-from service.bench.metrics import Units, nees, units_of
-from service.bench.misses import kept_in
+from service.bench.bench_photos import find_photos, sent
+from service.bench.miss_images import save_miss_images
 from service.bench.modifications import MODIFICATIONS, Shot, modified
-from service.bench.queries import find_photos, sent
-from service.bench.starts import KINDS, start_pose
+from service.bench.pose_metrics import Units, nees, units_of
+from service.bench.start_poses import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
 from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
 from service.interfaces import Frame
@@ -222,7 +222,7 @@ class TestRun:
         (seen,) = stripes(None, [Camera(LENS, far)])
         (folder / "images" / "5.png").write_bytes(encode_image(0.5 * seen.rgb + 0.2, "png"))
         runs["answer"] = lambda query, index: [poses()[0], poses()[0], far][index - 1]
-        outcome = bench.run(folder, on_miss=kept_in(tmp_path / "misses"))
+        outcome = bench.run(folder, on_miss=save_miss_images(tmp_path / "misses"))
         right, wrong = outcome["per_query"]
         assert "picture" not in right
         assert [p.name for p in (tmp_path / "misses").iterdir()] == [wrong["picture"]] == ["s-images_5.png-0.jpg"]

@@ -13,7 +13,7 @@ from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service import tracking as track
 from service.bench import track as bench
-from service.bench.metrics import Units
+from service.bench.pose_metrics import Units
 from service.errors import SceneNotFound
 from service.geometry import moved, pose_distance
 from service.localize import Cancelled, LoadedScene, Request

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from service.bench.localize import Subject, Trial, answered, subject, trials_of
-from service.bench.metrics import COARSE, FINE, Outcome, errors
+from service.bench.pose_metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.localize import DEFAULT_ESTIMATOR, Request

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from service.bench.queries import HOLD_OUT_EVERY, BenchPhoto, find_photos, moved_camera
+from service.bench.bench_photos import HOLD_OUT_EVERY, BenchPhoto, find_photos, moved_camera
 from service.errors import CorruptScene, InvalidImage, InvalidPrior, SceneNotFound, UnknownName
 from service.photos.images import photo_size
 from service.scene_formats.colmap import read_cameras

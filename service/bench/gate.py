@@ -25,9 +25,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
+from service.bench.bench_photos import BenchPhoto, sent
 from service.bench.localize import Subject, subject
-from service.bench.metrics import COARSE, errors, nees
-from service.bench.queries import BenchPhoto, sent
+from service.bench.pose_metrics import COARSE, errors, nees
 from service.estimators.view_index import Options
 from service.geometry import moved
 from service.interfaces import Tools

@@ -17,11 +17,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from service.bench.bench_photos import BenchPhoto, sent
 from service.bench.datasets import PHOTO_SUFFIXES, DataSet, read_data_set
-from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
 from service.bench.modifications import require_modifications
-from service.bench.queries import BenchPhoto, sent
-from service.bench.starts import require_kind, start_pose
+from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
+from service.bench.start_poses import require_kind, start_pose
 from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
 from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize

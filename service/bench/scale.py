@@ -19,8 +19,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from service.bench.metrics import COARSE, FINE, Outcome, errors, units_of
-from service.bench.queries import find_photos
+from service.bench.bench_photos import find_photos
+from service.bench.pose_metrics import COARSE, FINE, Outcome, errors, units_of
 from service.errors import BackendMissing, InvalidRequest
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
 from service.photos.images import read_query
@@ -51,7 +51,7 @@ def run(
         raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
     if not _STATUS.exists():
         raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
-    from service.bench.tiles import write_folder  # loads gsply
+    from service.bench.large_scenes import write_folder  # loads gsply
 
     held_back = [name for photo in find_photos(folder) for name in photo.names]
     scene = load_scene(folder, without_photos=held_back)
@@ -81,7 +81,7 @@ def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:
 
 
 def _sized(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
-    from service.bench.tiles import thinned, tiled
+    from service.bench.large_scenes import thinned, tiled
 
     if count < scene.count:
         return thinned(scene, count, LoadedScene.of(scene).rasterizer)

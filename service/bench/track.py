@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from service.bench.metrics import COARSE, FINE, Outcome, Units, errors, nees, units_of
+from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, nees, units_of
 from service.errors import SceneNotFound
 from service.geometry import pose_distance, quat_from_rotation, rotation_from_quat
 from service.interfaces import Rasterizer

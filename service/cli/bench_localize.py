@@ -44,7 +44,7 @@ def bench_localize(
     json_file: JsonFileOption = None,
 ) -> None:
     """Localize a scene's test photos and compare with the truth."""
-    from service.bench import misses as pictures
+    from service.bench import miss_images
     from service.bench.localize import Budget, run
     from service.localize import DEFAULT_MATCHER
     from service.web.schemas.parsing import options_from
@@ -69,7 +69,7 @@ def bench_localize(
             budget=Budget(budget_s, budget_renders),
             progress=counter(progress, "photos"),
             cache_dir=settings_of({}).cache_dir,
-            on_miss=pictures.kept_in(misses) if misses else None,
+            on_miss=miss_images.save_miss_images(misses) if misses else None,
         )
     write_json(json_file, outcome)
     for name, value in outcome.items():

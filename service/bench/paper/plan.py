@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
-from service.bench.starts import require_kind
+from service.bench.start_poses import require_kind
 from service.errors import UnknownName
 from service.estimators import ESTIMATORS
 from service.pose.descent.losses import LOSSES

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 
 from service.bench.localize import Subject, Trial, answered, line_of, subject, trials_of
-from service.bench.metrics import Outcome, errors
 from service.bench.paper.plan import SLOW, STEP_CURVES, Cell
+from service.bench.pose_metrics import Outcome, errors
 from service.errors import InvalidRequest
 from service.localize import Request
 from service.results import PoseEstimate

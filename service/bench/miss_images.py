@@ -25,7 +25,7 @@ DIFFERENCE_GAIN = 4.0
 Picture = Float32[np.ndarray, "h w 3"]
 
 
-def kept_in(folder: Path) -> Callable[[Subject, Trial, PoseEstimate], dict[str, Any]]:
+def save_miss_images(folder: Path) -> Callable[[Subject, Trial, PoseEstimate], dict[str, Any]]:
     """Return what `run` calls for a miss: it writes the picture, and tells its name and the residuals."""
     folder.mkdir(parents=True, exist_ok=True)
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.bench.metrics import Outcome, Units, errors, summary, units_of
+from service.bench.pose_metrics import Outcome, Units, errors, summary, units_of
 from service.geometry import look_at, moved, pose_distance, so3_exp
 from service.pose.retrieval.scene_focus import is_forward_facing
 from service.results import Status

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64
 
-from service.bench.metrics import Units
+from service.bench.pose_metrics import Units
 from service.errors import UnknownName
 from service.geometry import rotation_from_quat, so3_exp
 from service.types import Camera, Pose
