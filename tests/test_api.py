@@ -124,19 +124,19 @@ def test_the_prior_reaches_the_estimator_in_every_spelling(shared):
         job = post(shared, prior=prior).json()
         # 1e-12: the same numbers by another way.
         assert np.allclose(job["prior"]["world_from_camera"]["matrix"], TURNED, atol=1e-12)
-        assert job["region"] is None
+        assert job["prior_region"] is None
 
 
 def test_a_job_tells_its_region(shared):
     box = [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]]
     job = post(shared, prior={"box": box}).json()
     assert job["prior"] is None
-    assert job["region"] == {"box": box, "covariance": None}
+    assert job["prior_region"] == {"box": box, "covariance": None}
     guess = {"world_from_camera": TURNED.tolist()}
-    covariance = post(shared, prior=guess | {"sigma_deg": 2, "sigma_units": 0.5}).json()["region"]["covariance"]
+    covariance = post(shared, prior=guess | {"sigma_deg": 2, "sigma_units": 0.5}).json()["prior_region"]["covariance"]
     assert np.allclose(covariance["matrix"], np.diag(np.r_[np.full(3, np.radians(2)), np.full(3, 0.5)] ** 2))
     again = post(shared, prior=guess | {"covariance": covariance["matrix"]}).json()
-    assert again["region"]["covariance"] == covariance
+    assert again["prior_region"]["covariance"] == covariance
 
 
 def test_events_come_live_from_the_first_and_end_with_the_result(client, stepping):
@@ -409,7 +409,7 @@ def test_a_corrupt_scene_is_told_and_harms_no_other(stepping, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.ply").write_bytes(text)
     with serving(create_app(settings(scenes=[tmp_path], cache_dir=tmp_path))) as client:
-        until(lambda: not client.get("/readyz").json()["awaited"])
+        until(lambda: not client.get("/readyz").json()["pending"])
         ready = client.get("/readyz")
         assert (ready.status_code, len(ready.json()["failed"])) == (503, 2)
         states = {s["id"]: (s["state"], s["error"]["code"]) for s in client.get("/scenes").json()["scenes"]}
@@ -427,7 +427,7 @@ def test_a_scene_still_loading_is_not_ready(stepping):
     with serving(create_app(settings(), {"room": scene})) as client:
         until(scene.matcher.asked.is_set)
         ready = client.get("/readyz")
-        assert (ready.status_code, ready.json()["awaited"]) == (503, ["scene room: preparing"])
+        assert (ready.status_code, ready.json()["pending"]) == (503, ["scene room: preparing"])
         assert client.get("/livez").status_code == 200
         scene.matcher.go_on.set()
         until(lambda: client.get("/readyz").status_code == 200)

@@ -120,7 +120,7 @@ def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
         degrees, units = pose_distance(Pose(np.array(frame["world_from_camera"]["matrix"])), pose)
         assert degrees < 0.2  # seen: 0.02
         assert units < 0.01  # seen: 0.0006
-    assert [frame["followed"] for frame in found] == [False, True, True, True]
+    assert [frame["tracked"] for frame in found] == [False, True, True, True]
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert [row["time_s"] for row in rows] == ["0.0", "0.1", "0.2", "0.3"]
     lines = np.loadtxt(trajectory)

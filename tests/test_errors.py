@@ -91,7 +91,7 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
         }
         app = create_app(settings(**changes))
         with serving(app) as client:
-            until(lambda: not client.get("/readyz").json()["awaited"], 100)
+            until(lambda: not client.get("/readyz").json()["pending"], 100)
             client.post("/scenes/away/unload")
             client.post("/scenes/slow/load")
             done = post(client, scene="good").json()

@@ -66,19 +66,19 @@ def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
         until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]), 60)
         for asked, expected in (("auto", {"attic", "cellar", "hall"}), (["hall", "attic", "hall"], {"hall", "attic"})):
             job = post(client, scene=asked).json()
-            assert (job["state"], job["scene_asked"]) == ("succeeded", asked)
-            assert {each["id"] for each in job["result"]["considered"]} == expected
+            assert (job["state"], job["requested_scene"]) == ("succeeded", asked)
+            assert {each["id"] for each in job["result"]["scene_ranking"]} == expected
             assert job["scene"] == job["result"]["scene"]["id"] in expected
             assert job["result"]["status"] == "not_localized"  # the stand-ins see nothing
             assert [t["stage"] for t in job["result"]["timings"]][:2] == ["decode", "scene_ranking"]
         one = post(client, scene=["cellar"]).json()
-        assert (one["scene"], one["result"]["considered"]) == ("cellar", [])
+        assert (one["scene"], one["result"]["scene_ranking"]) == ("cellar", [])
         assert_problem(post(client, scene=["hall", "pantry"]), 404, "scene_not_found", "scene")
         assert_problem(post(client, scene=[]), 400, "invalid_request")
         client.post("/scenes/cellar/unload")
         until(lambda: client.get("/scenes/cellar").json()["state"] == "unloaded")
         job = post(client, scene="auto").json()
-        assert {each["id"] for each in job["result"]["considered"]} == {"attic", "hall"}
+        assert {each["id"] for each in job["result"]["scene_ranking"]} == {"attic", "hall"}
         assert all(scene["jobs"] == 0 for scene in client.get("/scenes").json()["scenes"])
 
 

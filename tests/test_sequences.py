@@ -47,7 +47,7 @@ def test_a_video_is_one_job(client):
 
 def test_a_single_photo_has_no_frames(client):
     job = post(client).json()
-    assert (job["result"]["frames"], job["result"]["considered"]) == (None, [])
+    assert (job["result"]["frames"], job["result"]["scene_ranking"]) == (None, [])
     _, _, record = events(client.get(job["links"]["events"]).text)[0]
     assert record["frame"] is None
 

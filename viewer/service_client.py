@@ -240,7 +240,7 @@ def parse_record(raw: dict[str, Any]) -> IterationRecord:
     return IterationRecord(
         stage=raw["stage"],
         pose=_pose(raw),
-        lens=IntrinsicsCorrection(**raw["lens"]),
+        lens=IntrinsicsCorrection(**raw["intrinsics_correction"]),
         matches=matches
         and MatchVectors(
             frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),

@@ -14,7 +14,7 @@ _POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 def photo_line(name: str, result: Result) -> str:
     """Return a photo's answer as a line."""
-    status = f"{result.status} in {result.scene.id}" if result.considered else result.status
+    status = f"{result.status} in {result.scene.id}" if result.scene_ranking else result.status
     told = _line(name, status, result.score, result.pose.world_from_camera)
     return f"{told}. {result.hint}" if result.hint else told
 
@@ -23,7 +23,7 @@ def frame_line(frame: FrameOut) -> str:
     """Return the answer of one photo of a sequence as a line."""
     name = f"{frame.time_s:.3f} s, {frame.name}"
     told = _line(name, frame.status, frame.score, frame.world_from_camera)
-    return told if frame.followed else f"{told}, searched"
+    return told if frame.tracked else f"{told}, searched"
 
 
 def _line(name: str, status: str, score: float, world_from_camera: Transform) -> str:
@@ -48,7 +48,7 @@ def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None
 def write_frame_table(path: Path, frames: Sequence[FrameOut]) -> None:
     """One row a photo of the sequence; the pose is world_from_camera in OpenCV axes."""
     rows = [
-        (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.followed)) for f in frames
+        (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.tracked)) for f in frames
     ]
     _write(path, ("photo", "time_s", "status", "reason", "score", *_POSE_COLUMNS, "followed"), rows)
 

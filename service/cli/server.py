@@ -70,8 +70,8 @@ def _announce(
         while not server.started:
             time.sleep(0.05)
         scenes = application.state.parts.scenes
-        while awaited := scenes.readiness().awaited:
-            status.update(", ".join(awaited))
+        while pending := scenes.readiness().pending:
+            status.update(", ".join(pending))
             time.sleep(0.1)
     readiness, url = scenes.readiness(), settings.loopback_url
     entrance = f"?key={key}" if key else ""

@@ -45,7 +45,7 @@ class Trajectory:
         self._exhausted |= found.exhausted
         record = replace(
             last,
-            stage="track" if frame.followed else "localize",
+            stage="track" if frame.tracked else "localize",
             pose=shown.pose,
             lens=shown.lens,
             index=frame.index,
@@ -94,7 +94,7 @@ def _frame_out(index: int, found: SequencePose) -> FrameOut:
         status=verdict.status,
         reason=verdict.reason,
         score=verdict.score,
-        followed=estimate.records[-1].stage == "track",
+        tracked=estimate.records[-1].stage == "track",
         world_from_camera=transform_out(estimate.pose.world_from_camera),
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
     )

@@ -249,10 +249,10 @@ class Scenes:
         loaded = [e.loaded for e in entries if e.loaded]
         return Readiness(
             ready=usable and not awaited,
-            awaited=awaited,
+            pending=awaited,
             failed=failed,
             rasterizers=sorted({scene.rasterizer.name for scene in loaded}),
-            passed_over=sorted({scene.passed_over for scene in loaded if scene.passed_over}),
+            skipped_rasterizers=sorted({scene.passed_over for scene in loaded if scene.passed_over}),
         )
 
     # ------------------------------------------------------------------ on the loading thread

@@ -1,4 +1,4 @@
-"""What an operator can set: arguments of `splatfix serve`, `SPLATFIX_*` in the environment, or a TOML file."""
+"""Settings of the service: arguments of `splatfix serve`, `SPLATFIX_*` in the environment, or a TOML file."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 from service.web.schemas.parsing import MAX_FRAMES
 
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
-"""Where `splatfix serve` keeps its jobs, a folder for each port."""
-
+"""Folder in which `splatfix serve` keeps its jobs, in a subfolder for each port."""
 
 CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "splatfix"
-
+"""Folder of the settings' file and of the API keys."""
 
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 
 def _cores() -> int:
-    """Count the processors that this process may use; a container's limit is a quota of their time."""
+    """Count the processors that this process may use: its CPU affinity, within the CPU quota of its cgroup."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = _CPU_QUOTA.read_text().split()
@@ -33,6 +32,8 @@ def _cores() -> int:
 
 
 class Settings(BaseSettings):
+    """The settings, checked; their descriptions are shown by `splatfix doctor`."""
+
     model_config = SettingsConfigDict(env_prefix="SPLATFIX_", use_attribute_docstrings=True, extra="forbid")
 
     @classmethod
@@ -44,85 +45,86 @@ class Settings(BaseSettings):
         dotenv_settings: Any,
         file_secret_settings: Any,
     ) -> tuple[Any, ...]:
-        """Arguments win over the environment, and that over the file."""
+        """Order the sources: arguments override the environment, which overrides the file."""
         file = Path(os.environ.get("SPLATFIX_CONFIG") or CONFIG_HOME / "splatfix.toml")
         return init_settings, env_settings, TomlConfigSettingsSource(settings_cls, file)
 
     scenes: list[Path] = []
     """Scene folders, scene files, or folders of scene folders. In the environment: a JSON list."""
     preload: list[str] | None = None
-    """Scenes to load at start, by id; None: all. The others are loaded when they are asked for."""
+    """Ids of the scenes to load at start; None: all. The others are loaded when a request needs them."""
     scene_memory_bytes: int | None = Field(default=None, ge=1)
-    """What scenes may take; the one not asked for longest is dropped for another. None: no limit."""
+    """Memory limit of all loaded scenes; the least recently used one is dropped to make room. None: no limit."""
     max_scene_bytes: int = Field(default=2_000_000_000, ge=1)
-    """Of an uploaded scene; what an archive holds may be as large in all."""
+    """Largest scene file or archive that can be uploaded; also the limit of an archive's unpacked files together."""
     host: str = "127.0.0.1"
+    """Address to listen on."""
     port: int = Field(default=8000, ge=0, lt=65536)
-    """0: any free one."""
+    """Port to listen on; 0: any free one."""
     root_path: str = ""
-    """The sub-path under which a proxy shows the service, e.g. /fix; `X-Forwarded-Prefix` wins."""
+    """Sub-path under which a proxy serves the service, e.g. /fix; the header `X-Forwarded-Prefix` overrides it."""
     estimator: str = DEFAULT_ESTIMATOR
-    """Of jobs that name none; what it prepares for a scene is made at start."""
+    """Default estimator of jobs; scenes are prepared for it when they are loaded."""
     matcher: str = DEFAULT_MATCHER
-    """Of local features, for all scenes; some need weights in the folder that SPLATFIX_WEIGHTS_DIR names."""
+    """Matcher of local features, for all scenes; some need weights in the folder SPLATFIX_WEIGHTS_DIR."""
     rasterizer: str | None = None
-    """Renderer; None: the GPU's where there is one that it can use, else the CPU's."""
+    """Renderer; None: a GPU renderer if this machine has a suitable GPU, else the CPU renderer."""
     workers: int = Field(default_factory=_cores, ge=1)
-    """Jobs that run at once; each has one thread."""
+    """Number of jobs that run at once, each on one thread."""
     queue_size: int = Field(default=32, ge=1)
-    """Jobs that may wait; one more is refused with 503."""
+    """Number of jobs that may be queued; further ones are refused with 503."""
     queue_bytes: int = Field(default=500_000_000, ge=1)
-    """Decoded photos that may wait in memory."""
+    """Memory limit of the decoded photos of queued jobs."""
     max_job_s: float = Field(default=300.0, gt=0)
-    """The longest budget of a job; also of one that sets none."""
+    """Longest time budget of a job, and the budget of jobs that set none."""
     stuck_s: float = Field(default=120.0, gt=0)
-    """A job that tells nothing for so long is given up, and its worker replaced."""
+    """A job without a new record for this long is failed, and its worker replaced."""
     shutdown_s: float = Field(default=10.0, ge=0)
-    """What running jobs get to finish after SIGTERM; what doesn't is run again after the restart."""
+    """Time for running jobs to finish after SIGTERM; unfinished ones are run again after the restart."""
     data_dir: Path | None = None
-    """Where jobs are kept; None: in a temporary folder that goes with the process. `splatfix serve` names one."""
+    """Folder of the stored jobs and uploaded scenes; None: a temporary one. `splatfix serve` has its own default."""
     keep_jobs: int = Field(default=10_000, ge=1)
-    """Ended jobs that are remembered."""
+    """Number of ended jobs that are kept."""
     keep_days: float = Field(default=30.0, gt=0)
-    """How long ended jobs are remembered."""
+    """How long ended jobs are kept."""
     keep_bytes: int = Field(default=2_000_000_000, ge=0)
-    """What ended jobs may take on disk, with their records and photos."""
+    """Disk space of ended jobs, with their records and photos."""
     photo_grace_s: float = Field(default=900.0, ge=0)
-    """How long after its job a photo can be looked at, unless the request says `keep_photo`; 0: not at all."""
+    """How long a photo is kept after its job, unless the request has `keep_photo`; 0: deleted with the job's end."""
     crashes: int = Field(default=3, ge=1)
-    """A job that was running in so many crashes is not run again."""
+    """A job whose attempts were lost this many times, by crashes of the service, is not run again."""
     max_upload_bytes: int = Field(default=50_000_000, ge=1)
-    """Of a photo, a video, or several photos together."""
+    """Size limit of a photo, a video, or several photos together."""
     max_frames: int = Field(default=MAX_FRAMES, ge=1)
-    """Photos, or frames of a video, in one job."""
+    """Number of photos, or frames of a video, in one job."""
     max_uploads: int = Field(default=8, ge=1)
-    """Requests whose bodies come in at once."""
+    """Number of request bodies that are received at once."""
     upload_s: float = Field(default=60.0, gt=0)
-    """How long a body may take to come in, and a second more for each megabyte that it may have."""
+    """Time limit for receiving a request body, plus one second for each megabyte of its size limit."""
     send_s: float = Field(default=30.0, gt=0)
-    """A client that takes nothing of its answer for so long is dropped."""
+    """A client that reads nothing of its response for this long is disconnected."""
     rate_limit: str = "30/second"
-    """Requests of one client that make work, e.g. 10/second or 600/minute; empty: any number."""
+    """Rate limit of each client, for requests other than GET, e.g. 10/second or 600/minute; empty: none."""
     max_wait_s: float = Field(default=60.0, gt=0, le=3600)
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
-    """Where view indexes are kept between runs; None: nowhere."""
+    """Cache folder of the view indexes; None: no cache."""
     keys_file: Path | None = CONFIG_HOME / "keys.json"
-    """API keys, as `splatfix keys add` stores them. If it has any, everybody needs one."""
+    """File of API keys, as `splatfix keys add` writes it. If it has keys, every client needs one."""
     open: bool = False
-    """Listen beyond this machine without keys."""
+    """Allow other machines to use the service without keys."""
     allowed_hosts: list[str] = []
-    """Names under which the service may be called, e.g. of a proxy; empty: any, except while there are no keys."""
+    """Accepted host names, e.g. a proxy's; empty: any with API keys, only this machine's without."""
     cors_origins: list[str] = []
-    """Origins of other sites whose pages may use the service, e.g. https://example.org."""
+    """Origins of other sites whose pages may use the service (CORS), e.g. https://example.org."""
     log_json: bool | None = None
-    """Log lines of JSON; None: unless a person watches."""
+    """Log in JSON; None: unless the log goes to a terminal."""
     viewer: bool = True
-    """Start the viewer and relay it under /viewer."""
+    """Start the viewer, and serve it under /viewer."""
 
     @property
     def loopback_url(self) -> str:
-        """Where this machine reaches the service."""
+        """URL of the service for clients on this machine."""
         everywhere = self.host in ("0.0.0.0", "::", "")
         host = "127.0.0.1" if everywhere else f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}"

@@ -1,19 +1,19 @@
-"""The routes: thin. Each takes validated values, asks the jobs or the scenes, and returns a model.
+"""The routes. Each takes validated values, calls the jobs or the scenes, and returns a model.
 
 POST   /localize                              202 + Location (200 with `Prefer: wait=N` when done in time)
-POST   /geopose                               the same for GeoPoseProtocol clients: on Earth, one answer
+POST   /geopose                               the same for GeoPoseProtocol clients: on Earth, in one request
 GET    /jobs                                  newest first, filtered, in pages
 GET    /jobs/{id}                             state, result or error
 DELETE /jobs/{id}                             cancel; takes effect between two records
 GET    /jobs/{id}/events                      server-sent events: `record`..., then `result` or `error`
-GET    /jobs/{id}/photo                       JPEG: upright, as decoded
+GET    /jobs/{id}/photo                       JPEG, upright
 GET    /jobs/{id}/trace                       all records
 GET    /jobs/{id}/iterations/{k}/render.jpg   record k's pose (or `last`), photo's size
-GET    /jobs/{id}/export/{format}             the pose as COLMAP, nerfstudio, TUM or GeoPose have it
+GET    /jobs/{id}/export/{format}             the pose for COLMAP, nerfstudio, TUM tools or GeoPose
 GET    /scenes                                GET /scenes/{id}
 PUT    /scenes/{id}                           upload; POST .../load, .../unload; DELETE
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
-POST   /scenes/{id}/render                    a picture or depth from any pose
+POST   /scenes/{id}/render                    colour or depth from any pose
 POST   /tokens                                short-lived, for pages
 GET    /capabilities, /version, /livez, /readyz, /metrics
 """

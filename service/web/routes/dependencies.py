@@ -1,4 +1,4 @@
-"""What the routes share: the app's parts as dependencies."""
+"""Dependencies of the routes: the app's parts, the caller, the sub-path, the job of an id."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.web.settings import Settings
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """What the routes work with; one per app."""
+    """Everything that routes use; one per app."""
 
     settings: Settings
     scenes: Scenes
@@ -31,12 +31,12 @@ class Parts:
     keys: KeyRing
     metrics: Metrics
     decoding: anyio.CapacityLimiter
-    """Photos decoded at once: each may take 450 MB for a moment."""
+    """Limits the photos that are decoded at once: one may take 450 MB."""
     rendering: anyio.CapacityLimiter
-    """Pictures rendered at once for looking at: a renderer's thread keeps working memory."""
+    """Limits the images that are rendered at once for clients: each thread of a renderer keeps working memory."""
 
     async def drawn(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
-        """Render something for looking at, off the event loop."""
+        """Render an image for a client in a thread, and count it in the metrics."""
         began = time.perf_counter()
         picture = await to_thread.run_sync(draw, limiter=self.rendering)
         self.metrics.rendered(scene_id, time.perf_counter() - began)

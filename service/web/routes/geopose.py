@@ -1,4 +1,4 @@
-"""AR clients that speak GeoPoseProtocol: `POST /geopose`."""
+"""`POST /geopose`: localization for AR clients that use the GeoPoseProtocol."""
 
 from __future__ import annotations
 
@@ -49,13 +49,13 @@ async def geopose(
     wanted: gpp.GeoPoseRequest,
     request: Request,
     parts: PartsOf,
-    scene: Annotated[str | None, Query(description="Left out: the nearest that has a place on Earth.")] = None,
-    accept: Annotated[str, Header(description=f"`{GEOPOSE}`: only the pose, as OGC GeoPose 1.0 has it")] = "",
+    scene: Annotated[str | None, Query(description="Default: the nearest scene with a `geo_anchor`.")] = None,
+    accept: Annotated[str, Header(description=f"`{GEOPOSE}`: return only the pose, as OGC GeoPose 1.0")] = "",
 ) -> Response:
-    """Find where a photo was taken, in Open AR Cloud's GeoPoseProtocol: one request, one answer, on Earth.
+    """Localize a photo on Earth with Open AR Cloud's GeoPoseProtocol, in one request.
 
-    Camera axes are +x right, +y up, +z backwards (WebXR's). The search is a job like any other; it takes at most
-    as long as `Prefer: wait` may.
+    Camera axes are +x right, +y up, +z backwards, as in WebXR. The search is a job like any other, with the longest
+    time that `Prefer: wait` may have.
     """
     photo, intrinsics = gpp.image_of(wanted)
     if is_sequence(photo):
@@ -63,7 +63,7 @@ async def geopose(
     entry = parts.scenes.entry(scene or gpp.nearest_scene(parts.scenes.entries(), wanted))
     anchor = parts.scenes.get(entry.id).scene.info.geo_anchor
     if anchor is None:
-        raise NoGeoAnchor(f"scene '{entry.id}' has no place on Earth.", where="scene")
+        raise NoGeoAnchor(f"scene '{entry.id}' has no geo_anchor.", where="scene")
     wait_s = parts.settings.max_wait_s
     fields = LocalizeFields(scene=entry.id, intrinsics=intrinsics, deadline_s=wait_s)
     order = Order(Body(photo, "", {}), fields, client_of(request.scope), None, hashlib.sha256(photo).hexdigest())

@@ -1,4 +1,4 @@
-"""What became of a photo: `/jobs`."""
+"""`/jobs`: state, records, photo, renders and exports of jobs."""
 
 from __future__ import annotations
 
@@ -38,14 +38,12 @@ def list_jobs(
     scene: str | None = None,
     estimator: str | None = None,
     state: JobState | None = None,
-    status: Annotated[Status | None, Query(description="Of the result.")] = None,
+    status: Annotated[Status | None, Query(description="Status of the result.")] = None,
     photo: Annotated[str | None, Query(description="sha256 of the photo's file.")] = None,
-    before: Annotated[
-        int | None, Query(ge=0, lt=2**63, description="Where the page starts: take it from `next`.")
-    ] = None,
+    before: Annotated[int | None, Query(ge=0, lt=2**63, description="Start of the page, as `next` has it.")] = None,
     limit: Annotated[int, Query(ge=1, le=500)] = 100,
 ) -> JobList:
-    """List the jobs that are remembered, newest first; those that fit, where a filter is given."""
+    """List the stored jobs that match all given filters, newest first, in pages."""
     wanted = JobFilter(scene, estimator, state, status, photo, before)
     page = parts.jobs.page(wanted, limit + 1)
     given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
@@ -62,14 +60,14 @@ def list_jobs(
 @router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
 @route_policy(role="read")
 def get_job(job: JobOf, root: RootOf) -> JobOut:
-    """Say how a job stands; with its result or its error when it has ended."""
+    """Return a job; with its result or its error if it has ended."""
     return documents.job_document(job, root)
 
 
 @router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
 @route_policy(role="localize", body=SMALL_BODY, rate_limited=True)
 def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
-    """Cancel: at once if the job waits, after its current step if it runs, without effect if it has ended."""
+    """Cancel a job: at once if it is queued, after its current step if it runs, without effect if it has ended."""
     parts.jobs.cancel(job)
     return documents.job_document(parts.jobs.get(job.id), root)
 
@@ -84,7 +82,7 @@ def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
 async def job_events(
     job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
 ) -> AsyncIterator[ServerSentEvent]:
-    """Follow a job: an event `record` for each step from the first on, then `result` or `error`.
+    """Stream a job as server-sent events: `record` for each step from the first on, then `result` or `error`.
 
     A `record` has `attempt.index` as id and a `Record` as data; after a crash of the service another attempt
     starts again at index 0. The last event has the id `end` and a `JobOut` as data: `result` if the job succeeded,
@@ -110,7 +108,7 @@ async def job_events(
 
 
 def _resumed(last_event_id: str) -> tuple[int, int]:
-    """Return the attempt that a client knows, and how many of its records."""
+    """Return the attempt of the last event that a client has, and how many of its records the client has."""
     found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
     return (int(found[1]), int(found[2]) + 1) if found else (0, 0)
 
@@ -123,7 +121,9 @@ def _resumed(last_event_id: str) -> tuple[int, int]:
 )
 @route_policy(role="read")
 async def job_photo(job: JobOf, parts: PartsOf) -> Response:
-    """Return the photo as the estimator sees it: upright, undistorted, perhaps reduced. For a while, or if kept."""
+    """Return the photo as the estimator gets it: upright, undistorted, reduced if large. It is deleted some time after
+    the job, unless the request has `keep_photo`.
+    """
     photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
     return Response(photo, media_type="image/jpeg")
 
@@ -131,7 +131,7 @@ async def job_photo(job: JobOf, parts: PartsOf) -> Response:
 @router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors("job_not_found"))
 @route_policy(role="read")
 def job_trace(job: JobOf, parts: PartsOf) -> Trace:
-    """Return all records so far, of the latest attempt."""
+    """Return all records of the latest attempt so far."""
     return documents.job_trace(job, parts.jobs.records(job))
 
 
@@ -146,14 +146,14 @@ async def job_render(
     job: JobOf,
     parts: PartsOf,
     index: Annotated[
-        Literal["last"] | Annotated[int, Field(ge=0)], Path(description="Of the record; `last`: the latest.")
+        Literal["last"] | Annotated[int, Field(ge=0)], Path(description="Index of the record; `last`: the latest.")
     ],
     camera: Annotated[
         Literal["pose", "matches"],
-        Query(description="The record's pose in the photo's size, or the camera that its matches refer to."),
+        Query(description="`pose`: the record's pose, photo's size; `matches`: the camera that its matches refer to."),
     ] = "pose",
 ) -> Response:
-    """Render the scene as a record's camera sees it."""
+    """Render the scene from the camera of a record."""
     text = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
     photo = PhotoOut.model_validate_json(job.photo)
     seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
@@ -172,7 +172,7 @@ def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
     response_class=Response,
     responses={
         200: {
-            "description": "Text or JSON, as the format has it",
+            "description": "Text or JSON, by format",
             "content": {kind: {} for kind in EXPORT_TYPES.values()},
         }
     }
@@ -180,12 +180,12 @@ def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
 )
 @route_policy(role="read")
 def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
-    """Return the pose as other programs read it; not of a job that found none.
+    """Return the pose in the format of another program, unless the job is `not_localized`.
 
-    `colmap`: an entry of `images.txt`, its camera in a comment. `nerfstudio`: an entry of `frames` in
-    `transforms.json`. `tum`: a line of a trajectory, stamped with the time of the job's acceptance. `geopose`: OGC
+    `colmap`: an entry of `images.txt`, with its camera in a comment. `nerfstudio`: an entry of `frames` in
+    `transforms.json`. `tum`: a line of a trajectory, with the time at which the job was created. `geopose`: OGC
     GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
-    an `images.txt`, a `transforms.json` or a trajectory in the photos' own times; `geopose` has the last.
+    an `images.txt`, a `transforms.json`, or a trajectory with the photos' times; `geopose` has the last one only.
     """
     name, created, result = documents.answer(job)
     return Response(exported(format, name, created, result), media_type=EXPORT_TYPES[format])

@@ -1,4 +1,4 @@
-"""A photo in: `POST /localize`."""
+"""`POST /localize`: accept a photo, queue a job."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _BODY = {
     }
 }
 _ACCEPTED = {
-    200: {"description": "`Prefer: wait=N`, and the job ended in time", "model": JobOut},
+    200: {"description": "With `Prefer: wait=N`: the job ended in time", "model": JobOut},
     202: {
         "description": "Accepted",
         "headers": {"Location": {"description": "The job", "schema": {"type": "string"}}},
@@ -82,20 +82,20 @@ async def localize_photo(
     response: Response,
     parts: PartsOf,
     root: RootOf,
-    prefer: Annotated[str, Header(description="`wait=N`: answer with the ended job if it takes at most N s")] = "",
+    prefer: Annotated[str, Header(description="`wait=N`: wait up to N s for the job to end before answering")] = "",
     idempotency_key: Annotated[
         str | None,
         Header(
             min_length=1,
             max_length=200,
-            description="Send a request again with the same key: it is the same job, not a second",
+            description="A request that is repeated with the same key returns the same job, and makes no second one",
         ),
     ] = None,
 ) -> JobOut:
-    """Find where a photo was taken. What is wrong with the request is told at once; the search is a job.
+    """Localize a photo: check the request, queue a job, and return it.
 
-    Several photos of one camera, or a video, are one job: each is followed from the one before, an event `record`
-    tells each one's answer, and the result's `frames` has them all.
+    Several photos of one camera, or a video, are one job: the camera is tracked from each frame to the next, an event
+    `record` has each frame's answer, and `frames` of the result has all of them.
     """
     body = await read_body(request, parts.settings.max_frames)
     fields = read_fields(body.fields)

@@ -1,4 +1,4 @@
-"""What photos are localized in: `/scenes`."""
+"""`/scenes`: list, upload, load, render and delete scenes."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ router = APIRouter()
 @router.get("/scenes", tags=["scenes"], responses=errors())
 @route_policy(role="read")
 async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
-    """List the scenes and how far they have come."""
+    """List the scenes with their states."""
     return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
 @route_policy(role="read")
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
-    """Describe a scene, with its training cameras."""
+    """Return a scene with its training cameras."""
     return documents.scene_document(parts.scenes.entry(scene_id), root)
 
 
@@ -59,9 +59,9 @@ async def upload_scene(
     request: Request,
     parts: PartsOf,
     root: RootOf,
-    file: Annotated[str, Query(description="The file's name: its suffix says of which format it is.")] = "scene.ply",
+    file: Annotated[str, Query(description="Name of the file; its suffix decides the format.")] = "scene.ply",
 ) -> SceneOut:
-    """Add a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, then loaded."""
+    """Upload a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, stored and loaded."""
     if any(entry.id == scene_id for entry in parts.scenes.entries()):
         raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
     path = await parts.uploads.receive(scene_id, file, request.stream())
@@ -75,7 +75,7 @@ async def upload_scene(
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
-    """Load a scene into memory, and make it ready; again, if that failed before."""
+    """Load a scene into memory and prepare it; also a scene whose loading failed."""
     entry = parts.scenes.entry(scene_id)
     parts.scenes.load(entry)
     return documents.scene_summary(entry, root)
@@ -89,7 +89,7 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
-    """Drop a scene from memory when the last job on it has ended; it takes no more, until it is loaded again."""
+    """Remove a scene from memory once the last job on it has ended. It accepts no new jobs until it is loaded again."""
     entry = parts.scenes.entry(scene_id)
     parts.scenes.unload(entry)
     return documents.scene_summary(entry, root)
@@ -103,10 +103,10 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def delete_scene(scene_id: str, parts: PartsOf) -> None:
-    """Delete an uploaded scene with its files; not one that the operator named, nor one that jobs use."""
+    """Delete an uploaded scene and its files; not a scene of the settings, nor one that jobs use."""
     entry = parts.scenes.entry(scene_id)
     if not entry.uploaded or entry.path is None:
-        raise SceneInUse("the operator named this scene; it can only be unloaded.", where="scene")
+        raise SceneInUse("this scene is in the service's settings; it can only be unloaded.", where="scene")
     if entry.jobs:
         raise SceneInUse(f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
     parts.scenes.remove(entry)
@@ -121,7 +121,7 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
 )
 @route_policy(role="read")
 async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
-    """Return a small picture of the scene, as its middle training camera sees it."""
+    """Return a small image of the scene from its middle training camera."""
     draw = partial(thumbnail, parts.scenes.get(scene_id))
     return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
 
@@ -142,9 +142,11 @@ async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
 async def scene_splats(
     scene_id: str,
     parts: PartsOf,
-    limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="At most so many.")] = 200_000,
+    limit: Annotated[
+        int, Query(alias="max", ge=1, le=MAX_SPLATS, description="Largest number of Gaussians to return.")
+    ] = 200_000,
 ) -> Response:
-    """Return the scene's most important Gaussians for drawing, as little-endian binary."""
+    """Return the most important Gaussians of the scene for drawing, as little-endian binary."""
     pack = partial(splats.packed_splats, parts.scenes.get(scene_id).scene, limit)
     return Response(await to_thread.run_sync(pack, limiter=parts.rendering), media_type=splats.BINARY)
 
@@ -154,7 +156,7 @@ async def scene_splats(
     tags=["scenes"],
     response_class=Response,
     responses={
-        200: {"description": "The picture", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
+        200: {"description": "The image", "content": {kind: {} for kind in PICTURE_TYPES.values()}},
     }
     | errors(
         *("invalid_request", "bad_request", "request_timeout", *SCENE_ERRORS, "invalid_intrinsics", "invalid_prior"),
@@ -163,6 +165,6 @@ async def scene_splats(
 )
 @route_policy(role="read", body=SMALL_BODY, rate_limited=True)
 async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
-    """Render a scene from any pose: a picture, or the depth of what is seen there."""
+    """Render a colour image or a depth map of a scene from any pose."""
     draw = partial(picture, parts.scenes.get(scene_id), wanted)
     return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])

@@ -1,4 +1,4 @@
-"""The service itself: what it can do, and whether it is well."""
+"""Capabilities, versions, health, metrics and tokens of the service."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ router = APIRouter()
 @router.get("/capabilities", tags=["service"], responses=errors())
 @route_policy(role="read")
 def get_capabilities(parts: PartsOf) -> Capabilities:
-    """Say which estimators, matchers, renderers and formats there are, and the estimators' options."""
+    """Return the estimators with their options, the matchers, renderers and scene formats."""
     return documents.capabilities(parts.settings)
 
 
 @router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))
 @route_policy(role="read")
 def get_version() -> dict[str, str]:
-    """Return the versions of this service and of what its results depend on."""
+    """Return the versions of the service and of the packages that results depend on."""
     return documents.versions()
 
 
 @router.get("/livez", tags=["service"], responses=errors(always=_CANNOT_FAIL))
 @route_policy(role=None)
 async def live() -> Liveness:
-    """Answer, as long as the process can."""
+    """Answer as long as the process runs."""
     return Liveness()
 
 
-@router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not yet"}} | errors())
+@router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not ready"}} | errors())
 @route_policy(role=None)
 async def ready(parts: PartsOf, response: Response) -> Readiness:
-    """Say whether photos can be localized at full speed: scenes loaded and ready, workers and disk at work."""
+    """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work."""
     readiness = parts.scenes.readiness()
     ill = parts.jobs.ailments()
     readiness = readiness.model_copy(update={"ready": readiness.ready and not ill, "failed": readiness.failed + ill})
@@ -54,18 +54,18 @@ async def ready(parts: PartsOf, response: Response) -> Readiness:
     "/metrics",
     tags=["service"],
     response_class=Response,
-    responses={200: {"description": "Prometheus's text form", "content": {"text/plain": {}}}} | errors(),
+    responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}} | errors(),
 )
 @route_policy(role="read")
 def get_metrics(parts: PartsOf) -> Response:
-    """Return what there is to watch: requests, queue, jobs by stage and outcome, memory by scene, workers."""
+    """Return the metrics: requests, queue, jobs by stage and status, memory by scene, workers."""
     return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
 
 
 @router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))
 @route_policy(role="read", body=SMALL_BODY, rate_limited=True)
 def make_token(parts: PartsOf, caller: CallerOf) -> Token:
-    """Make a token that stands for the caller's key for some minutes, to open a page with: `/viewer/?token=…`."""
+    """Make a token with the role of the caller's key, valid for some minutes, to open a page: `/viewer/?token=…`."""
     if caller is None:
-        raise NoKeys("the service has no keys: its pages are open.", where="header.authorization")
-    return Token(token=parts.keys.token(caller, TOKEN_S), seconds=TOKEN_S)
+        raise NoKeys("the service has no keys: its pages need none.", where="header.authorization")
+    return Token(token=parts.keys.token(caller, TOKEN_S), expires_in_s=TOKEN_S)

@@ -13,8 +13,8 @@ from service.web.schemas.geodesy import geographic
 from service.web.schemas.job_results import (
     Alternative,
     CandidatesOut,
-    Considered,
     MatchesOut,
+    RankedScene,
     Record,
     Result,
     SceneRef,
@@ -27,8 +27,8 @@ from service.web.schemas.poses import (
     GeoPose,
     GeoPosition,
     GeoQuaternion,
+    IntrinsicsCorrectionOut,
     IntrinsicsOut,
-    LensOut,
     Matrix,
     NamedCameraOut,
     PoseOut,
@@ -109,7 +109,7 @@ def record_out(record: IterationRecord) -> Record:
         index=record.index,
         stage=record.stage,
         world_from_camera=rows(record.pose.world_from_camera),
-        lens=LensOut(**asdict(record.lens)),
+        intrinsics_correction=IntrinsicsCorrectionOut(**asdict(record.lens)),
         elapsed_s=record.elapsed_s,
         cpu_s=record.cpu_s,
         loss=record.loss,
@@ -134,8 +134,8 @@ def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> 
     if of_matches and record.matches is not None:
         camera = record.matches.render_camera
         return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
-    lens = IntrinsicsCorrection(**record.lens.model_dump())
-    return Camera(_intrinsics_in(photo).corrected(lens), Pose(np.array(record.world_from_camera)))
+    correction = IntrinsicsCorrection(**record.intrinsics_correction.model_dump())
+    return Camera(_intrinsics_in(photo).corrected(correction), Pose(np.array(record.world_from_camera)))
 
 
 def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
@@ -180,7 +180,7 @@ def result_out(
         intrinsics_source=estimate.intrinsics_source,
         focal_sigma_px=verdict.focal_sigma * estimate.intrinsics.fx if verdict.focal_sigma else None,
         inliers=verdict.inliers,
-        agreement=verdict.agreement,
+        gradient_correlation=verdict.agreement,
         coverage=verdict.coverage,
         signals=dict(verdict.signals),
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
@@ -191,7 +191,7 @@ def result_out(
         matcher=estimate.matcher,
         rasterizer=estimate.rasterizer,
         scene=SceneRef(id=estimate.scene_id, sha256=estimate.scene_sha256),
-        considered=[Considered(id=scene, matches=matches) for scene, matches in estimate.considered],
+        scene_ranking=[RankedScene(id=scene, inliers=inliers) for scene, inliers in estimate.considered],
         versions=versions,
         warnings=list(estimate.warnings),
     )

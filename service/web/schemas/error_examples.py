@@ -103,7 +103,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/jobs",
     ),
     (e.Forbidden("the key's role is read, needed is localize."), "/localize"),
-    (e.NoKeys("the service has no keys: its pages are open.", where="header.authorization"), "/tokens"),
+    (e.NoKeys("the service has no keys: its pages need none.", where="header.authorization"), "/tokens"),
     (HTTPException(400, "Missing boundary in multipart."), "/localize"),
     (HTTPException(404, "Not Found"), "/nowhere"),
     (HTTPException(405, "Method Not Allowed"), "/localize"),

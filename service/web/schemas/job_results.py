@@ -1,4 +1,4 @@
-"""What a job reports and finds, as the API returns it: the record of each step, and the result."""
+"""The record of each step of a job, and the result, as the API returns them."""
 
 from __future__ import annotations
 
@@ -8,22 +8,32 @@ from pydantic import Field
 
 from service.results import Reason, Status
 from service.web.api_model import Model
-from service.web.schemas.poses import CameraOut, Covariance, GeoPose, IntrinsicsOut, LensOut, Matrix, PoseOut, Transform
+from service.web.schemas.poses import (
+    CameraOut,
+    Covariance,
+    GeoPose,
+    IntrinsicsCorrectionOut,
+    IntrinsicsOut,
+    Matrix,
+    PoseOut,
+    Transform,
+)
 
 
 class MatchesOut(Model):
-    """Matches between the photo and a render: row i of each list belongs together."""
+    """Point matches between the photo and a render; entry i of each list belongs to match i. At most 300."""
 
     photo_px: list[list[float]]
     """x, y in pixels of the image that `/jobs/{id}/photo` returns."""
     render_px: list[list[float]]
-    """x, y in pixels of `render_camera`, which need not have the photo's size."""
+    """x, y in pixels of `render_camera`, whose size may differ from the photo's."""
     inlier: list[bool]
+    """Whether the match agrees with the camera that was estimated from all of them."""
     render_camera: CameraOut
 
 
 class CandidatesOut(Model):
-    """Poses that were weighed against one another."""
+    """Candidate poses of a step, and their scores."""
 
     world_from_camera: list[Matrix]
     scores: list[float]
@@ -31,21 +41,22 @@ class CandidatesOut(Model):
 
 
 class FrameOut(Model):
-    """Where one photo of a sequence, or one frame of a video, was taken."""
+    """The pose of one photo of a sequence, or of one frame of a video."""
 
     index: int
-    """Among those that were looked at, from 0."""
+    """Number among the frames that were localized, from 0."""
     name: str
-    """Of the file, or `frame N`: its number in the video, from 0."""
+    """Name of the file, or `frame N` with its number in the video, from 0."""
     time_s: float
-    """As it was sent, or since the video's beginning."""
+    """The time that was sent for it, or since the beginning of the video."""
     status: Status
     reason: Reason
     score: float
-    followed: bool
-    """From the photo before, without a search."""
+    """Probability that the pose is right, as the result's."""
+    tracked: bool
+    """Whether the pose was found by tracking from the previous frame; else the whole scene was searched."""
     world_from_camera: Transform
-    """The best pose found, in OpenCV camera axes. Don't use it unless `status` is `localized`."""
+    """Best pose found, in OpenCV camera axes. Use it only if `status` is `localized`."""
     covariance: Covariance | None
 
 
@@ -53,98 +64,116 @@ class Record(Model):
     """One step of a job; of a job with several photos, one photo."""
 
     index: int
+    """Number of the record, from 0 in each attempt."""
     stage: str
+    """Name of the estimator's stage that made the step."""
     world_from_camera: Matrix
-    """4x4: the best pose so far, which would be the answer if the job were stopped here."""
-    lens: LensOut
-    """What goes with the pose where the photo's intrinsics are approximate."""
+    """4x4. Best pose so far: the answer if the job ended here."""
+    intrinsics_correction: IntrinsicsCorrectionOut
+    """Estimated with the pose where the photo's intrinsics are approximate; else no correction."""
     elapsed_s: float
-    """Wall time since the job's start."""
+    """Wall time since the start of the job."""
     cpu_s: float
-    """CPU time since then."""
+    """CPU time since the start of the job."""
     loss: float | None
-    """The stage's own objective; comparable within a stage only."""
+    """Value of the stage's objective function; comparable within a stage only."""
     num_matches: int | None
     num_inliers: int | None
+    """How many of the matches agree with the pose."""
     step_deg: float | None
+    """Rotation of the pose in this step."""
     step_units: float | None
+    """Translation of the pose in this step, in scene units."""
     matches: MatchesOut | None
     candidates: CandidatesOut | None
     frame: FrameOut | None = None
-    """Of a job with several photos: this one's answer. `world_from_camera` is then the last that was localized."""
+    """Of a job with several photos: this photo's answer. `world_from_camera` is then the last pose that was
+    localized."""
 
 
 class Timing(Model):
+    """Time that a stage took."""
+
     stage: str
     wall_s: float
     cpu_s: float
 
 
 class SceneRef(Model):
+    """A scene, and the version of its file."""
+
     id: str
     sha256: str
+    """Of the scene file."""
 
 
-class Considered(Model):
-    """A scene that a photo was compared with."""
+class RankedScene(Model):
+    """How well a photo fits one of several scenes."""
 
     id: str
-    matches: int
-    """With one of its views, that agree on one camera."""
+    inliers: int
+    """Matches with one of the scene's views that agree with one camera."""
 
 
 class Alternative(Model):
-    """Another answer."""
+    """Another pose that explains the photo."""
 
     probability: float
-    """0..1, if one of the answers is right; the result's `pose` has what is left."""
+    """0..1, given that one of the poses is right; the result's `pose` has the remaining probability."""
     pose: PoseOut
 
 
 class Result(Model):
-    """The answer, what it rests on, and how it came about. "Not localized" is an answer, too."""
+    """The pose with its verification and provenance. `not_localized` is a result, not an error."""
 
     status: Status
+    """`localized`: use the pose. `uncertain`: check it. `not_localized`: don't use it."""
     reason: Reason
+    """What decided the status."""
     hint: str
-    """What to do about the reason; empty if all is well."""
+    """What to do about the reason; empty for a pose that is localized."""
     score: float
-    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); at least 0.8
-    is `localized`."""
+    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); from 0.8 on
+    the status is `localized`."""
     pose: PoseOut
-    """The best pose found. Don't use it unless `status` is `localized`."""
+    """Best pose found. Use it only if `status` is `localized`."""
     alternatives: list[Alternative] = Field(default_factory=list)
-    """Other poses that explain the photo, too, most probable first. With a `pose` that isn't far more probable than
-    these the result is `uncertain`, and its reason `ambiguous`."""
+    """Other poses that explain the photo, most probable first. If one of them is nearly as probable as `pose`, the
+    result is `uncertain` and its reason `ambiguous`."""
     geopose: GeoPose | None
-    """The same on Earth, for scenes whose manifest has a `geo_anchor`."""
+    """The pose on Earth, for scenes whose manifest has a `geo_anchor`."""
     intrinsics: IntrinsicsOut
-    """Used for the whole upright photo."""
+    """Camera model used for the whole upright photo."""
     intrinsics_source: Literal["given", "exif", "guessed"]
-    """Unless they are `exact`, focal length and principal point were estimated from there."""
+    """Where the intrinsics come from. Unless they are `exact`, focal length and principal point were then estimated
+    together with the pose."""
     focal_sigma_px: float | None
-    """Standard deviation of the estimated focal length; null where it was given as exact."""
+    """Standard deviation of the estimated focal length; null if it was given as exact."""
     inliers: int
-    agreement: float
-    """Correlation of the gradients of photo and render, -1..1."""
+    """Matches between the photo and the scene rendered at the pose that agree with the pose."""
+    gradient_correlation: float
+    """Normalized cross-correlation of the gradients of photo and render, -1..1, over the best three quarters."""
     coverage: float
-    """Share of the photo in which the scene is rendered opaque."""
+    """Share of the photo, 0..1, in which the rendered scene is opaque."""
     signals: dict[str, float]
-    """All that the gate measured at the pose, by name."""
+    """Inputs of the verification's probability model, by name."""
     covariance: Covariance | None
+    """Uncertainty of the pose; null if the photo does not determine it."""
     timings: list[Timing]
-    """By stage, in order; `decode` is the photo's."""
+    """Time by stage, in order of the stages; `decode` is reading the photo."""
     budget_exhausted: bool
+    """Whether `budget_s` ended the search."""
     seed: int
     estimator: str
     matcher: str
     rasterizer: str
     scene: SceneRef
-    """The one that the pose is in."""
-    considered: list[Considered] = Field(default_factory=list)
-    """Where several scenes were asked for: how well each fits, best first."""
+    """The scene whose frame the pose is in."""
+    scene_ranking: list[RankedScene] = Field(default_factory=list)
+    """If several scenes were requested: how well the photo fits each, best first."""
     versions: dict[str, str]
+    """Versions of the packages that the result depends on."""
     warnings: list[str]
     frames: list[FrameOut] | None = None
-    """Of a job with several photos or a video: each one's answer. All else in the result is of the last photo that was
-    localized, but for `timings`, which are all photos' together; `/jobs/{id}/photo` shows it, too."""
+    """Of a job with several photos or a video: the answer for each. The other fields are then of the last photo that
+    was localized, except `timings`, which are sums over all; `/jobs/{id}/photo` returns the same photo."""

@@ -24,79 +24,86 @@ class JobLinks(Model):
     render: str
     """The scene rendered at the latest pose."""
     export: str
-    """Followed by `/colmap`, `/nerfstudio`, `/tum` or `/geopose`."""
+    """To be followed by `/colmap`, `/nerfstudio`, `/tum` or `/geopose`."""
     viewer: str
 
 
 class PhotoOut(Model):
-    """The photo as it was decoded for the job: upright, undistorted, perhaps reduced."""
+    """The photo as it was decoded for the job: upright, undistorted, reduced if it was large."""
 
     name: str
+    """Name of the file that was sent."""
     sha256: str
-    """Of the file as it was sent: jobs on the same photo share it."""
+    """Of the file that was sent; equal for all jobs on the same photo."""
     intrinsics: IntrinsicsOut
-    """Pinhole, of the image that `/jobs/{id}/photo` returns."""
+    """Pinhole camera of the image that `/jobs/{id}/photo` returns."""
 
 
 class JobSummary(Model):
+    """A job as in the list of jobs."""
+
     id: str
     state: JobState
     scene: str
-    """Where several were asked for, one of them until it is known which."""
+    """Id of the scene. If several were requested: one of them, until it is known which one the photo shows."""
     estimator: str
     photo: PhotoOut
     attempt: int
-    """How often it was started: again after a crash of the service."""
+    """How many times the job was started; a crash of the service starts it again."""
     created: datetime
     started: datetime | None
     finished: datetime | None
     records: int
-    """How many steps it has told of."""
+    """Number of records of the latest attempt so far."""
     stage: str | None
-    """Of the latest record."""
+    """Stage of the latest record."""
     status: Status | None
-    """Of the result, when there is one."""
+    """Status of the result; null as long as there is none."""
     score: float | None
+    """Score of the result."""
     links: JobLinks
 
 
 class JobOut(JobSummary):
-    """A job with its result (state `succeeded`), or the error for which it has none (`failed`, `interrupted`)."""
+    """A job with its result (state `succeeded`), or with the error of a job that has none (`failed`,
+    `interrupted`)."""
 
-    scene_asked: str | list[str] | None
-    """As it was sent."""
+    requested_scene: str | list[str] | None
+    """`scene` of the request."""
     seed: int
     budget_s: float | None
     deadline: datetime | None
-    """When the answer was of no use any more, if that was said."""
+    """`deadline_s` of the request as a point in time."""
     options: dict[str, Any]
     prior: PoseOut | None
-    """The guess, or a Gaussian's mean."""
-    region: RegionOut | None
-    """Where the prior says that the camera is for certain."""
+    """The approximate pose of the request, or the mean of its Gaussian."""
+    prior_region: RegionOut | None
+    """Box or Gaussian of the request's prior; poses outside are rejected."""
     truth: PoseOut | None
-    """As it was sent; no part of the search."""
+    """`truth` of the request; not used by the search."""
     result: Result | None
     error: Problem | None
-    """`code`: `deadline_exceeded`, `estimator_fault` or `internal_error` of a failed job; of an interrupted one
-    `interrupted` or what is wrong with the scene."""
+    """`code` is `deadline_exceeded`, `estimator_fault` or `internal_error` for a failed job; for an interrupted one
+    `interrupted` or the code of the scene's error."""
 
 
 class JobList(Model):
+    """One page of jobs."""
+
     jobs: list[JobSummary]
     """Newest first."""
     next: str | None
-    """The path of the next page; None: this is the last."""
+    """Path of the next page; null on the last one."""
     queued: int
-    """Of all jobs, whatever the filter; so is `running`."""
+    """Number of all queued jobs, whatever the filter."""
     running: int
+    """Number of all running jobs, whatever the filter."""
 
 
 class Trace(Model):
-    """Everything that a job has told of itself so far."""
+    """All records of a job's latest attempt so far."""
 
     job: str
     state: JobState
     attempt: int
-    """The one whose records these are."""
     records: list[Record]

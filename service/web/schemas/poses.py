@@ -17,29 +17,31 @@ Matrix = list[list[float]]
 
 
 class Transform(Model):
-    """A rigid motion target_from_source, in three spellings of the same thing."""
+    """A rigid transform target_from_source, in two representations: a matrix, and translation with quaternion."""
 
     matrix: Matrix
     """4x4, target_from_source."""
     translation: list[float]
-    """The last column: where the source's origin lies in the target."""
+    """Last column of the matrix: the origin of the source frame in the target frame."""
     quaternion_wxyz: list[float]
-    """The rotation, unit, w >= 0."""
+    """Rotation as a unit quaternion with w >= 0."""
 
 
 class Axes(Model):
+    """A camera pose in both directions."""
+
     world_from_camera: Transform
     """The pose of the camera; its translation is the camera's position in the world."""
     camera_from_world: Transform
-    """The inverse: COLMAP's and OpenCV's extrinsics."""
+    """The inverse: the extrinsics of COLMAP and OpenCV."""
 
 
 class PoseOut(Axes):
-    """Where the camera is. `world_from_camera` and `camera_from_world` are in OpenCV camera axes."""
+    """A camera pose. `world_from_camera` and `camera_from_world` are in OpenCV camera axes."""
 
     convention: Literal["opencv"] = "opencv"
     position: list[float]
-    """The camera's centre in the world, scene units."""
+    """Camera centre in the world, in scene units."""
     opengl: Axes
     """The same pose with OpenGL's camera axes (+y up, +z backwards), as Blender and nerfstudio use."""
 
@@ -48,7 +50,7 @@ class IntrinsicsOut(Model):
     """A camera model of the upright image, in pixels."""
 
     model: str
-    """COLMAP's name."""
+    """Name of the camera model in COLMAP, e.g. PINHOLE."""
     width: int
     height: int
     fx: float
@@ -56,51 +58,59 @@ class IntrinsicsOut(Model):
     cx: float
     cy: float
     distortion: list[float]
-    """COLMAP's parameters after focal lengths and principal point."""
+    """Parameters of the COLMAP model after focal lengths and principal point."""
     trust: Literal["exact", "approximate"]
+    """`approximate`: focal length and principal point are estimated together with the pose."""
 
 
-class LensOut(Model):
-    """How the photo's lens differs from the intrinsics assumed for it."""
+class IntrinsicsCorrectionOut(Model):
+    """Difference between the estimated and the assumed intrinsics of the photo."""
 
     focal_factor: float
+    """Estimated over assumed focal length."""
     shift_x: float
-    """Of the principal point, in long sides of the image."""
+    """Of the principal point to the right, as a share of the image's longer side."""
     shift_y: float
+    """Of the principal point downwards, as a share of the image's longer side."""
 
 
 class CameraOut(Model):
+    """Intrinsics and pose of a camera, in OpenCV camera axes."""
+
     intrinsics: IntrinsicsOut
     world_from_camera: Matrix
 
 
 class NamedCameraOut(CameraOut):
+    """A training camera."""
+
     name: str
+    """Of its image file."""
 
 
 class Covariance(Model):
-    """Of the right perturbation of world_from_camera: true = estimate @ exp(twist)."""
+    """Covariance of a pose: of the right perturbation of world_from_camera, true = estimate @ exp(twist)."""
 
     frame: Literal["camera"] = "camera"
     order: tuple[str, ...] = ("rx_rad", "ry_rad", "rz_rad", "tx_units", "ty_units", "tz_units")
     matrix: Matrix
-    """6x6."""
+    """6x6, in the units of `order`."""
     sigma_deg: float
-    """Square root of the trace of the rotation's block, in degrees."""
+    """Square root of the trace of the rotation block, in degrees."""
     sigma_units: float
-    """Square root of the trace of the translation's block."""
+    """Square root of the trace of the translation block, in scene units."""
 
 
 class RegionOut(Model):
-    """A box that holds the camera's centre, or the covariance of a Gaussian about the prior."""
+    """Where a prior admits poses: a box around the camera centre, or a Gaussian around the prior pose."""
 
     box: Matrix | None = None
-    """Lower and upper corner in the world."""
+    """Lower and upper corner of an axis-aligned box in the world."""
     covariance: Covariance | None = None
 
 
 class GeoPosition(Model):
-    """On WGS84."""
+    """A position on WGS84."""
 
     lat: float = Field(ge=-90, le=90)
     """Degrees."""
@@ -111,6 +121,8 @@ class GeoPosition(Model):
 
 
 class GeoQuaternion(Model):
+    """A unit quaternion."""
+
     x: float
     y: float
     z: float
@@ -118,9 +130,9 @@ class GeoQuaternion(Model):
 
 
 class GeoPose(Model):
-    """OGC GeoPose 1.0, Basic-Quaternion: where on Earth the camera is, and how it is turned.
+    """OGC GeoPose 1.0, Basic-Quaternion: position and orientation of the camera on Earth.
 
-    The quaternion takes camera axes (OpenGL's and WebXR's: +x right, +y up, +z backwards) to the local East-North-Up
+    The quaternion rotates camera axes (of OpenGL and WebXR: +x right, +y up, +z backwards) to the local East-North-Up
     frame at the camera.
     """
 

@@ -1,4 +1,4 @@
-"""What callers send, as pydantic models."""
+"""Bodies of requests as pydantic models."""
 
 from __future__ import annotations
 
@@ -15,81 +15,85 @@ Matrix6 = Annotated[list[Annotated[list[float], Len(6, 6)]], Len(6, 6)]
 
 
 class PoseIn(Model):
-    """A pose: exactly one of the three spellings."""
+    """A camera pose: exactly one of `world_from_camera`, `camera_from_world`, or `position` with `quaternion_wxyz`."""
 
     convention: Literal["opencv", "opengl"] = "opencv"
-    """The camera axes of what is given."""
+    """Camera axes of the pose: +x right, +y down, +z forward (opencv), or +x right, +y up, +z backwards (opengl)."""
     world_from_camera: Matrix4 | None = None
+    """4x4, row-major."""
     camera_from_world: Matrix4 | None = None
+    """4x4, row-major: the extrinsics of COLMAP and OpenCV."""
     position: list[float] | None = Field(default=None, min_length=3, max_length=3)
-    """The camera's centre in the world; together with `quaternion_wxyz`."""
+    """Camera centre in the world, in scene units; together with `quaternion_wxyz`."""
     quaternion_wxyz: list[float] | None = Field(default=None, min_length=4, max_length=4)
-    """world_from_camera."""
+    """Rotation of world_from_camera, of length 1."""
 
 
 class PriorIn(PoseIn):
-    """What is known of the photo's pose: a guess, which may be wrong; or a Gaussian or a box that surely holds it.
+    """Prior knowledge of the photo's pose: an approximate pose, which may be wrong, or a Gaussian, or a box.
 
-    A guess is a pose and no more. With `sigma_deg` and `sigma_units`, or `covariance`, the pose is a Gaussian's mean.
-    A `box` may stand alone or with a pose, a guess then. Poses beyond a Gaussian's 99.9 % or outside a box are
-    rejected. Of several photos it is about the first.
+    An approximate pose is given by a pose alone. With `sigma_deg` and `sigma_units`, or with `covariance`, the pose is
+    the mean of a Gaussian. A `box` may be given alone or with an approximate pose. Poses outside of the Gaussian's
+    99.9 % region or of the box are rejected. Of several photos the prior is of the first.
     """
 
     sigma_deg: float | None = Field(default=None, gt=0, le=180, allow_inf_nan=False)
-    """Standard deviation of the rotation, per axis. With 180 any direction is possible."""
+    """Standard deviation of the rotation, per axis. 180: the rotation is unknown."""
     sigma_units: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    """Standard deviation of the camera's centre, per axis, in scene units."""
+    """Standard deviation of the camera centre, per axis, in scene units."""
     covariance: Matrix6 | None = None
-    """Instead of the two: of (rotation in rad, translation in scene units) in the camera's frame and OpenCV's axes, as
-    results have it: true = pose @ exp(twist)."""
+    """In place of the two sigmas: covariance of the twist (rotation in rad, translation in scene units) in the camera
+    frame, in OpenCV axes, with true = pose @ exp(twist), as in results."""
     box: Annotated[list[Annotated[list[float], Len(3, 3)]], Len(2, 2)] | None = None
-    """Lower and upper corner, in the world, of a box along its axes that the camera's centre is in."""
+    """Lower and upper corner of an axis-aligned box in the world that contains the camera centre."""
 
 
 class RenderIn(Model):
-    """A picture of a scene."""
+    """An image to render of a scene."""
 
     pose: PoseIn
     intrinsics: dict[str, Any] | None = None
-    """Pinhole: `width, height, fx, fy, cx, cy`. Left out: those of the first training camera, or 640 x 480."""
+    """Pinhole camera: `width, height, fx, fy, cx, cy`. Default: the first training camera's, or 640 x 480."""
     format: Literal["png", "jpeg", "depth"] = "png"
-    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
+    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where the scene is empty."""
     quality: int = Field(default=90, ge=1, le=100)
-    """JPEG's."""
+    """Quality of a JPEG."""
 
 
 class LocalizeFields(Model):
-    """What is sent beside the photo."""
+    """The fields of a request beside the photo."""
 
     scene: str | Annotated[list[str], Len(1, 100)] | None = None
-    """May be left out when the service has exactly one scene. A list, or `auto` for all that are ready: the photo is
-    looked for in each, and the result names the one that it shows. In a form, a list is JSON text."""
+    """Id of the scene; may be left out if the service has exactly one. With a list of ids, or `auto` for all scenes
+    that are ready, the photo is searched in each, and the result names the scene that it shows. In a form, a list is
+    JSON text."""
     estimator: str | None = None
-    """See `/capabilities`; left out: the default one."""
+    """Name of an estimator of `/capabilities`; default: the one that is marked there."""
     options: dict[str, Any] = Field(default_factory=dict)
-    """The estimator's options; `/capabilities` has their schema."""
+    """Options of the estimator, by their schema in `/capabilities`."""
     intrinsics: dict[str, Any] | None = None
-    """Of the upright photo: `width, height, fx, fy, cx, cy`, COLMAP's `model` and `distortion`, and `trust`: `exact`
-    (the default), or `approximate`, whose focal length is estimated with the pose. Left out: taken from the EXIF
-    data, or guessed; approximate then."""
+    """Camera model of the upright photo: `width, height, fx, fy, cx, cy`, `model` and `distortion` as in COLMAP, and
+    `trust`: `exact` (the default), or `approximate`, so that the focal length is estimated with the pose. Default:
+    approximate intrinsics from the EXIF data, or a guess."""
     prior: PriorIn | None = None
     truth: PoseIn | None = None
-    """The true pose, where it is known: kept with the job for whoever measures errors, out of the estimator's sight."""
+    """Ground truth of the pose, if known. Stored with the job, to measure errors by; estimators don't get it."""
     every: int = Field(default=1, ge=1, le=MAX_EVERY)
-    """Of a video, or several photos: use each Nth, beginning with the first."""
+    """Of a video, or several photos: use every Nth frame, beginning with the first."""
     times_s: list[float] | None = Field(default=None, min_length=2)
-    """When each of several photos was taken, in seconds, ascending; a video tells it itself."""
+    """Time of each of several photos in seconds, ascending. A video has its own times."""
     seed: int = Field(default=0, ge=0, lt=2**63)
+    """Seed of the estimator's random numbers."""
     budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
-    """Wall time after which the best pose so far is the answer."""
+    """Wall time after which the search ends with the best pose so far."""
     deadline_s: float | None = Field(default=None, gt=0, le=86_400, allow_inf_nan=False)
-    """Seconds from now after which an answer is of no use: a job that hasn't started by then fails."""
+    """Seconds from now by which the job must have started; else it fails."""
     keep_photo: bool = False
-    """Keep the photo, upright and without EXIF data, as long as the job; else it is deleted after the job."""
+    """Keep the photo, upright and without EXIF data, as long as the job. Default: delete it after the job."""
 
 
 class LocalizeIn(LocalizeFields):
-    """A request to localize a photo, as a JSON body; a multipart form has the same names.
+    """A request to localize a photo, as a JSON body; a multipart form has the same fields.
 
     In a form, `options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text, and `photo` is a file, or several
     of one camera, in the order in which they were taken.

@@ -65,13 +65,13 @@ def job_document(job: StoredJob, root: str) -> JobOut:
     pose, region = prior_from(fields.prior) if fields.prior else (None, None)
     return JobOut(
         **summary,
-        scene_asked=fields.scene,
+        requested_scene=fields.scene,
         seed=fields.seed,
         budget_s=fields.budget_s,
         deadline=_time(job.deadline) if job.deadline else None,
         options=fields.options,
         prior=pose and pose_out(pose),
-        region=region and region_out(region),
+        prior_region=region and region_out(region),
         truth=pose_out(pose_from(fields.truth, "truth")) if fields.truth else None,
         result=Result.model_validate_json(job.result) if job.result else None,
         error=error and error.model_copy(update={"instance": summary["links"].self}),

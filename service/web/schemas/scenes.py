@@ -12,36 +12,47 @@ SceneState = Literal["unloaded", "loading", "preparing", "ready", "unloading", "
 
 
 class SceneLinks(Model):
+    """Paths on this service, with its sub-path if it has one."""
+
     self: str
     splats: str
     thumbnail: str
 
 
 class SceneSummary(Model):
+    """A scene as in the list of scenes."""
+
     id: str
     name: str
     state: SceneState
     gaussians: int | None
-    """None until it is loaded; so are the other counts."""
+    """Number of Gaussians. Null until the scene is loaded, like `sh_degree`, `cameras` and `memory_bytes`."""
     sh_degree: int | None
+    """Degree of the spherical harmonics of the colours."""
     cameras: int | None
+    """Number of training cameras."""
     memory_bytes: int | None
     jobs: int
-    """That use it, waiting or running."""
+    """Number of queued and running jobs on the scene."""
     error: Problem | None
-    """Why it failed to load."""
+    """Why loading failed."""
     links: SceneLinks
 
 
 class SceneOut(SceneSummary):
+    """A scene with its training cameras; the fields of its file are null until it is loaded."""
+
     sha256: str | None
+    """Of the scene file."""
     format: str | None
     background_rgb: list[float] | None
+    """Background colour of training, 0..1."""
     up_in_world: list[float] | None
+    """Unit vector that points up, in the scene's frame."""
     metres_per_unit: float | None
     render_mode: str | None
     bounds_in_world: list[list[float]] | None
-    """Lower and upper corner of the box that holds the middle 98 % of the Gaussians along each axis."""
+    """Lower and upper corner of an axis-aligned box: the 1 % and 99 % quantiles of the Gaussians' centres."""
     warnings: list[str]
     training_cameras: list[NamedCameraOut]
 

@@ -1,4 +1,4 @@
-"""The service itself as the API returns it: what it can do, whether it is ready, and tokens."""
+"""Capabilities, readiness and tokens of the service as the API returns them."""
 
 from __future__ import annotations
 
@@ -8,46 +8,55 @@ from service.web.api_model import Model
 
 
 class Capability(Model):
+    """A plug-in, and whether it can run on this machine."""
+
     name: str
     available: bool
     reason: str | None
-    """Why it can't run here."""
+    """Why it can't run here; null if it can."""
     default: bool = False
-    source: str
-    """Where it comes from: `built-in`, `plug-in folder`, or an installed package with its version."""
 
 
 class EstimatorCapability(Capability):
+    """An estimator with its options."""
+
     options_schema: dict[str, Any] | None
-    """JSON Schema of the form field `options`."""
+    """JSON Schema of the request's `options`; null if the estimator can't run here."""
 
 
 class Capabilities(Model):
+    """What a request can choose, and the limits of requests."""
+
     estimators: list[EstimatorCapability]
     matchers: list[Capability]
     rasterizers: list[Capability]
     scene_formats: list[Capability]
     max_upload_bytes: int
+    """Of a photo, a video, or several photos together."""
     max_wait_s: float
+    """The longest `Prefer: wait=N` that is honoured."""
 
 
 class Readiness(Model):
+    """Whether photos can be localized without waiting for a scene."""
+
     ready: bool
-    awaited: list[str]
+    pending: list[str]
     """What is not done yet; empty when ready."""
     failed: list[str]
-    """Scenes that could not be loaded, a disk that can't be written to, workers that are stuck; with the reason."""
+    """Scenes that could not be loaded, storage that can't be written to, stuck workers; each with the reason."""
     rasterizers: list[str]
-    """What the scenes in memory are rendered with: `cpu`, `gsplat_cuda`."""
-    passed_over: list[str]
-    """Why no GPU is used, where the operator left the choice."""
+    """Renderers of the scenes in memory: `cpu`, `gsplat_cuda`."""
+    skipped_rasterizers: list[str]
+    """Why no GPU renderer is used, if the settings left the choice."""
 
 
 class Token(Model):
+    """A short-lived credential with the role of the key that it was made with."""
+
     token: str
-    """Stands for the key that it was made with: in `?token=` of a page, or as Bearer."""
-    seconds: float
-    """How long it is valid."""
+    """For `?token=` of a page, or as Bearer token."""
+    expires_in_s: float
 
 
 class Liveness(Model):

@@ -50,7 +50,7 @@ function differences(jobs, scene) {
     scene: job => job.scene, estimator: job => job.estimator, options: job => JSON.stringify(job.options), seed: job => job.seed,
     prior: job => (job.prior ? "given" : "none"), "intrinsics from": job => job.result?.intrinsics_source,
     reason: job => words(job.result?.reason), score: job => job.result?.score.toFixed(3), inliers: job => job.result?.inliers,
-    agreement: job => job.result?.agreement.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
+    gradient_correlation: job => job.result?.gradient_correlation.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
     "error of rotation": job => degrees(error(job)[0]), "error of position": job => length(error(job)[1], scene?.metres_per_unit),
     "σ of rotation": job => degrees(job.result?.covariance?.sigma_deg), steps: job => job.records,
     "wall time": job => seconds(sum(job, "wall_s")), "CPU time": job => seconds(sum(job, "cpu_s")),

@@ -76,7 +76,7 @@ function numbers(job, scene) {
   const [angle, distance] = job.truth ? poseDistance(result.pose, job.truth) : [null, null];
   return h("section", {}, h("h2", {}, "Evidence"), facts([
     ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
-    ["Agreement", result.agreement.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
+    ["Gradient correlation", result.gradient_correlation.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
     ["σ of rotation", covariance && degrees(covariance.sigma_deg)],
     ["σ of position", covariance && length(covariance.sigma_units, scale)],
     ["Error of rotation", job.truth && degrees(angle)],
