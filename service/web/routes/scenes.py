@@ -142,9 +142,7 @@ async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
 async def scene_splats(
     scene_id: str,
     parts: PartsOf,
-    limit: Annotated[
-        int, Query(alias="max", ge=1, le=MAX_SPLATS, description="Largest number of Gaussians to return.")
-    ] = 200_000,
+    limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="Most Gaussians to return.")] = 200_000,
 ) -> Response:
     """Return the most important Gaussians of the scene for drawing, as little-endian binary."""
     pack = partial(splats.packed_splats, parts.scenes.get(scene_id).scene, limit)

@@ -15,6 +15,8 @@ class Capability(Model):
     reason: str | None
     """Why it can't run here; null if it can."""
     default: bool = False
+    source: str
+    """Origin of the plug-in: `built-in`, `plug-in folder`, or an installed package with its version."""
 
 
 class EstimatorCapability(Capability):
