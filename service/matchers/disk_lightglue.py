@@ -18,17 +18,19 @@ class DiskLightGlue:
         self._extract, self._network = networks.disk(WEIGHTS[0]), networks.lightglue(WEIGHTS[1])
 
     def extract(self, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
+        """Return the `limit` strongest DISK features."""
         return networks.extracted(self._extract, rgb, limit)
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
+        """Return the pairs of indices that LightGlue (Lindenberger et al., ICCV 2023) assigns."""
         return networks.glued(self._network, a, b)
 
 
 def create() -> DiskLightGlue:
-    """Return a matcher. Raises BackendMissing for files that are not its weights."""
+    """Load the networks. Raises BackendMissing for files that are not their weights."""
     return DiskLightGlue()
 
 
 def missing() -> str | None:
-    """Return what is not there to run it."""
+    """Return which weight files are missing; None if none is."""
     return networks.missing_weights(*WEIGHTS)

@@ -1,6 +1,7 @@
 """LoFTR (Sun et al., CVPR 2021): pairs two images without features of each; weights from a folder.
 
-What the supplement's iComMa matches with, and most likely its own method. See `service.matchers.networks`.
+The paper's iComMa matches with it in the supplement, and most likely for its own method, too. See
+`service.matchers.networks`.
 """
 
 from __future__ import annotations
@@ -21,14 +22,15 @@ class Loftr:
         self._network = networks.loftr(*WEIGHTS)
 
     def match_images(self, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
+        """Return the pairs of points that show the same, with their confidence."""
         return networks.paired(self._network, a, b)
 
 
 def create() -> Loftr:
-    """Return a matcher. Raises BackendMissing for a file that is not its weights."""
+    """Load the network. Raises BackendMissing for a file that is not its weights."""
     return Loftr()
 
 
 def missing() -> str | None:
-    """Return what is not there to run it."""
+    """Return which weight file is missing; None if none is."""
     return networks.missing_weights(*WEIGHTS)

@@ -1,4 +1,4 @@
-"""Mutual nearest neighbours: the pairs that choose one another."""
+"""Mutual nearest neighbours of descriptors by cosine similarity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from jaxtyping import Float32, Int32
 def mutual_nearest(
     a: Float32[np.ndarray, "n d"], b: Float32[np.ndarray, "m d"], min_cosine: float
 ) -> Int32[np.ndarray, "k 2"]:
-    """Return pairs of indices, the most similar first. Descriptors have unit length."""
+    """Return pairs of indices, each the other's nearest neighbour, with at least `min_cosine`; the most similar first.
+
+    Descriptors have unit length, so their dot product is the cosine.
+    """
     if len(a) == 0 or len(b) == 0:
         return np.zeros((0, 2), np.int32)
     similarity = a @ b.T

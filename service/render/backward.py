@@ -1,16 +1,17 @@
-"""Gradients of the picture, front to back like the picture itself.
+"""Gradients of the image by the Gaussians' ellipses and colours, front to back like the blending itself.
 
 For one pixel let s_i = d loss / d (weight of Gaussian i), w_i its weight, P_i the sum of w s up to and with i, and
-total the sum over all. Then d loss / d alpha_i = T_i s_i - (total - P_i) / (1 - alpha_i): no list of what a pixel
-met is stored, the suffix is the total minus the prefix.
+total the sum over all. Then d loss / d alpha_i = T_i s_i - (total - P_i) / (1 - alpha_i). The total follows from the
+image, and the suffix is the total minus the prefix, so that no list of a pixel's Gaussians is stored.
 
 Per Gaussian ten sums over its pixels are enough. v = -alpha d loss / d alpha = d loss / d sigma has six moments about
 the centre, and w times the gradients of red, green, blue and depth gives four:
 
     sums of a record [ v | v dx | v dy | v dx^2 | v dx dy | v dy^2 | w gr | w gg | w gb | w gd | 0 ... ]   16 floats
 
-A block runs 16 Gaussians, keeping v and w as rows [Gaussian][pixel]; transposed, the sums over pixels become additions
-of vectors whose lanes are Gaussians; transposed again, they are added to the Gaussians' rows.
+A block takes 16 Gaussians and keeps v and w as rows [Gaussian][pixel]; transposed, the sums over pixels become
+additions of vectors whose lanes are Gaussians; transposed again, they are added to the Gaussians' rows. This replaces
+a sum over 16 lanes for each of ten values by three transpositions for 16 Gaussians.
 """
 
 from __future__ import annotations
@@ -83,6 +84,7 @@ def blend_backward(records, starts, entries, width, height, background, rgb, alp
             count = min(BATCH, last - first)
             gather_batch(records, entries, first, count, local)
             touching_lists(local, count, tile_x, tile_y, alive, lists, lengths)
+            # Sums of the batch first: its 128 rows stay in the cache while 16 blocks add to them.
             for i in range(count):
                 store(batch_sums, i * 16, splat(0.0))
             for block in range(16):
@@ -99,7 +101,7 @@ def blend_backward(records, starts, entries, width, height, background, rgb, alp
 
 @inline
 def _read_block(inputs, block, x, y, width, height, background, rgb, alpha, depth, d_rgb, d_depth, d_alpha):
-    """Turn the gradients of a block's pixels into those of the weights: s = gr r + gg g + gb b + gd z + ga."""
+    """Convert the gradients of a block's pixels to those of the weights: s = gr r + gg g + gb b + gd z + ga."""
     base = block * INPUT
     for k in range(8):
         store(inputs, base + k * 16, splat(0.0))
@@ -115,17 +117,18 @@ def _read_block(inputs, block, x, y, width, height, background, rgb, alpha, dept
                 ga -= g * background[c]
                 total += g * (rgb[three + c] - (np.float32(1.0) - a) * background[c])
                 inputs[lane + c * np.uint64(16)] = g
+            # The depth is normalized by alpha: d depth / d w_i = (z_i - depth) / alpha.
             gd = d_depth[pixel] / max(a, np.float32(1e-12)) if a > 0 else np.float32(0.0)
             ga -= gd * depth[pixel]
             inputs[lane + np.uint64(48)] = gd
             inputs[lane + np.uint64(64)] = ga
             inputs[lane + np.uint64(80)] = total + gd * depth[pixel] * a + ga * a
-            inputs[lane + np.uint64(96)] = 1.0
+            inputs[lane + np.uint64(96)] = 1.0  # transmittance; pixels outside the image keep 0 and add nothing
 
 
 @inline
 def _run_block(local, lists, block, length, x, y, inputs, work, batch_sums):
-    """Run the block's list and add to its Gaussians' sums. False when every pixel is opaque."""
+    """Take the block's list and add to its Gaussians' sums. Returns False when every pixel is opaque."""
     base = block * INPUT
     gr, gg, gb = load(inputs, base), load(inputs, base + 16), load(inputs, base + 32)
     gd, ga, total = load(inputs, base + 48), load(inputs, base + 64), load(inputs, base + 80)
@@ -143,6 +146,7 @@ def _run_block(local, lists, block, length, x, y, inputs, work, batch_sums):
             e = broadcast(local, O + i) - fma(dx, slope, dy * dy * broadcast(local, C + i))
             raw = exp2(e)
             a = select(e >= LOG2_ALPHA_MIN, vmin(raw, ALPHA_MAX), 0.0)
+            # As in `blend`, operation by operation: the total is the image's, and must be this sum's.
             w = a * t
             t = fma(-a, t, t)
             counted = t > T_MIN
@@ -156,6 +160,7 @@ def _run_block(local, lists, block, length, x, y, inputs, work, batch_sums):
             ws = w * s
             prefix = prefix + ws
             v = fma(total - prefix, a / (1.0 - a), -ws)
+            # A clamped alpha doesn't change with sigma.
             store(work, k * 16, select(counted & (raw <= ALPHA_MAX), v, 0.0))
             store(work, 256 + k * 16, w)
         for k in range(count, 16):
@@ -176,6 +181,7 @@ def _sum_up(local, lists, listed, count, x, y, inputs, base, work, batch_sums):
     transpose16(work, 0, 16, work, 0, 16)
     transpose16(work, 256, 16, work, 256, 16)
     zero = splat(0.0)
+    # Moments about the block's first pixel, whose columns and rows are the integers 0..3.
     m, mx, my, mxx, mxy, myy = zero, zero, zero, zero, zero, zero
     r, g, b, d = zero, zero, zero, zero
     for row in range(4):
@@ -196,6 +202,7 @@ def _sum_up(local, lists, listed, count, x, y, inputs, base, work, batch_sums):
             d = fma(w, broadcast(inputs, base + 48 + lane), d)
     # A list's unused end holds anything: keep the index inside the batch.
     index = iload(lists, listed) & isplat(BATCH - 1)
+    # Shifted to the moments about each Gaussian's centre.
     ox, oy = (
         np.float32(x + 0.5) - gather(local, index),
         np.float32(y + 0.5) - gather(local, index + isplat(Y)),

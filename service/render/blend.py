@@ -1,14 +1,18 @@
-"""The picture: every 4x4 block of pixels is one vector that runs through its Gaussians front to back.
+"""Blending: every 4x4 block of pixels is one SIMD vector that takes its Gaussians front to back.
 
     tile 16x16 = 16 blocks          block = 16 lanes           batch of 128 Gaussians of the tile's list
     +--+--+--+--+                   | 0| 1| 2| 3|              local [10 values][128]: structure of arrays
     | 0| 1| 2| 3|                   | 4| 5| 6| 7|              lists [16 blocks][128 + 16]: which of the batch
     | 4| ...                        | 8| ...                   touch the block (exact ellipse against rectangle)
 
+A tile's list is taken in batches of 128 records, which stay in the L1 cache while the 16 blocks read them. Blocks, not
+whole tiles, are the unit of work since most Gaussians of a trained scene are smaller than a tile: a block skips what
+doesn't touch it, and stops once its 16 pixels are opaque.
+
 Semantics (gsplat's): alpha below 1/255 is skipped, alpha is clamped at 0.999, a Gaussian that would bring the
-transmittance T to 1e-4 or below is not added and ends the pixel. T goes on decaying unfrozen here: the loop-carried
-chain is one fma, and `T after > 1e-4` is the mask of what counts. A rough picture ends a block once each of its pixels
-has less than `enough` left.
+transmittance T to 1e-4 or below is not added and ends the pixel. Here T goes on decaying after that: the dependency
+between iterations is one fma, and `T after > 1e-4` is the mask of what counts. An approximate image ends a block once
+all of its pixels have a transmittance of `end_t` or less.
 """
 
 from __future__ import annotations
@@ -41,11 +45,13 @@ from service.render.simd import (
 )
 
 BATCH = 128
+"""Records of a tile's list at once: 10 values of each are 5 kB."""
 LIST = BATCH + 16
-"""A list's room: a compressed vector is stored whole."""
+"""Elements of a block's list: a compressed vector is stored with its unused lanes."""
 T_MIN = np.float32(1e-4)
+"""Transmittance at which a pixel ends; gsplat's."""
 ALPHA_MAX = np.float32(0.999)
-# Rows of `local`: the record's first ten values, then the ellipse test's bound and slopes.
+# Rows of `local`: a record's first ten values (see `project`); behind them work space of `gather_batch`.
 X, Y, A, B, C, O, Z, R, G, BL = (i * BATCH for i in range(10))  # noqa: E741
 LOCAL = 16 * BATCH
 STATE = 7 * 16
@@ -54,7 +60,8 @@ STATE = 7 * 16
 
 @inline
 def exp2(x):
-    """2^x for x in -126..127: magic-number rounding, polynomial of degree 5 on -0.5..0.5; relative error 2e-7."""
+    """Return 2^x for x in -126..127, by a polynomial of degree 5 on -0.5..0.5; relative error 2e-7."""
+    # Adding 1.5 * 2^23 leaves the rounded x in the low bits of the mantissa; a shift moves it to the exponent.
     shifted = x + 12582912.0
     f = x - (shifted - 12582912.0)
     p = fma(f, 0.0013400432, 0.009618073)
@@ -67,7 +74,7 @@ def exp2(x):
 
 @inline
 def gather_batch(records, entries, first, count, local):
-    """Bring up to 128 records into structure of arrays; pad with Gaussians that touch nothing."""
+    """Transpose up to 128 records to structure of arrays; pad with Gaussians that touch nothing."""
     for group in range(0, count, 16):
         for lane in range(16):
             entry = first + min(group + lane, count - 1)
@@ -80,16 +87,17 @@ def gather_batch(records, entries, first, count, local):
 
 @inline
 def touching_lists(local, count, tile_x, tile_y, alive, lists, lengths):
-    """Fill the list of every block that is alive: Gaussians whose alpha reaches 1/255 on its pixel centres.
+    """List for every block that isn't finished the Gaussians whose alpha reaches 1/255 on its pixel centres.
 
-    The least value of the quadratic form over a rectangle lies on the edges that face the centre: clamp the free
-    coordinate of each edge's minimum into the edge.
+    The quadratic form's minimum over a rectangle lies on the edges that face the Gaussian's centre: on each, the
+    unconstrained minimum, clamped to the edge.
     """
     for block in range(16):
         lengths[block] = 0
     for group in range(0, count, 16):
         mx, my = load(local, X + group), load(local, Y + group)
         a, b, c = load(local, A + group), load(local, B + group), load(local, C + group)
+        # 16 Gaussians against 16 blocks: lanes are Gaussians here, pixels in `_run_block`.
         bound = load(local, O + group) - LOG2_ALPHA_MIN
         slope_y, slope_x = b / (c * -2.0), b / (a * -2.0)
         index = iota() + isplat(group)
@@ -113,27 +121,28 @@ def touching_lists(local, count, tile_x, tile_y, alive, lists, lengths):
                 horizontal = fma(x, fma(a, x, bdy), cdy)
                 hit = vmin(vertical, horizontal) <= bound
                 length = np.intp(lengths[block])
+                # Without a branch: the indices that hit move to the front, and the length grows by their number.
                 store(lists, block * LIST + length, compress(index, hit))
                 lengths[block] = length + popcount(bits(hit))
 
 
 @kernel
-def blend(records, starts, entries, width, height, background, enough, local, lists, lengths, state,
+def blend(records, starts, entries, width, height, background, end_t, local, lists, lengths, state,
           rgb, alpha, depth, median):  # fmt: skip
-    """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each. `enough`: at least T_MIN."""
+    """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each. `end_t`: at least T_MIN."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
     lane_x = to_float(iota() & isplat(3))
     lane_y = to_float(iota() >> isplat(2))
     for tile in range(tiles_x * tiles_y):
         tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-        alive = np.uint32(0)
+        alive = np.uint32(0)  # a bit for each block with pixels that still let light through
         for block in range(16):
             if tile_x + block % 4 * 4 < width and tile_y + block // 4 * 4 < height:
                 alive |= np.uint32(1) << np.uint32(block)
         inside = alive
         for block in range(16):
-            store(state, block * STATE, splat(1.0))
+            store(state, block * STATE, splat(1.0))  # transmittance
             for k in range(1, 7):
                 store(state, block * STATE + k * 16, splat(0.0))
         first, last = np.intp(starts[tile]), np.intp(starts[tile + 1])
@@ -147,7 +156,7 @@ def blend(records, starts, entries, width, height, background, enough, local, li
                     continue
                 px = lane_x + np.float32(tile_x + block % 4 * 4 + 0.5)
                 py = lane_y + np.float32(tile_y + block // 4 * 4 + 0.5)
-                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, enough, state):
+                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, end_t, state):
                     alive &= ~(np.uint32(1) << np.uint32(block))
         for block in range(16):
             if (inside >> np.uint32(block)) & np.uint32(1):
@@ -156,8 +165,8 @@ def blend(records, starts, entries, width, height, background, enough, local, li
 
 
 @inline
-def _run_block(local, lists, block, length, px, py, enough, state):
-    """Composite the block's list onto its state. False when every pixel is opaque enough."""
+def _run_block(local, lists, block, length, px, py, end_t, state):
+    """Blend the block's list onto its state. Returns False when every pixel's transmittance is `end_t` or less."""
     base = block * STATE
     t, r, g = load(state, base), load(state, base + 16), load(state, base + 32)
     b, d, m = load(state, base + 48), load(state, base + 64), load(state, base + 80)
@@ -174,6 +183,7 @@ def _run_block(local, lists, block, length, px, py, enough, state):
                 dy * dy * broadcast(local, C + i),
             )
             a = select(e >= LOG2_ALPHA_MIN, vmin(exp2(e), ALPHA_MAX), 0.0)
+            # Overwritten as long as more than half of the light comes through: the last value is the median depth.
             m = select((t > 0.5) & (e >= LOG2_ALPHA_MIN), broadcast(local, Z + i), m)
             w = a * t
             t = fma(-a, t, t)
@@ -183,7 +193,7 @@ def _run_block(local, lists, block, length, px, py, enough, state):
             g = fma(w, broadcast(local, G + i), g)
             b = fma(w, broadcast(local, BL + i), b)
             d = fma(w, broadcast(local, Z + i), d)
-        if bits(t > enough) == 0:
+        if bits(t > end_t) == 0:  # every 16 Gaussians only: not in the inner loop
             going = False
             break
     store(state, base, t)
@@ -198,7 +208,7 @@ def _run_block(local, lists, block, length, px, py, enough, state):
 
 @inline
 def _write_block(state, block, x, y, width, height, background, rgb, alpha, depth, median):
-    """Put the background behind, normalize the depth, and write the part that lies inside the image."""
+    """Add the background, normalize the depth, and write the part of the block that lies inside the image."""
     at = block * STATE
     a = load(state, at + 96)
     rest = 1.0 - a
@@ -214,6 +224,7 @@ def _write_block(state, block, x, y, width, height, background, rgb, alpha, dept
         _store_rows(depth, pixel, width, d)
         _store_rows(median, pixel, width, m)
         return
+    # At the right and lower border pixel by pixel, through the state's memory.
     store(state, at, r)
     store(state, at + 16, g)
     store(state, at + 32, b)

@@ -1,7 +1,8 @@
-"""From a record's ten sums (`backward`) to the parameters of camera and Gaussians: the chain rule of `project`.
+"""The chain rule of `project`: from a record's ten sums (`backward`) to gradients by camera and Gaussians.
 
 Written for j_a = (fx/z, 0, -fx u/z) and j_b = (0, fy/z, -fy v/z), the rows of the perspective Jacobian, and
-a = R^T j_a, b = R^T j_b, their images in the world: covariance in the picture = [a; b] S [a; b]^T + dilation I.
+a = R^T j_a, b = R^T j_b, the same rows in the world frame: covariance in the image = [a; b] S [a; b]^T + dilation I.
+Lanes are Gaussians: 16 records at a time are transposed into vectors, as in `project`.
 
 Twist: world_from_camera @ exp(rotation, translation), so a point in the camera moves by -(rotation x p) - translation.
 """
@@ -63,7 +64,7 @@ def pose_twist(records, sums, visible, geometry, sh, degree, view, lens, width, 
         twist[0] += sum16(wx - (y * gz - z * gy))
         twist[1] += sum16(wy - (z * gx - x * gz))
         twist[2] += sum16(wz - (x * gy - y * gx))
-        # The direction that the colour is seen from changes with the camera's place only.
+        # The viewing direction, and so the colour, changes with the camera's position only, not with its rotation.
         twist[3] -= sum16(gx + fma(dx, r[0], fma(dy, r[1], dz * r[2])))
         twist[4] -= sum16(gy + fma(dx, r[4], fma(dy, r[5], dz * r[6])))
         twist[5] -= sum16(gz + fma(dx, r[8], fma(dy, r[9], dz * r[10])))
@@ -80,6 +81,7 @@ def scene_rows(records, sums, visible, geometry, sh, degree, view, lens, width, 
             scratch,
         )  # fmt: skip
         (a0, a1, a2), (b0, b1, b2) = a, b
+        # Rows of `scratch` from 768 on are the columns of the output: d mean, then d S = [a b] d covariance [a b]^T.
         gxx, gxy, gyy = load(scratch, 512), load(scratch, 528), load(scratch, 544)
         store(scratch, 768, fma(gx, r[0], fma(gy, r[4], fma(gz, r[8], dx))))
         store(scratch, 784, fma(gx, r[1], fma(gy, r[5], fma(gz, r[9], dy))))
@@ -102,16 +104,16 @@ def scene_rows(records, sums, visible, geometry, sh, degree, view, lens, width, 
 @inline
 def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
               scratch):  # fmt: skip
-    """The chain for 16 records.
+    """Apply the chain rule to 16 records.
 
-    Returns d point in the camera, the point, the rotation that turns the covariance, a, b, and d direction carried to
+    Returns d point in the camera frame, the point, d rotation through the covariance, a, b, and d direction mapped to
     the Gaussian's centre. Leaves in `scratch`: sums at 256, d covariance (xx, xy, yy) at 512, d colour at 560, the
     viewing direction at 608.
     """
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
     r = view
     for lane in range(16):
-        i = min(first + lane, visible - 1) * 16
+        i = min(first + lane, visible - 1) * 16  # the last group repeats the last record, with sums of 0
         store(scratch, lane * 16, load(records, i))
         store(scratch, 256 + lane * 16, load(sums, i) if first + lane < visible else splat(0.0))
     transpose16(scratch, 0, 16, scratch, 0, 16)
@@ -125,6 +127,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     inverse_z = 1.0 / z
     jx, jy = inverse_z * fx, inverse_z * fy
     x_z, y_z = x * inverse_z, y * inverse_z
+    # The clamp of `project`: J is taken at most 15 % of the image outside its border.
     u = vmin(
         vmax(x_z, -(cx / fx + np.float32(0.15) * width / fx)),
         (width - cx) / fx + np.float32(0.15) * width / fx,
@@ -136,6 +139,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     a0, a1, a2 = (r[0] - u * r[8]) * jx, (r[1] - u * r[9]) * jx, (r[2] - u * r[10]) * jx
     b0, b1, b2 = (r[4] - v * r[8]) * jy, (r[5] - v * r[9]) * jy, (r[6] - v * r[10]) * jy
 
+    # Q, the inverse covariance, from the record's scaled A, B, C.
     qa, qb, qc = (
         load(scratch, 32) / HALF_LOG2E,
         load(scratch, 48) / (2 * HALF_LOG2E),
@@ -149,7 +153,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     f0, f1 = fma(qb, sxx, qc * sxy), fma(qb, sxy, qc * syy)
     gxx, gxy, gyy = fma(e0, qa, e1 * qb) * -0.5, fma(e0, qb, e1 * qc) * -0.5, fma(f0, qb, f1 * qc) * -0.5
     if antialiased:
-        # ln compensation = 1/2 (ln det sharp - ln det dull); d / d ln opacity = -m
+        # ln compensation = 1/2 (ln det without - ln det with dilation); d / d ln opacity = -m
         determinant = 1.0 / (qa * qc - qb * qb)
         sxx0, sxy0, syy0 = qc * determinant - dilation, -qb * determinant, qa * determinant - dilation
         sharp = 1.0 / (sxx0 * syy0 - sxy0 * sxy0)
@@ -167,11 +171,11 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     s11, s12, s22 = gather(geometry, at + 96), gather(geometry, at + 112), gather(geometry, at + 128)
     sa0, sa1, sa2 = _times(s00, s01, s02, s11, s12, s22, a0, a1, a2)
     sb0, sb1, sb2 = _times(s00, s01, s02, s11, s12, s22, b0, b1, b2)
-    # d a, d b in the world, then turned into the camera: d j
-    da0, da1, da2 = _turned(
+    # d a, d b in the world frame, then rotated to the camera frame: d j
+    da0, da1, da2 = _rotated(
         r, 2.0 * fma(gxx, sa0, gxy * sb0), 2.0 * fma(gxx, sa1, gxy * sb1), 2.0 * fma(gxx, sa2, gxy * sb2)
     )
-    db0, db1, db2 = _turned(
+    db0, db1, db2 = _rotated(
         r, 2.0 * fma(gxy, sa0, gyy * sb0), 2.0 * fma(gxy, sa1, gyy * sb1), 2.0 * fma(gxy, sa2, gyy * sb2)
     )
     ja2, jb2 = -jx * u, -jy * v
@@ -179,6 +183,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     wx = jy * db2 - jb2 * db1 - ja2 * da1
     wy = ja2 * da0 - jx * da2 + jb2 * db0
     wz = jx * da1 - jy * db0
+    # Through jx = fx / z, jy = fy / z and the clamped u, v.
     d_jx, d_jy = da0 - u * da2, db1 - v * db2
     du = select((u <= x_z) & (u >= x_z), -jx * da2, 0.0)
     dv = select((v <= y_z) & (v >= y_z), -jy * db2, 0.0)
@@ -192,6 +197,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
 
 @inline
 def _times(s00, s01, s02, s11, s12, s22, x, y, z):
+    """Multiply a symmetric matrix and a vector."""
     return (
         fma(s00, x, fma(s01, y, s02 * z)),
         fma(s01, x, fma(s11, y, s12 * z)),
@@ -200,7 +206,8 @@ def _times(s00, s01, s02, s11, s12, s22, x, y, z):
 
 
 @inline
-def _turned(r, x, y, z):
+def _rotated(r, x, y, z):
+    """Rotate a vector from the world to the camera frame."""
     return (
         fma(x, r[0], fma(y, r[1], z * r[2])),
         fma(x, r[4], fma(y, r[5], z * r[6])),
@@ -210,13 +217,15 @@ def _turned(r, x, y, z):
 
 @inline
 def _direction(scratch, sh, place, degree, r, mx, my, mz):
-    """Gradient of the colour through the viewing direction, carried to the Gaussian's centre."""
+    """Return the colour's gradient by the Gaussian's centre: through the viewing direction and the SH basis."""
+    # A colour that was clamped at 0 has no gradient.
     red = select(load(scratch, 176) > 0.0, load(scratch, 352), 0.0)
     green = select(load(scratch, 192) > 0.0, load(scratch, 368), 0.0)
     blue = select(load(scratch, 208) > 0.0, load(scratch, 384), 0.0)
     store(scratch, 560, red)
     store(scratch, 576, green)
     store(scratch, 592, blue)
+    # centre - camera position, with the position -R^T t
     x = mx + (r[0] * r[3] + r[4] * r[7] + r[8] * r[11])
     y = my + (r[1] * r[3] + r[5] * r[7] + r[9] * r[11])
     z = mz + (r[2] * r[3] + r[6] * r[7] + r[10] * r[11])
@@ -229,43 +238,44 @@ def _direction(scratch, sh, place, degree, r, mx, my, mz):
     coefficients = (degree + 1) * (degree + 1) * 3
     at = (place >> isplat(4)) * (coefficients * 16) + (place & isplat(15))
     if degree >= 1:
-        gy = _pull(sh, at, 1, red, green, blue) * -C1
-        gz = _pull(sh, at, 2, red, green, blue) * C1
-        gx = _pull(sh, at, 3, red, green, blue) * -C1
+        gy = _weighted_coefficient(sh, at, 1, red, green, blue) * -C1
+        gz = _weighted_coefficient(sh, at, 2, red, green, blue) * C1
+        gx = _weighted_coefficient(sh, at, 3, red, green, blue) * -C1
     if degree >= 2:
-        k = _pull(sh, at, 4, red, green, blue) * C20
+        k = _weighted_coefficient(sh, at, 4, red, green, blue) * C20
         gx, gy = fma(k, y, gx), fma(k, x, gy)
-        k = _pull(sh, at, 5, red, green, blue) * C21
+        k = _weighted_coefficient(sh, at, 5, red, green, blue) * C21
         gy, gz = fma(k, z, gy), fma(k, y, gz)
-        k = _pull(sh, at, 6, red, green, blue) * (2 * C22)
+        k = _weighted_coefficient(sh, at, 6, red, green, blue) * (2 * C22)
         gx, gy, gz = fma(-k, x, gx), fma(-k, y, gy), fma(k * 2.0, z, gz)
-        k = _pull(sh, at, 7, red, green, blue) * C23
+        k = _weighted_coefficient(sh, at, 7, red, green, blue) * C23
         gx, gz = fma(k, z, gx), fma(k, x, gz)
-        k = _pull(sh, at, 8, red, green, blue) * (2 * C24)
+        k = _weighted_coefficient(sh, at, 8, red, green, blue) * (2 * C24)
         gx, gy = fma(k, x, gx), fma(-k, y, gy)
     if degree >= 3:
         xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
-        k = _pull(sh, at, 9, red, green, blue) * (3 * C30)
+        k = _weighted_coefficient(sh, at, 9, red, green, blue) * (3 * C30)
         gx, gy = fma(k * 2.0, xy, gx), fma(k, xx - yy, gy)
-        k = _pull(sh, at, 10, red, green, blue) * C31
+        k = _weighted_coefficient(sh, at, 10, red, green, blue) * C31
         gx, gy, gz = fma(k, yz, gx), fma(k, xz, gy), fma(k, xy, gz)
-        k = _pull(sh, at, 11, red, green, blue) * C32
+        k = _weighted_coefficient(sh, at, 11, red, green, blue) * C32
         gx, gy, gz = fma(k * -2.0, xy, gx), fma(k, 4.0 * zz - xx - 3.0 * yy, gy), fma(k * 8.0, yz, gz)
-        k = _pull(sh, at, 12, red, green, blue) * (3 * C33)
+        k = _weighted_coefficient(sh, at, 12, red, green, blue) * (3 * C33)
         gx, gy, gz = fma(k * -2.0, xz, gx), fma(k * -2.0, yz, gy), fma(k, 2.0 * zz - xx - yy, gz)
-        k = _pull(sh, at, 13, red, green, blue) * C34
+        k = _weighted_coefficient(sh, at, 13, red, green, blue) * C34
         gx, gy, gz = fma(k, 4.0 * zz - 3.0 * xx - yy, gx), fma(k * -2.0, xy, gy), fma(k * 8.0, xz, gz)
-        k = _pull(sh, at, 14, red, green, blue) * C35
+        k = _weighted_coefficient(sh, at, 14, red, green, blue) * C35
         gx, gy, gz = fma(k * 2.0, xz, gx), fma(k * -2.0, yz, gy), fma(k, xx - yy, gz)
-        k = _pull(sh, at, 15, red, green, blue) * (3 * C36)
+        k = _weighted_coefficient(sh, at, 15, red, green, blue) * (3 * C36)
         gx, gy = fma(k, xx - yy, gx), fma(k * -2.0, xy, gy)
+    # Of a normalized vector: the tangential part, divided by the length.
     along = fma(gx, x, fma(gy, y, gz * z))
     return (gx - along * x) * inverse, (gy - along * y) * inverse, (gz - along * z) * inverse
 
 
 @inline
-def _pull(sh, at, k, red, green, blue):
-    """Sum over the channels of coefficient k times the colour's gradient."""
+def _weighted_coefficient(sh, at, k, red, green, blue):
+    """Return the sum over the channels of SH coefficient k times the colour's gradient."""
     r, g, b = gather(sh, at + 48 * k), gather(sh, at + (48 * k + 16)), gather(sh, at + (48 * k + 32))
     return fma(r, red, fma(g, green, b * blue))
 
@@ -273,7 +283,7 @@ def _pull(sh, at, k, red, green, blue):
 @kernel
 def unpack_rows(rows, records, visible, order, quats, scales, opacities, degree,
                 index, d_means, d_quats, d_scales, d_opacities, d_sh):  # fmt: skip
-    """From rows to the scene's own parameters: quaternion and scales behind S, and SH behind colour."""
+    """Convert rows to gradients by the scene's parameters: from S to quaternion and scales, from colour to SH."""
     places = records.view(np.int32)
     for v in range(visible):
         row = v * ROW
@@ -288,7 +298,7 @@ def unpack_rows(rows, records, visible, order, quats, scales, opacities, degree,
 
 @inline
 def _shape(rows, row, quat, scale, d_quat, d_scale):
-    """S = M M^T, M = R diag(scale): d M = 2 D M, then R's derivative by the quaternion, tangential part."""
+    """Differentiate S = M M^T, M = R diag(scale): d M = 2 D M, then R by the quaternion, tangential part."""
     w, x, y, z = quat[0], quat[1], quat[2], quat[3]
     d00, d01, d02 = rows[row + 3], rows[row + 4], rows[row + 5]
     d11, d12, d22 = rows[row + 6], rows[row + 7], rows[row + 8]
@@ -305,6 +315,7 @@ def _shape(rows, row, quat, scale, d_quat, d_scale):
     d_scale[0] = 2 * scale[0] * (r00 * t00 + r10 * t10 + r20 * t20)
     d_scale[1] = 2 * scale[1] * (r01 * t01 + r11 * t11 + r21 * t21)
     d_scale[2] = 2 * scale[2] * (r02 * t02 + r12 * t12 + r22 * t22)
+    # g = d R, from d M = d R diag(scale)
     a0, a1, a2 = 2 * scale[0] * scale[0], 2 * scale[1] * scale[1], 2 * scale[2] * scale[2]
     g00, g10, g20 = a0 * t00, a0 * t10, a0 * t20
     g01, g11, g21 = a1 * t01, a1 * t11, a1 * t21
@@ -320,6 +331,7 @@ def _shape(rows, row, quat, scale, d_quat, d_scale):
 
 @inline
 def _sh_row(rows, row, degree, d_sh):
+    """Multiply the colour's gradient by the SH basis at the viewing direction."""
     red, green, blue = rows[row + 10], rows[row + 11], rows[row + 12]
     x, y, z = rows[row + 13], rows[row + 14], rows[row + 15]
     _put(d_sh, 0, 0.28209479177387814, red, green, blue)

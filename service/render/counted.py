@@ -1,4 +1,4 @@
-"""A rasterizer that counts what it is asked for: budgets and benches are told in renders, too."""
+"""A rasterizer that counts its renders: budgets and benchmarks are measured in renders, too."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from service.types import Camera, GaussianScene
 
 
 class Counted:
-    """`Rasterizer` that passes everything on; one to a job, for its tally is not shared."""
+    """`Rasterizer` that delegates to another one and counts images and gradients; one for each job."""
 
     def __init__(self, inner: Rasterizer, tally: RenderTally) -> None:
         self.name = inner.name
@@ -21,24 +21,30 @@ class Counted:
 
     @property
     def nbytes(self) -> int:
+        """As the inner rasterizer."""
         return self.inner.nbytes
 
     def of(self, scene: GaussianScene) -> Counted:
+        """As the inner rasterizer; the new one adds to the same tally."""
         return Counted(self.inner.of(scene), self.tally)
 
     def trained_at(self, long_side_px: int) -> Counted:
+        """As the inner rasterizer; the new one adds to the same tally."""
         return Counted(self.inner.trained_at(long_side_px), self.tally)
 
     def render(self, cameras: Sequence[Camera], *rest: Any, **named: Any) -> list[Frame]:
+        """Render; each image counts as one."""
         self.tally.count += len(cameras)
         return self.inner.render(cameras, *rest, **named)
 
     def pose_gradient(
         self, camera: Camera, d_rgb: Any, d_depth: Any = None, d_alpha: Any = None
     ) -> Float64[np.ndarray, "6"]:
+        """Return the gradient; it counts as one render."""
         self.tally.count += 1
         return self.inner.pose_gradient(camera, d_rgb, d_depth, d_alpha)
 
     def scene_gradients(self, camera: Camera, d_rgb: Any, d_depth: Any = None, d_alpha: Any = None) -> SceneGradients:
+        """Return the gradients; they count as one render."""
         self.tally.count += 1
         return self.inner.scene_gradients(camera, d_rgb, d_depth, d_alpha)

@@ -1,10 +1,11 @@
-"""The CPU renderer: one thread per picture, several pictures over one shared pool.
+"""The CPU renderer: one thread per image, several images over one shared pool.
 
-The steps are in `project` (ellipses and colours), `tiles` (depth order, tile lists), `blend` (the picture) and
-`backward` (gradients); `pack` has the memory layout. Semantics are gsplat's, with two additions: the 0.3 px^2
-screen-space dilation, right at the resolution the scene was trained at, is scaled by (f_render / f_train)^2, which
-takes the bias out of small renders; and whole blocks of 256 Gaussians outside 1.3 times the field of view are culled.
-Where asked, a picture ends early (`approximate`) and leaves out what lies beyond given depths (`occlusion_depths`).
+The steps are in `project` (ellipses and colours), `tiles` (depth order, tile lists), `blend` (the image), `backward`
+and `chain` (gradients); `pack` has the memory layout. Semantics are gsplat's (3DGS, Kerbl et al. 2023), with
+two additions: the 0.3 px^2 screen-space dilation, right at the resolution the scene was trained at, is scaled by
+(f_render / f_train)^2, which removes the bias of small renders; and whole blocks of 256 Gaussians outside 1.3 times the
+field of view are culled. On request an image ends early (`approximate`) and leaves out what lies beyond given depths
+(`occlusion_depths`).
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import os
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import Any
 
@@ -30,14 +31,22 @@ from service.render.project import RECORD, TILE, project
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
 
-DILATION = 0.3
-"""px^2, at the training resolution (3DGS, Kerbl et al. 2023, section 6)."""
-NEAR = 0.01
-"""Scene units; gsplat's default."""
-ASSUMED_TRAINING_LONG_SIDE_PX = 1000
-"""Where neither training cameras nor the manifest tell the resolution that a scene was trained at."""
-APPROXIMATE_T_MIN = np.float32(0.03)
-"""Transmittance at which an approximate image ends: walls of trained scenes let 0.01 through, above T_MIN."""
+
+@dataclass(frozen=True, slots=True)
+class RenderConfig:
+    """How Gaussians become pixels, where 3DGS leaves a choice; gsplat's renderer takes the same values."""
+
+    dilation_px2: float = 0.3
+    """Added to the covariance in the image, at the training resolution (3DGS, Kerbl et al. 2023, section 6)."""
+    near: float = 0.01
+    """Scene units; gsplat's default."""
+    assumed_training_long_side_px: int = 1000
+    """Where neither training cameras nor the manifest have the resolution that a scene was trained at."""
+    approximate_t_min: float = 0.03
+    """Transmittance at which an approximate image ends: walls of trained scenes let 0.01 through, above T_MIN."""
+
+
+DEFAULTS = RenderConfig()
 
 NO_OCCLUSION = np.empty(0, np.float32)
 
@@ -45,23 +54,23 @@ _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
 
 
 def create(scene: GaussianScene) -> CpuRasterizer:
-    """Pack the scene; takes some 50 ms per 100,000 Gaussians, and the kernels' compilation once per machine."""
+    """Pack a scene for rendering: 50 ms per 100,000 Gaussians; the kernels are compiled once per machine."""
     return CpuRasterizer(scene)
 
 
 def dilation_for(camera: Camera, info: SceneInfo) -> float:
-    """Return the dilation in px^2 for a render: DILATION * (f_render / f_train)^2."""
+    """Return the dilation in px^2 for a render: that of training times (f_render / f_train)^2."""
     if info.training_focal_px:
         ratio = camera.intrinsics.fx / info.training_focal_px
     else:
-        ratio = camera.intrinsics.long_side / (info.training_long_side_px or ASSUMED_TRAINING_LONG_SIDE_PX)
-    return DILATION * ratio * ratio
+        ratio = camera.intrinsics.long_side / (info.training_long_side_px or DEFAULTS.assumed_training_long_side_px)
+    return DEFAULTS.dilation_px2 * ratio * ratio
 
 
 class CpuRasterizer:
-    """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest picture seen.
+    """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest image so far.
 
-    The gradients use the lists of the thread's last picture if it was of the same camera object; else they
+    The gradients use the tile lists of the thread's last image if it was of the same camera object; else they
     render first.
     """
 
@@ -75,19 +84,22 @@ class CpuRasterizer:
 
     @property
     def nbytes(self) -> int:
+        """Memory of the packed scene; the threads' scratch is not counted."""
         return self.packed.nbytes
 
     def of(self, scene: GaussianScene) -> CpuRasterizer:
+        """Pack another scene."""
         return CpuRasterizer(scene)
 
     def trained_at(self, long_side_px: int) -> CpuRasterizer:
+        """Return a renderer of the same packed Gaussians whose dilation is right at another training resolution."""
         other = copy.copy(self)
         info = replace(self.scene.info, training_focal_px=None, training_long_side_px=long_side_px)
         other.scene = replace(self.scene, info=info)
         return other
 
     def refresh(self) -> None:
-        """Take in the scene's values again, for a scene under training: its arrays are views of changing ones."""
+        """Copy the scene's values into the packed arrays again, for a scene under training whose arrays change."""
         fill(self.packed, self.scene)
 
     def render(
@@ -96,10 +108,11 @@ class CpuRasterizer:
         approximate: bool = False,
         occlusion_depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
     ) -> list[Frame]:
-        enough = APPROXIMATE_T_MIN if approximate else T_MIN
-        if len(cameras) == 1:
-            return [self._render(cameras[0], enough, occlusion_depths[0] if occlusion_depths else None)]
-        return list(_POOL.map(self._render, cameras, repeat(enough), occlusion_depths or repeat(None)))
+        """Render float32 images, read-only, by front-to-back alpha blending; several cameras on all cores."""
+        end_t = np.float32(DEFAULTS.approximate_t_min) if approximate else T_MIN
+        if len(cameras) == 1:  # in this thread: a job of one image at a time must not wait for the pool
+            return [self._render(cameras[0], end_t, occlusion_depths[0] if occlusion_depths else None)]
+        return list(_POOL.map(self._render, cameras, repeat(end_t), occlusion_depths or repeat(None)))
 
     def pose_gradient(
         self,
@@ -108,6 +121,7 @@ class CpuRasterizer:
         d_depth: Float32[np.ndarray, "h w"] | None = None,
         d_alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> Float64[np.ndarray, "6"]:
+        """Return d loss / d twist (rotation, translation in the camera frame) in two passes over the tile lists."""
         s = self._backward(camera, d_rgb, d_depth, d_alpha)
         twist = np.empty(6)
         pose_twist(s.records, s.sums, s.visible, *self._chain_arguments(camera, s), twist)
@@ -120,6 +134,7 @@ class CpuRasterizer:
         d_depth: Float32[np.ndarray, "h w"] | None = None,
         d_alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> SceneGradients:
+        """Return d loss / d parameter of the Gaussians in view."""
         s = self._backward(camera, d_rgb, d_depth, d_alpha)
         n, scene = s.visible, self.scene
         rows = aligned((n + LANES) * ROW)
@@ -139,7 +154,7 @@ class CpuRasterizer:
         return result
 
     def _render(
-        self, camera: Camera, enough: np.float32 = T_MIN, occlusion_depth: Float32[np.ndarray, "_ _"] | None = None
+        self, camera: Camera, end_t: np.float32 = T_MIN, occlusion_depth: Float32[np.ndarray, "_ _"] | None = None
     ) -> Frame:
         s = self._scratch()
         s.camera = None  # an error on the way must not leave another camera's lists behind
@@ -147,23 +162,24 @@ class CpuRasterizer:
         k = camera.intrinsics
         frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))
         blend(
-            s.records, s.starts, s.entries, k.width, k.height, self._background, enough, s.local, s.lists, s.lengths,
+            s.records, s.starts, s.entries, k.width, k.height, self._background, end_t, s.local, s.lists, s.lengths,
             s.state,
             frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1),
         )  # fmt: skip
+        # The gradients and other jobs' caches share these arrays.
         for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
             image.flags.writeable = False
-        if enough == T_MIN and occlusion_depth is None:  # no gradients of an approximate image
+        if end_t == T_MIN and occlusion_depth is None:  # an approximate image has no gradients
             s.camera, s.info, s.frame = camera, self.scene.info, frame
         return frame
 
     def _backward(self, camera: Camera, d_rgb: Any, d_depth: Any, d_alpha: Any) -> _Scratch:
-        """Fill `sums` for the picture of this camera; it is rendered first unless it was this thread's last."""
+        """Fill `sums` for the image of this camera, rendered first unless it was this thread's last one."""
         s = self._scratch()
-        is_last = s.camera is camera and s.info is self.scene.info  # trained_at another size is another picture
+        is_last = s.camera is camera and s.info is self.scene.info  # `trained_at` another size gives another image
         frame = s.frame if is_last and s.frame is not None else self._render(camera)
         width, height = camera.intrinsics.width, camera.intrinsics.height
-        zero = np.zeros(width * height, np.float32)
+        zero = np.zeros(width * height, np.float32)  # a gradient that is not given
         s.sums[: s.visible * RECORD] = 0
         blend_backward(
             s.records, s.starts, s.entries, width, height, self._background, frame.rgb.reshape(-1),
@@ -176,7 +192,7 @@ class CpuRasterizer:
     def _chain_arguments(self, camera: Camera, s: _Scratch) -> tuple:
         packed, k = self.packed, camera.intrinsics
         return (
-            packed.geometry, packed.sh, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
+            packed.geometry, packed.sh, packed.sh_degree, *_view_and_intrinsics(camera), k.width, k.height,
             *self._dilation(camera), s.local,
         )  # fmt: skip
 
@@ -190,31 +206,33 @@ class CpuRasterizer:
         return np.float32(dilation_for(camera, info)), info.render_mode == "antialiased"
 
     def _bin(self, camera: Camera, s: _Scratch, occlusion_depth: Float32[np.ndarray, "_ _"] | None) -> None:
-        """Project, sort and fill the tile lists."""
+        """Project the Gaussians, sort them by depth and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
         tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
         s.visible, count = project(
-            packed.geometry, packed.sh, packed.spheres, packed.sh_degree, *_view_and_lens(camera), k.width, k.height,
-            *self._dilation(camera), np.float32(NEAR), tile_depths, s.records, s.depths, s.rects, s.local,
+            packed.geometry, packed.sh, packed.spheres, packed.sh_degree,
+            *_view_and_intrinsics(camera), k.width, k.height, *self._dilation(camera), np.float32(DEFAULTS.near),
+            tile_depths, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:
-            s.entries = np.empty(count + count // 4, np.int32)
+            s.entries = np.empty(count + count // 4, np.int32)  # a quarter more: the next view may need it
         if len(s.starts) != tiles_x * tiles_y + 1:
             s.starts = np.empty(tiles_x * tiles_y + 1, np.int32)
         sort_by_depth(s.depths, s.visible, s.keys, s.swap, s.histogram)
         fill_tiles(s.keys, s.visible, s.rects, tiles_x, tiles_y, s.starts, s.entries)
 
 
-def _view_and_lens(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def _view_and_intrinsics(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     k = camera.intrinsics
     view = np.ascontiguousarray(camera.pose.camera_from_world[:3], np.float32).reshape(-1)
     return view, np.array([k.fx, k.fy, k.cx, k.cy], np.float32)
 
 
 def _tile_maxima(occlusion_depth: Float32[np.ndarray, "h w"], width: int, height: int) -> Float32[np.ndarray, "_"]:
-    """Return the largest occlusion depth in each tile."""
+    """Return the largest occlusion depth in each tile: a tile ends only where all of its pixels do."""
     for axis, side in enumerate((height, width)):
+        # Coarse pixels that a tile covers in part count, too: from the floor of its start to the ceiling of its end.
         ends = np.minimum(np.arange(0, side + TILE, TILE), side) * occlusion_depth.shape[axis] / side
         last = np.ceil(ends[1:]).astype(int) - 1
         farthest = np.maximum.reduceat(occlusion_depth, ends[:-1].astype(int), axis)
@@ -227,7 +245,7 @@ def _flat(image: np.ndarray) -> np.ndarray:
 
 
 class _Scratch:
-    """A thread's working memory. Large parts are touched, and so exist, only as far as a picture needs them."""
+    """A thread's working memory. The system provides pages of the large arrays only once an image uses them."""
 
     def __init__(self, packed: Packed) -> None:
         room = len(packed.order)
@@ -245,9 +263,9 @@ class _Scratch:
         self.state = aligned(16 * STATE)
         self.visible = 0
         self.camera: Camera | None = None
-        """Whose picture the lists belong to..."""
+        """Camera of the image that the lists belong to..."""
         self.info: SceneInfo | None = None
-        """...and of the scene as trained at which size."""
+        """...and the scene's facts at the time: `trained_at` changes them."""
         self.frame: Frame | None = None
         self.inputs = aligned(16 * INPUT)
         self.work = aligned(WORK)

@@ -1,13 +1,13 @@
 """The renderer on an NVIDIA GPU: gsplat's CUDA kernels, with the semantics of `cpu`. The only file with gsplat.
 
-Pictures of one size are rendered in one call; pictures and gradients are computed on the device, and only frames and
-gradients cross over. Gradients are summed in no fixed order, so their last digits differ from call to call.
+Images of one size are rendered in one call; images and gradients are computed on the device, and only they are copied
+to the host. Gradients are summed in no fixed order, so their last digits differ from call to call.
 
-gsplat has no median depth. A second pass asks its kernel which Gaussians each pixel blends, some hundred at a time and
-from near to far, and looks for the one at which the transmittance falls to one half:
+gsplat has no median depth. A second pass takes from its kernel the Gaussians that each pixel blends, 256 at a time and
+from near to far, and finds the one at which the transmittance falls to one half:
 
     tile's list, by depth   |  256 Gaussians  |  256 Gaussians  | ...
-    transmittance of a ray  1 ......... 0.7   0.7 ... 0.5 <- here: the ray is left out from now on
+    transmittance of a ray  1 ......... 0.7   0.7 ... 0.5 <- here: the ray is left out of later passes
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from torch import Tensor
 
 from service.errors import BackendMissing
 from service.interfaces import Frame, SceneGradients
-from service.render.cpu import NEAR, dilation_for
+from service.render.cpu import DEFAULTS, dilation_for
 from service.types import Camera, GaussianScene
 
 TILE = 16
 """Pixels; gsplat's kernels take TILE * TILE Gaussians of a tile's list at a time."""
 PROJECTED_AT_ONCE = 4_000_000
-"""Gaussians times cameras of a call: some 200 bytes each at SH degree 3."""
+"""Gaussians times cameras in one call: some 200 bytes of GPU memory each at SH degree 3."""
 RAYS_AT_ONCE = 2**18
-"""For the median depth, at most 256 Gaussians each: some 100 bytes per Gaussian that a ray meets."""
+"""Pixels of one pass for the median depth: some 100 bytes of GPU memory per Gaussian, at most 256 for each."""
 
 
 class Kernels(NamedTuple):
@@ -52,13 +52,13 @@ def missing() -> str | None:
         return "this PyTorch was built without CUDA"
     if not torch.cuda.is_available():
         return "PyTorch sees no CUDA device: no NVIDIA GPU, or no driver for it"
-    from gsplat.cuda import _backend  # not before there is a GPU: it looks for a compiler, and says so
+    from gsplat.cuda import _backend  # only where there is a GPU: the import searches for a compiler, and prints that
 
     return None if _backend._C is not None else "gsplat has no CUDA kernels, and finds no nvcc to compile them"
 
 
 def create(scene: GaussianScene) -> GsplatRasterizer:
-    """Put the scene on the GPU. Raises BackendMissing if its memory is too small."""
+    """Copy the scene to the GPU. Raises BackendMissing if its memory is too small."""
     from gsplat import rasterization, rasterize_to_indices_in_range
 
     kernels = Kernels(rasterization, rasterize_to_indices_in_range)
@@ -87,12 +87,15 @@ class GsplatRasterizer:
 
     @property
     def nbytes(self) -> int:
+        """GPU memory of the scene."""
         return sum(tensor.nbytes for tensor in self._parameters)
 
     def of(self, scene: GaussianScene) -> GsplatRasterizer:
+        """Copy another scene to the same GPU. Raises BackendMissing."""
         return _put(scene, self._on, self._kernels)
 
     def trained_at(self, long_side_px: int) -> GsplatRasterizer:
+        """Return a renderer of the same tensors whose dilation is right at another training resolution."""
         other = copy.copy(self)
         info = replace(self.scene.info, training_focal_px=None, training_long_side_px=long_side_px)
         other.scene = replace(self.scene, info=info)
@@ -104,6 +107,7 @@ class GsplatRasterizer:
         approximate: bool = False,
         occlusion_depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None,
     ) -> list[Frame]:
+        """Render the cameras, in one call for each image size; the options only permit omissions, and are not used."""
         groups: dict[tuple, list[int]] = defaultdict(list)
         for index, camera in enumerate(cameras):
             k = camera.intrinsics
@@ -123,14 +127,16 @@ class GsplatRasterizer:
         d_depth: Float32[np.ndarray, "h w"] | None = None,
         d_alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> Float64[np.ndarray, "6"]:
+        """Return d loss / d twist by automatic differentiation of the view matrix."""
         views = self._views([camera]).requires_grad_()
         image, alpha, _ = self._rasterize([camera], views, self._parameters)
         (d_view,) = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), views)
-        # camera_from_world becomes exp(-twist) @ camera_from_world.
+        # camera_from_world becomes exp(-twist) @ camera_from_world; a matrix gradient D there contributes D V^T, whose
+        # antisymmetric part belongs to the rotation and whose last column to the translation.
         d_view, view = d_view[0].double().cpu().numpy(), camera.pose.camera_from_world
         m = d_view @ view.T
-        turn = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
-        return -np.array([*turn, *m[:3, 3]])
+        rotation = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
+        return -np.array([*rotation, *m[:3, 3]])
 
     def scene_gradients(
         self,
@@ -139,6 +145,7 @@ class GsplatRasterizer:
         d_depth: Float32[np.ndarray, "h w"] | None = None,
         d_alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> SceneGradients:
+        """Return d loss / d parameter of the Gaussians in view by automatic differentiation."""
         leaves = tuple(tensor.detach().requires_grad_() for tensor in self._parameters)
         image, alpha, meta = self._rasterize([camera], self._views([camera]), leaves)
         gradients = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), leaves)
@@ -148,7 +155,7 @@ class GsplatRasterizer:
         )
 
     def _render(self, cameras: Sequence[Camera]) -> Iterator[Frame]:
-        """Cameras of one size and dilation."""
+        """Render cameras of one image size and dilation."""
         with torch.no_grad():
             image, alpha, meta = self._rasterize(cameras, self._views(cameras), self._parameters)
             median = self._median_depth(meta, alpha[..., 0].shape)
@@ -161,7 +168,7 @@ class GsplatRasterizer:
     def _rasterize(
         self, cameras: Sequence[Camera], views: Float[Tensor, "c 4 4"], parameters: tuple[Tensor, ...]
     ) -> tuple[Float[Tensor, "c h w 4"], Float[Tensor, "c h w 1"], dict[str, Any]]:
-        """Return colours with the expected depth, alpha, and what gsplat tells of its intermediate results."""
+        """Return colours with the expected depth, alpha, and gsplat's intermediate results."""
         k, info = cameras[0].intrinsics, self.scene.info
         lenses = [[[c.fx, 0, c.cx], [0, c.fy, c.cy], [0, 0, 1]] for c in (camera.intrinsics for camera in cameras)]
         return self._kernels.rasterization(
@@ -170,10 +177,10 @@ class GsplatRasterizer:
             Ks=self._tensor(lenses),
             width=k.width,
             height=k.height,
-            near_plane=NEAR,
+            near_plane=DEFAULTS.near,
             eps2d=dilation_for(cameras[0], info),
             sh_degree=self.scene.sh_degree,
-            packed=False,  # the median depth needs its form
+            packed=False,  # the median depth indexes the unpacked form
             tile_size=TILE,
             backgrounds=self._background.expand(len(cameras), 3),
             render_mode="RGB+ED",
@@ -188,7 +195,7 @@ class GsplatRasterizer:
         longest = int(torch.diff(offsets, append=offsets.new_tensor([len(meta["flatten_ids"])])).max())
         for first in range(0, total, RAYS_AT_ONCE):
             rays = slice(first, first + RAYS_AT_ONCE)
-            through = torch.zeros(total, device=self._on)  # a ray without light meets nothing
+            through = torch.zeros(total, device=self._on)  # a ray of transmittance 0 blends nothing
             through[rays] = 1
             for step in range(-(-longest // TILE**2)):
                 self._advance(meta, shape, step, through, median)
@@ -204,7 +211,7 @@ class GsplatRasterizer:
         through: Float[Tensor, "r"],
         median: Float[Tensor, "r"],
     ) -> None:
-        """Take all rays past the next Gaussians of their tiles' lists; one that loses half its light ends there."""
+        """Blend the next 256 Gaussians of the tiles' lists; a ray whose transmittance falls to one half ends there."""
         _, height, width = shape
         centres, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
         gaussian, pixel, image = self._kernels.rasterize_to_indices_in_range(
@@ -218,22 +225,23 @@ class GsplatRasterizer:
         a, b, c = conics[image, gaussian].unbind(-1)
         sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         alpha = (opacities[image, gaussian] * torch.exp(-sigma)).clamp(max=0.999)
-        # Ray follows ray: transmittance is a running product that starts anew with each.
+        # The entries are sorted by ray, then depth: transmittance is a running product that restarts with each ray,
+        # computed as a sum of logarithms minus the sum at the ray's start, in float64, as thousands are added up.
         starts = torch.ones_like(ray, dtype=torch.bool)
         starts[1:] = ray[1:] != ray[:-1]
         kept = torch.log1p(-alpha.double())
         sums = kept.cumsum(0)
         after = through[ray] * torch.exp(sums - (sums - kept)[starts][starts.cumsum(0) - 1])
-        dark = after <= 0.5
-        crossing = dark.clone()
-        crossing[1:] &= starts[1:] | ~dark[:-1]
+        below_half = after <= 0.5
+        crossing = below_half.clone()
+        crossing[1:] &= starts[1:] | ~below_half[:-1]
         last = starts.roll(-1)
         through[ray[last]] = after[last].to(through.dtype)
         through[ray[crossing]] = 0
         median[ray[crossing]] = meta["depths"][image, gaussian][crossing].to(median.dtype)
 
     def _loss(self, image: Tensor, alpha: Tensor, d_rgb: Any, d_depth: Any, d_alpha: Any) -> Float[Tensor, ""]:
-        """The scalar whose gradient is asked for: each output times its own gradient."""
+        """Return the scalar with the requested gradient: the sum of each output times its gradient."""
         loss = (image[0, ..., :3] * self._tensor(d_rgb)).sum()
         if d_depth is not None:
             loss = loss + (image[0, ..., 3] * self._tensor(d_depth)).sum()

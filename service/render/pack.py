@@ -1,4 +1,4 @@
-"""Gaussians in the order and layout that the kernels read.
+"""The memory layout of the scene that the kernels read: chunks of 16 Gaussians, one SIMD vector for each value.
 
     Morton order, then 16 Gaussians a chunk, structure of arrays inside the chunk; 16 chunks a block:
 
@@ -6,7 +6,9 @@
     sh        [chunk][ k0 r | k0 g | k0 b | k1 r | ... ][16 lanes]
     spheres   [block][ x, y, z, radius ]     encloses every Gaussian of the block out to its visible edge
 
-S is the covariance in the world frame. The last chunk is filled up with Gaussians that are never visible.
+One load brings a value of 16 Gaussians into a register. Morton order puts neighbours into one chunk, so that a block's
+sphere is small and is culled as a whole. S is the covariance in the world frame: it depends on no camera and is
+computed once. The last chunk is filled up with Gaussians that are never visible.
 """
 
 from __future__ import annotations
@@ -21,34 +23,40 @@ from service.types import GaussianScene
 
 LANES = 16
 GEOMETRY = 10
+"""Values of a Gaussian in `geometry`."""
 CHUNKS_PER_BLOCK = 16
 """Small, so that little outside the view is projected: with 64, 3 million Gaussians take a tenth longer."""
-# exp(-x^2 / 2) = 1/255 at x = 3.33: beyond it even an opaque Gaussian is skipped.
 VISIBLE_SIGMAS = 3.33
+"""exp(-x^2 / 2) = 1/255 at x = 3.33: beyond it even an opaque Gaussian is skipped."""
 NEVER = -1e9
+"""log2 of the opacity of a Gaussian that is never visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class Packed:
+    """A scene in the layout above."""
+
     count: int
     sh_degree: int
     order: Int32[np.ndarray, "padded"]
-    """Index into the scene of each packed place; filled up with the last Gaussian's."""
+    """The scene's index of each packed Gaussian; padded with the last one's."""
     geometry: Float32[np.ndarray, "g"]
     sh: Float32[np.ndarray, "s"]
     spheres: Float32[np.ndarray, "blocks 4"]
 
     @property
     def nbytes(self) -> int:
+        """Memory of all arrays."""
         return self.order.nbytes + self.geometry.nbytes + self.sh.nbytes + self.spheres.nbytes
 
     @property
     def chunks(self) -> int:
+        """Number of groups of 16 Gaussians."""
         return len(self.order) // LANES
 
 
 def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
-    """Return an uninitialized array that starts at a cache line: a vector then never crosses one."""
+    """Return an uninitialized array that starts at a cache line (64 bytes), so that no vector crosses one."""
     itemsize = np.dtype(dtype).itemsize
     raw = np.empty(count * itemsize + 64, np.uint8)
     start = -raw.ctypes.data % 64
@@ -56,7 +64,7 @@ def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
 
 
 def pack(scene: GaussianScene) -> Packed:
-    """Order the Gaussians along a space-filling curve and lay them out."""
+    """Order the Gaussians along a space-filling curve and write them in the kernels' layout."""
     order = morton_order(scene.means)
     padded = -(-scene.count // LANES) * LANES
     order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])
@@ -75,7 +83,7 @@ def pack(scene: GaussianScene) -> Packed:
 
 
 def fill(packed: Packed, scene: GaussianScene) -> None:
-    """Write the scene's values into the packed arrays, in the order they have: for a scene under training."""
+    """Write the scene's values into the packed arrays in their present order, also of a scene under training."""
     sh = scene.sh.reshape(scene.count, -1)
     _fill(
         scene.means, scene.quats, scene.scales, scene.opacities, sh, packed.count, packed.order,
@@ -84,12 +92,13 @@ def fill(packed: Packed, scene: GaussianScene) -> None:
 
 
 def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
-    """Return the order along a Z-shaped space-filling curve of 1024^3 cells."""
+    """Return the indices that sort points along the Z-order (Morton) curve of 1024^3 cells."""
     # Quantiles, not extremes: a few far floaters must not squeeze the rest into one cell.
     low, high = np.quantile(means[:: max(1, len(means) // 20_000)], [0.01, 0.99], axis=0)
     cells = np.clip((means - low) / np.maximum(high - low, 1e-12) * 1023, 0, 1023).astype(np.uint32)
     code = np.zeros(len(means), np.uint32)
     for axis in range(3):
+        # Spread 10 bits to every third place; the axes are then interleaved.
         x = cells[:, axis]
         for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
             x = (x | (x << np.uint32(shift))) & np.uint32(mask)
@@ -99,12 +108,14 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
 
 @kernel
 def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh, spheres):
+    """Write covariances, SH and bounding spheres; numba, as a Python loop over millions would take minutes."""
     coefficients = sh.shape[1]
     for place in range(order.shape[0]):
         i = order[place]
         g = (place // 16) * 160 + (place & 15)
         w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         s0, s1, s2 = scales[i, 0], scales[i, 1], scales[i, 2]
+        # S = M M^T with M = R diag(scale): R by columns times the scales.
         r00, r01, r02 = (1 - 2 * (y * y + z * z)) * s0, 2 * (x * y - w * z) * s1, 2 * (x * z + w * y) * s2
         r10, r11, r12 = 2 * (x * y + w * z) * s0, (1 - 2 * (x * x + z * z)) * s1, 2 * (y * z - w * x) * s2
         r20, r21, r22 = 2 * (x * z - w * y) * s0, 2 * (y * z + w * x) * s1, (1 - 2 * (x * x + y * y)) * s2
@@ -123,6 +134,7 @@ def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh
     for block in range(spheres.shape[0]):
         first = block * CHUNKS_PER_BLOCK * LANES
         last = min(first + CHUNKS_PER_BLOCK * LANES, order.shape[0])
+        # The sphere around the bounding box's centre: not the smallest one, but found in two passes.
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for place in range(first, last):
             for axis in range(3):

@@ -1,12 +1,14 @@
-"""From Gaussians in the world to ellipses on the image, 16 at a time (EWA splatting, gsplat's semantics).
+"""Projection: Gaussians in the world to ellipses on the image, 16 at a time (EWA splatting, Zwicker et al. 2001).
 
-Covariance in the image: J R S R^T J^T + dilation * I, with the perspective Jacobian J taken at the centre, whose
-direction is clamped to 1.3 times the field of view. A record of a visible Gaussian is one cache line:
+Covariance in the image: J R S R^T J^T + dilation * I, with the perspective Jacobian J at the centre, whose direction is
+clamped to 1.3 times the field of view, as in gsplat. Input is structure of arrays (see `pack`), so that one operation
+takes 16 Gaussians; output is one record for each visible Gaussian, one cache line, since later steps read all values of
+a single Gaussian:
 
-    [ x | y | A | B | C | log2 opacity | depth | r | g | b | place (int bits) | raw r | raw g | raw b | - | - ]
+    [ x | y | A | B | C | log2 opacity | depth | r | g | b | packed index (int bits) | raw r | raw g | raw b | - | - ]
 
-log2 alpha = log2 opacity - (A dx^2 + B dx dy + C dy^2), dx = x - pixel: factors 1/2 and log2 e are in A, B, C. The raw
-colours are before the clamp at 0, whose gradient needs their sign.
+log2 alpha = log2 opacity - (A dx^2 + B dx dy + C dy^2), dx = x - pixel: factors 1/2 and log2 e are in A, B, C, so that
+blending needs one exp2. The raw colours are those before the clamp at 0, whose gradient needs their sign.
 """
 
 from __future__ import annotations
@@ -35,7 +37,9 @@ from service.render.simd import (
 )
 
 RECORD = 16
+"""Floats of a record."""
 TILE = 16
+"""Pixels of a tile's side."""
 HALF_LOG2E = np.float32(0.5 * np.log2(np.e))
 TWO_LN2 = np.float32(2 * np.log(2.0))
 LOG2_ALPHA_MIN = np.float32(-np.log2(255.0))
@@ -53,7 +57,7 @@ C30, C31, C32, C33, C34, C35, C36 = (
 
 @inline
 def log2_of(x):
-    """log2 of positive floats by the atanh series around 1; error below 1e-7."""
+    """Return log2 of positive floats, by the series of atanh around 1; error below 1e-7."""
     shifted = as_int(x) - 0x3F3504F3  # sqrt(1/2): the mantissa lands in [sqrt(1/2), sqrt(2))
     exponent = select(shifted < 0, (shifted >> 23) - 512, shifted >> 23)
     mantissa = as_float((shifted & 0x7FFFFF) + 0x3F3504F3)
@@ -65,7 +69,7 @@ def log2_of(x):
 
 @inline
 def colour(sh, at, degree, x, y, z):
-    """Three colour planes from SH for unit directions; `at` is the chunk's offset. Basis: Sloan 2013, as 3DGS."""
+    """Return red, green, blue of SH at unit directions; `at`: the chunk's offset. Basis: Sloan 2013, as 3DGS."""
     r, g, b = load(sh, at) * C0, load(sh, at + 16) * C0, load(sh, at + 32) * C0
     if degree >= 1:
         at += 48
@@ -100,13 +104,14 @@ def _add_basis(sh, at, basis, r, g, b):
 
 @inline
 def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
-    """Whether a bounding sphere reaches into the clamp region of the view."""
+    """Whether a bounding sphere reaches into the field of view, enlarged to the clamped region."""
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
     if cz + radius < near:
         return False
+    # Distances from the four side planes, whose normals aren't normalized: the radius is scaled instead.
     return (
         cx - high_x * cz < radius * np.sqrt(1 + high_x * high_x)
         and -cx - low_x * cz < radius * np.sqrt(1 + low_x * low_x)
@@ -132,7 +137,7 @@ def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, tile_depths):
 
 @inline
 def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
-    """Return the first tile of a row that a box reaches into, dilation and all, and the one after the last."""
+    """Return the range of tiles along one axis that a box in the camera frame projects to, a tile more at each end."""
     first = (min(low / nearest, low / farthest) * focal + centre) / TILE - 1
     last = (max(high / nearest, high / farthest) * focal + centre) / TILE + 2
     return int(max(0, min(first, tiles))), int(max(0, min(last, tiles)))
@@ -140,7 +145,7 @@ def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
 
 @inline
 def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
-    """Whether what is at this depth lies behind the occlusion depths of all these tiles."""
+    """Whether a depth lies behind the occlusion depths of all these tiles."""
     for ty in range(y0, y1):
         for tx in range(x0, x1):
             if depth <= tile_depths[np.intp(ty * tiles_x + tx)]:
@@ -166,6 +171,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
     r00, r01, r02, t0 = view[0], view[1], view[2], view[3]
     r10, r11, r12, t1 = view[4], view[5], view[6], view[7]
     r20, r21, r22, t2 = view[8], view[9], view[10], view[11]
+    # Position of the camera in the world: -R^T t.
     eye_x = -(r00 * t0 + r10 * t1 + r20 * t2)
     eye_y = -(r01 * t0 + r11 * t1 + r21 * t2)
     eye_z = -(r02 * t0 + r12 * t1 + r22 * t2)
@@ -222,6 +228,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
             mask = bits(seen)
             if mask == 0:
                 continue
+            # Colours for chunks with a visible Gaussian only: at degree 3, SH are five times the memory of the rest.
             inverse = HALF_LOG2E / determinant
             dx, dy, dz = mx - eye_x, my - eye_y, mz - eye_z
             length = 1.0 / sqrt(fma(dx, dx, fma(dy, dy, dz * dz)))
@@ -240,12 +247,14 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
             store(scratch, 176, red)
             store(scratch, 192, green)
             store(scratch, 208, blue)
+            # From vectors of 16 Gaussians to their records.
             transpose16(scratch, 0, 16, scratch, 256, 16)
             to_tile = np.float32(1.0 / TILE)
             store(integers, 512, to_int(vmax((px - wide) * to_tile, 0.0)))
             store(integers, 528, to_int(vmax((py - high) * to_tile, 0.0)))
             store(integers, 544, to_int(vmin(floor((px + wide) * to_tile) + 1.0, tiles_x)))
             store(integers, 560, to_int(vmin(floor((py + high) * to_tile) + 1.0, tiles_y)))
+            # Visible Gaussians are written without gaps, in the packed order.
             for lane in range(16):
                 if (mask >> np.uint32(lane)) & np.uint32(1):
                     x0, y0 = integers[512 + lane], integers[528 + lane]

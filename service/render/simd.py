@@ -1,16 +1,16 @@
-"""A 16-wide SIMD type for numba kernels: one source for AVX-512, AVX2 and NEON.
+"""16-wide SIMD types for numba kernels: one source for AVX-512, AVX2 and NEON.
 
-`f32x16`, `i32x16` and `mask16` are numba types that become LLVM vectors, so the speed of a kernel doesn't hang
-on whether LLVM happens to vectorize a loop. A <16 x float> is one register with AVX-512, two with AVX2:
+`f32x16`, `i32x16` and `mask16` are numba types that become LLVM vectors, so that a kernel's speed doesn't depend on
+whether LLVM vectorizes a loop by itself. A <16 x float> is one register with AVX-512, two with AVX2, four with NEON:
 
     lane      0     1     2    ...    15
     f32x16 [ x0  | x1  | x2  | ... | x15 ]     16 Gaussians of a chunk, or the 4x4 pixels of a block (row by row)
 
 Operators (+ - * / and comparisons, & | ~ for masks) work lane by lane; a Python number beside a vector is
-broadcast. Everything here is usable inside kernels only.
+broadcast. Everything here is for use inside kernels only: a function returns numba's signature and a generator of LLVM
+IR. Memory functions take one-dimensional contiguous arrays and an offset in elements, and check no bounds.
 """
 
-# ruff: noqa: D103  (one line each; the names say it)
 from __future__ import annotations
 
 import operator
@@ -51,11 +51,12 @@ _LLVM = {f32x16: _VF, i32x16: _VI, mask16: _VM}
 
 
 def intrinsic(emit: Callable[..., Any]) -> Callable[..., Any]:
-    """numba's decorator, typed as what it makes: a function without `typingctx`, callable in kernels."""
+    """Apply numba's decorator, typed as its result: a function without `typingctx`, callable in kernels."""
     return numba_intrinsic(emit)
 
 
 def _model(numba_type: type, llvm_type: ir.Type) -> None:
+    # A value of the type is the LLVM vector itself: it lives in registers.
     @register_model(numba_type)
     class _Model(models.PrimitiveModel):
         def __init__(self, dmm: Any, fe_type: Any) -> None:
@@ -68,13 +69,14 @@ _model(VectorM, _VM)
 
 
 def _splat(builder: Any, scalar: Any, llvm_type: ir.VectorType) -> Any:
+    # LLVM recognizes this pair as a broadcast instruction.
     undef = ir.Constant(llvm_type, ir.Undefined)
     one = builder.insert_element(undef, scalar, ir.Constant(_I32, 0))
     return builder.shuffle_vector(one, undef, ir.Constant(ir.VectorType(_I32, LANES), [0] * LANES))
 
 
 def _widened(context: Any, builder: Any, value: Any, source: Any, target: Vector) -> Any:
-    """A vector as it is; a number cast to the vector's element type and broadcast."""
+    """Return a vector as it is; a number is cast to the vector's element type and broadcast."""
     if isinstance(source, Vector):
         return value
     element = types.float32 if target is f32x16 else types.int32
@@ -112,6 +114,7 @@ def _operator(op: Any, kinds: dict[Vector, tuple[Vector, Any]], operands: int = 
         if operands == 1:
             lower_builtin(op, type(vector))(lower)
             continue
+        # A vector with a vector, and with a number on either side.
         for pair in (
             (type(vector), type(vector)),
             (type(vector), types.Number),
@@ -198,16 +201,20 @@ def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
 
 @intrinsic
 def sqrt(typingctx: Any, a: Any) -> Any:
+    """Square root."""
     return _function("llvm.sqrt", 1)(a)
 
 
 @intrinsic
 def floor(typingctx: Any, a: Any) -> Any:
+    """Largest integer not above, as a float."""
     return _function("llvm.floor", 1)(a)
 
 
 @intrinsic
 def splat(typingctx: Any, x: Any) -> Any:
+    """One number in every lane, as floats."""
+
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         return _widened(context, builder, args[0], sig.args[0], f32x16)
 
@@ -216,6 +223,8 @@ def splat(typingctx: Any, x: Any) -> Any:
 
 @intrinsic
 def isplat(typingctx: Any, x: Any) -> Any:
+    """One number in every lane, as integers."""
+
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         return _widened(context, builder, args[0], sig.args[0], i32x16)
 
@@ -239,11 +248,13 @@ def _extreme(predicate: str) -> Any:
 
 @intrinsic
 def vmin(typingctx: Any, a: Any, b: Any) -> Any:
+    """The smaller one, lane by lane; `b` where one is NaN."""
     return f32x16(a, b), _extreme("<")
 
 
 @intrinsic
 def vmax(typingctx: Any, a: Any, b: Any) -> Any:
+    """The larger one, lane by lane; `b` where one is NaN."""
     return f32x16(a, b), _extreme(">")
 
 
@@ -271,6 +282,8 @@ def bits(typingctx: Any, mask: Any) -> Any:
 
 @intrinsic
 def popcount(typingctx: Any, x: Any) -> Any:
+    """Number of set bits."""
+
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         return builder.zext(builder.ctpop(args[0]), _I64)
 
@@ -285,6 +298,7 @@ def to_int(typingctx: Any, a: Any) -> Any:
 
 @intrinsic
 def to_float(typingctx: Any, a: Any) -> Any:
+    """Integers as floats of the same value."""
     return f32x16(a), lambda context, builder, sig, args: builder.sitofp(args[0], _VF)
 
 
@@ -319,6 +333,7 @@ def load(typingctx: Any, array: Any, offset: Any) -> Any:
     """16 consecutive float32 of a one-dimensional contiguous array."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        # Aligned to 4 bytes only: most arrays start at a cache line, but offsets are of any number of floats.
         p = _pointer(context, builder, sig.args[0], args[0], args[1])
         return builder.load(builder.bitcast(p, _VF.as_pointer()), align=4, typ=_VF)
 
@@ -396,6 +411,7 @@ def gather(typingctx: Any, array: Any, index: Any) -> Any:
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         data = cgutils.create_struct_proxy(sig.args[0])(context, builder, args[0]).data
         pointers = ir.VectorType(_F32.as_pointer(), LANES)
+        # Addresses as 64-bit integers, 4 bytes an element.
         wide = builder.sext(args[1], ir.VectorType(_I64, LANES))
         base = _splat(builder, builder.ptrtoint(data, _I64), ir.VectorType(_I64, LANES))
         four = ir.Constant(ir.VectorType(_I64, LANES), [4] * LANES)

@@ -3,6 +3,9 @@
 keys     depth's float bits, shifted so that the range in use fills 24 bits   [24 bits key | record number]
 sort     2 passes of 12 bits, least significant first
 lists    entries[starts[t] : starts[t + 1]] = the records of tile t, near to far
+
+One sort of all records, then a stable distribution: a tile's list needs no sort of its own. 12 bits, as two histograms
+of 4096 counters fit the L1 cache.
 """
 
 from __future__ import annotations
@@ -14,10 +17,10 @@ from service.jit import kernel
 
 @kernel
 def sort_by_depth(depths, visible, keys, swap, histogram):
-    """Leave in `keys` the record numbers (low 32 bits) in order of depth."""
+    """Leave in `keys` the record numbers (low 32 bits) in order of depth; `swap` and `histogram` are work space."""
     if visible == 0:
         return
-    bits = depths.view(np.uint32)
+    bits = depths.view(np.uint32)  # of positive floats: ordered like their values
     low, high = bits[np.uint64(0)], bits[np.uint64(0)]
     for i in range(np.uint64(visible)):
         low, high = min(low, bits[i]), max(high, bits[i])
@@ -30,6 +33,7 @@ def sort_by_depth(depths, visible, keys, swap, histogram):
         keys[i] = key << np.uint64(32) | i
         histogram[key & np.uint64(4095)] += 1
         histogram[np.uint64(4096) + (key >> np.uint64(12))] += 1
+    # Counts become the places where each digit's records begin.
     first = second = np.int32(0)
     for i in range(np.uint64(4096)):
         count = histogram[i]
@@ -50,10 +54,11 @@ def sort_by_depth(depths, visible, keys, swap, histogram):
 
 @kernel
 def fill_tiles(keys, visible, rects, tiles_x, tiles_y, starts, entries):
-    """Write the tile lists; `starts` has one place more than tiles."""
+    """Write the tile lists; `starts` has one element more than there are tiles."""
     mask = np.uint64(0xFFFF)
     wide = np.uint64(tiles_x)
     starts[:] = 0
+    # A counting sort: how many records each tile has, one place further on for the sums below.
     for i in range(np.uint64(visible)):
         rect = rects[i]
         x1, y1 = (rect >> np.uint64(32)) & mask, rect >> np.uint64(48)
