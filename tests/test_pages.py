@@ -367,7 +367,7 @@ def test_the_whole_way_goes_by_keyboard(page: Page) -> None:
 
 def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> None:
     keys, port = KeyRing(tmp_path / "keys.json"), free_port()
-    key = keys.make_passing("tester", "localize")
+    key = keys.make_temporary("tester", "localize")
     with served(create_app(Settings(scenes=[], port=port, viewer=False, data_dir=tmp_path), keys=keys), port) as url:
         page = opened(browser, f"{url}/")
         page.get_by_label("API key").fill(key)

@@ -28,7 +28,7 @@ from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, rem
 from service.web.app import create_app
 from service.web.metrics import Metrics
 from service.web.middleware.limits import Limits
-from service.web.middleware.proxy import Edge
+from service.web.middleware.proxy import Proxy
 from service.web.route_policy import PHOTO_BODY, RoutePolicy
 from service.web.viewer_relay import Relay
 
@@ -135,7 +135,7 @@ def test_listening_beyond_this_machine_needs_keys_or_a_word():
         create_app(settings(host="0.0.0.0", keys_file=None))
     create_app(settings(host="0.0.0.0", keys_file=None, open=True))
     ring = KeyRing(None)
-    ring.make_passing("start", "admin")
+    ring.make_temporary("start", "admin")
     create_app(settings(host="0.0.0.0", keys_file=None), keys=ring)
 
 
@@ -363,8 +363,8 @@ def test_a_slow_reader_is_dropped(caplog):
             if message["type"] == "http.response.body":
                 await asyncio.sleep(60)
 
-        edge = Edge(app, Metrics(), "", send_s=0.05)
-        await edge({"type": "http", "method": "GET", "path": "/jobs", "headers": []}, None, stalled)  # type: ignore[arg-type]
+        proxy = Proxy(app, Metrics(), "", send_s=0.05)
+        await proxy({"type": "http", "method": "GET", "path": "/jobs", "headers": []}, None, stalled)  # type: ignore[arg-type]
 
     began = time.monotonic()
     with caplog.at_level(logging.INFO, "service"):

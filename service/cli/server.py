@@ -31,7 +31,7 @@ def run(settings: Settings, out: Console, err: Console) -> None:
     if settings.data_dir is None and settings.port:  # on a random port nobody would come back to it
         settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
     keys = KeyRing(settings.keys_file)
-    key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_passing("start", "admin")
+    key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_temporary("start", "admin")
     with _listener(settings.host, settings.port) as listener:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         application = create_app(settings, keys=keys)

@@ -1,6 +1,6 @@
-"""Who may do what: API keys with roles, and the short-lived tokens that stand for them in a browser.
+"""API keys with roles, and the short-lived tokens that browsers use in their place.
 
-A key is 256 random bits, so a plain SHA-256 of it can't be turned back and needs no salt. Only that is stored.
+Only the SHA-256 of a key is stored. It needs no salt: a key is 256 random bits, which can't be guessed from it.
 """
 
 from __future__ import annotations
@@ -21,81 +21,89 @@ from service.errors import InvalidRequest
 
 Role = Literal["read", "localize", "admin"]
 ROLES: tuple[Role, ...] = get_args(Role)
-"""Each may do what the ones before it may."""
+"""In ascending order; each role includes those before it."""
 _PREFIX = "sfx_"
-"""Tells people and secret scanners what it is."""
-_FRESH_S = 1.0
+"""Marks a key for people and for secret scanners."""
+_RECHECK_S = 1.0
+"""Time between two checks of the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caller:
+    """The owner of an accepted key."""
+
     name: str
+    """Of the key."""
     role: Role
 
     def may(self, role: Role) -> bool:
+        """Return whether the caller's role includes another."""
         return ROLES.index(self.role) >= ROLES.index(role)
 
 
 @dataclass(frozen=True, slots=True)
 class StoredKey:
+    """An entry of the key file."""
+
     name: str
     role: Role
     sha256: str
 
 
 class KeyRing:
-    """The keys of a file, read again when it changes, and keys that live as long as the process."""
+    """The keys of a file, which is read again when it changes, and temporary keys of this process."""
 
     def __init__(self, path: Path | None) -> None:
-        """Raises InvalidRequest if the file can't be understood."""
+        """Read the keys; none if there is no file. Raises InvalidRequest if the file is damaged."""
         self._path = path
-        self._passing: list[StoredKey] = []
+        self._temporary: list[StoredKey] = []
         self._secret = secrets.token_bytes(32)
         self._read_at, self._stamp = 0.0, (0, 0)
         self._stored: list[StoredKey] = []
         self._refresh()
 
     def __bool__(self) -> bool:
+        """Return whether a client needs a key: whether there is any but the viewer's own."""
         self._refresh()
-        return bool(self._stored) or any(key.name != "viewer" for key in self._passing)
+        return bool(self._stored) or any(key.name != "viewer" for key in self._temporary)
 
-    def make_passing(self, name: str, role: Role) -> str:
-        """Return a new key that ends with the process."""
+    def make_temporary(self, name: str, role: Role) -> str:
+        """Make a key that is valid until the process ends; return it."""
         key = _PREFIX + secrets.token_urlsafe(32)
-        self._passing.append(StoredKey(name, role, _digest(key)))
+        self._temporary.append(StoredKey(name, role, _digest(key)))
         return key
 
     def caller(self, key: str) -> Caller | None:
-        """Return whose key it is; takes the same time for every wrong one."""
+        """Return the owner of a key; None for an unknown one. The comparison takes constant time."""
         self._refresh()
         digest, found = _digest(key), None
-        for known in (*self._stored, *self._passing):
+        for known in (*self._stored, *self._temporary):
             if hmac.compare_digest(known.sha256, digest):
                 found = Caller(known.name, known.role)
         return found
 
     def token(self, caller: Caller, seconds: float) -> str:
-        """Return what stands for the caller for some time; it ends with the process, and with the key."""
+        """Return a signed token that is valid for that time, but no longer than the process and the caller's key."""
         claim = json.dumps({"name": caller.name, "role": caller.role, "until": time.time() + seconds})
         text = base64.urlsafe_b64encode(claim.encode()).decode()
         return f"{text}.{self._signature(text)}"
 
     def bearer(self, token: str) -> Caller | None:
-        """Return whom a token stands for; None if it is forged, too old, or its key is gone."""
+        """Return the owner of a token; None if it is forged or expired, or its key was removed."""
         text, _, signature = token.partition(".")
         if not hmac.compare_digest(self._signature(text).encode(), signature.encode()):
             return None
         claim = json.loads(base64.urlsafe_b64decode(text))
         caller = Caller(claim["name"], claim["role"])
         self._refresh()
-        living = {(key.name, key.role) for key in (*self._stored, *self._passing)}
+        living = {(key.name, key.role) for key in (*self._stored, *self._temporary)}
         return caller if claim["until"] > time.time() and (caller.name, caller.role) in living else None
 
     def _signature(self, text: str) -> str:
         return hmac.new(self._secret, text.encode(), "sha256").hexdigest()
 
     def _refresh(self) -> None:
-        if self._path is None or time.monotonic() - self._read_at < _FRESH_S:
+        if self._path is None or time.monotonic() - self._read_at < _RECHECK_S:
             return
         self._read_at = time.monotonic()
         try:
@@ -121,7 +129,7 @@ def read_keys(path: Path) -> list[StoredKey]:
 
 
 def add_key(path: Path, name: str, role: Role) -> str:
-    """Make a key and store its hash; return the key, which can't be had again. Raises InvalidRequest."""
+    """Make a key and store its hash; return the key, which can't be read from the file. Raises InvalidRequest."""
     keys = read_keys(path)
     if any(key.name == name for key in keys):
         raise InvalidRequest(f"there is a key '{name}' already.", where="name", hint="Remove it first.")
@@ -131,7 +139,7 @@ def add_key(path: Path, name: str, role: Role) -> str:
 
 
 def remove_key(path: Path, name: str) -> None:
-    """Forget a key; running services refuse it from the next second on. Raises InvalidRequest."""
+    """Remove a key; running services refuse it from the next second on. Raises InvalidRequest."""
     keys = read_keys(path)
     left = [key for key in keys if key.name != name]
     if len(left) == len(keys):
@@ -141,6 +149,7 @@ def remove_key(path: Path, name: str) -> None:
 
 def _write(path: Path, keys: list[StoredKey]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    # Replaced at once: a running service must never read half a file.
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     try:
         with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:

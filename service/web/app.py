@@ -1,8 +1,8 @@
-"""The HTTP service: `create_app` puts scenes, jobs, routes and the viewer's relay together.
+"""The HTTP service: `create_app` assembles scenes, jobs, routes, middleware and the viewer's relay.
 
-One process, one port, paths without a version. Behind a proxy that shows the service under a sub-path,
-links are right if the proxy sends `X-Forwarded-Prefix` or `SPLATFIX_ROOT_PATH` is set, whether or not the
-proxy strips the sub-path from what it hands on.
+One process, one port, paths without a version. Behind a proxy that serves it under a sub-path, links are right if the
+proxy sends `X-Forwarded-Prefix` or `SPLATFIX_ROOT_PATH` is set, whether or not the proxy strips the sub-path from the
+paths of requests.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from service.web.api_keys import KeyRing
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts, is_loopback
 from service.web.middleware.limits import Limits
-from service.web.middleware.proxy import Edge
+from service.web.middleware.proxy import Proxy
 from service.web.middleware.route_lookup import RouteLookup
 from service.web.openapi import description, description_as_yaml
 from service.web.pages import add_pages
@@ -52,16 +52,16 @@ def create_app(
     scenes: Mapping[str, LoadedScene] | None = None,
     keys: KeyRing | None = None,
 ) -> FastAPI:
-    """Make the app. Scenes are found here and loaded after start-up; `scenes` are in memory already.
+    """Make the app. Scenes are found now and loaded after start-up, unless `scenes` gives loaded ones.
 
-    Without `keys` those of the settings' file count. Raises SceneNotFound, BadInput or BackendMissing if the
-    settings name what is not there, InvalidRequest if they would let everybody in without saying so.
+    `keys` defaults to those of the settings' key file. Raises SceneNotFound, BadInput or BackendMissing for scenes
+    and plug-ins of the settings that can't be used, InvalidRequest if anybody could use the service without `open`.
     """
     settings = settings or Settings()
     SCENE_FORMATS.names()  # an added plug-in with a name that is taken is refused now, and here for all kinds
     RASTERIZERS.names()
     for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
-        kind.load(name)  # an unknown name shall be told now, not in each job
+        kind.load(name)  # an unknown name must stop the start, not fail each job
     if settings.rasterizer:
         RASTERIZERS.load(settings.rasterizer)
     if scenes is None:
@@ -77,7 +77,7 @@ def create_app(
     else:
         known = Scenes.of(scenes, settings.estimator)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
-    viewer = ViewerChild(settings.loopback_url, keys.make_passing("viewer", "read")) if settings.viewer else None
+    viewer = ViewerChild(settings.loopback_url, keys.make_temporary("viewer", "read")) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
 
     @asynccontextmanager
@@ -93,7 +93,7 @@ def create_app(
             stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
             app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
-            _show(metrics, known, jobs, settings.workers)
+            _add_gauges(metrics, known, jobs, settings.workers)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -135,7 +135,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Me
             allow_headers=["*"],
             expose_headers=["Location", "Retry-After"],
         )
-    app.add_middleware(Edge, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
+    app.add_middleware(Proxy, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
 
 
 # FastAPI's own routes: the description of the API is public, with the page that shows it.
@@ -155,7 +155,7 @@ def _declare_documentation(app: FastAPI) -> None:
 
 @contextmanager
 def data_folder(path: Path | None) -> Iterator[Path]:
-    """Hold a folder for this process alone; None: a temporary one. Raises StorageFailed."""
+    """Lock a folder for this process; None: a temporary one. Raises StorageFailed, also if it is locked."""
     with ExitStack() as stack:
         folder = path or Path(stack.enter_context(TemporaryDirectory(prefix="splatfix-")))
         try:
@@ -163,9 +163,9 @@ def data_folder(path: Path | None) -> Iterator[Path]:
             lock = stack.enter_context((folder / "lock").open("w"))
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            told = "another process uses it" if isinstance(error, BlockingIOError) else error.strerror
+            reason = "another process uses it" if isinstance(error, BlockingIOError) else error.strerror
             raise StorageFailed(
-                f"{folder} can't be used: {told}.", where="data_dir", hint="Name another one: SPLATFIX_DATA_DIR."
+                f"{folder} can't be used: {reason}.", where="data_dir", hint="Name another one: SPLATFIX_DATA_DIR."
             ) from error
         yield folder
 
@@ -177,19 +177,19 @@ def access_rules(settings: Settings, keys: KeyRing) -> AccessRules:
         raise InvalidRequest(
             f"everybody who reaches {settings.host} could use the service.",
             where="host",
-            hint="Make a key (splatfix keys add NAME), or say SPLATFIX_OPEN=true.",
+            hint="Make a key (splatfix keys add NAME), or set SPLATFIX_OPEN=true.",
         )
     hosts = allowed_hosts(settings.host, settings.allowed_hosts, open_to_all=is_open)
     return AccessRules(keys, is_open, hosts, settings.cors_origins)
 
 
-def _show(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
-    """Put the service's state among the metrics."""
-    metrics.gauge("jobs_queued", "Jobs that wait", (), lambda: {(): jobs.waiting()})
-    metrics.gauge("jobs_running", "Jobs that run", (), lambda: {(): jobs.running()})
-    metrics.gauge("workers", "Threads that run jobs", (), lambda: {(): workers})
-    metrics.gauge("workers_stuck", "Abandoned workers", (), lambda: {(): jobs.stuck_workers()})
-    metrics.gauge("scene_bytes", "Memory of a scene", ("scene",), scenes.memory)
+def _add_gauges(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
+    """Add gauges of the queue, the workers and the scenes."""
+    metrics.gauge("jobs_queued", "Queued jobs", (), lambda: {(): jobs.waiting()})
+    metrics.gauge("jobs_running", "Running jobs", (), lambda: {(): jobs.running()})
+    metrics.gauge("workers", "Worker threads", (), lambda: {(): workers})
+    metrics.gauge("workers_stuck", "Workers given up as stuck", (), lambda: {(): jobs.stuck_workers()})
+    metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), scenes.memory)
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

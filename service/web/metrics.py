@@ -1,4 +1,4 @@
-"""What operators see at `/metrics`, in Prometheus's form. The only file with prometheus_client."""
+"""Metrics of the service in Prometheus text format, as `/metrics` returns them."""
 
 from __future__ import annotations
 
@@ -19,66 +19,86 @@ METRICS_TYPE = CONTENT_TYPE_LATEST
 _SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60, 120)
 
 Reading = Mapping[tuple[str, ...], float]
-"""Values by labels."""
+"""Values of a gauge by the values of its labels."""
 
 
 class Metrics:
-    """One registry per app, so that several apps in a process don't mix."""
+    """Counters, histograms and gauges of one app."""
 
     def __init__(self) -> None:
+        # Not the global registry: tests run several apps in one process.
         self._registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         PlatformCollector(registry=registry)
         self._requests = Counter("splatfix_requests", "HTTP requests", ["method", "route", "status"], registry=registry)
         self._request_s = Histogram(
-            "splatfix_request_seconds", "Until the answer's end", ["route"], buckets=_SECONDS, registry=registry
+            "splatfix_request_seconds",
+            "Until the response's end",
+            ["route"],
+            buckets=_SECONDS,
+            registry=registry,
         )
         self._jobs = Counter("splatfix_jobs", "Jobs that ended", ["estimator", "state", "status"], registry=registry)
         self._wait_s = Histogram(
-            "splatfix_job_wait_seconds", "From acceptance to start", buckets=_SECONDS, registry=registry
+            "splatfix_job_wait_seconds", "Job, from acceptance to start", buckets=_SECONDS, registry=registry
         )
         self._job_s = Histogram(
-            "splatfix_job_seconds", "From start to end", ["estimator"], buckets=_SECONDS, registry=registry
+            "splatfix_job_seconds",
+            "Job, from start to end",
+            ["estimator"],
+            buckets=_SECONDS,
+            registry=registry,
         )
         self._stage_s = Histogram(
-            "splatfix_stage_seconds", "Of a job, by stage", ["estimator", "stage"], buckets=_SECONDS, registry=registry
+            "splatfix_stage_seconds",
+            "Job, by stage",
+            ["estimator", "stage"],
+            buckets=_SECONDS,
+            registry=registry,
         )
-        self._renders = Counter("splatfix_renders", "Renders that jobs made", ["estimator"], registry=registry)
+        self._renders = Counter("splatfix_renders", "Renders made by jobs", ["estimator"], registry=registry)
         self._render_s = Histogram(
             "splatfix_render_seconds",
-            "Pictures for looking at, with their wait",
+            "Time to render an image for a client, with its wait",
             ["scene"],
             buckets=_SECONDS,
             registry=registry,
         )
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:
+        """Count a request that was answered. `route` is the path with its parameters' names."""
+        # Clients can invent methods: each would be a time series of its own.
         self._requests.labels(method if method in _METHODS else "other", route, status).inc()
         self._request_s.labels(route).observe(seconds)
 
     def started(self, waited_s: float) -> None:
+        """Count a job that started, and its time in the queue."""
         self._wait_s.observe(waited_s)
 
     def ended(self, estimator: str, state: str, status: str | None, seconds: float | None) -> None:
-        """`status` is the result's; `seconds` since the start, None for a job that never started."""
+        """Count a job that ended. `status` is its result's; `seconds` since its start, None if it never started."""
         self._jobs.labels(estimator, state, status or "none").inc()
         if seconds is not None:
             self._job_s.labels(estimator).observe(seconds)
 
     def stage(self, estimator: str, stage: str, seconds: float) -> None:
+        """Count the time that a job spent on a stage."""
         self._stage_s.labels(estimator, stage).observe(seconds)
 
     def renders(self, estimator: str, count: int) -> None:
+        """Count the renders of a job."""
         self._renders.labels(estimator).inc(count)
 
     def rendered(self, scene: str, seconds: float) -> None:
+        """Count an image that was rendered for a client."""
         self._render_s.labels(scene).observe(seconds)
 
     def gauge(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], Reading]) -> None:
-        """Show values that are read when somebody asks."""
+        """Add a gauge whose values are read at each scrape."""
         self._registry.register(_Gauge(f"splatfix_{name}", text, labels, read))
 
     def exposition(self) -> bytes:
+        """Return all metrics in Prometheus text format."""
         return generate_latest(self._registry)
 
 
@@ -86,6 +106,8 @@ _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 
 
 class _Gauge:
+    """A collector: prometheus_client calls `collect` at each scrape."""
+
     def __init__(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], Reading]) -> None:
         self._name, self._text, self._labels, self._read = name, text, labels, read
 

@@ -1,4 +1,4 @@
-"""The OpenAPI description of the app, as /openapi.json and openapi.yaml have it."""
+"""The OpenAPI description of the API, for /openapi.json and openapi.yaml."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from service.web.schemas.job_results import Record
 from service.web.schemas.openapi_links import add_links
 from service.web.schemas.requests import LocalizeIn
 
-_KEYS = "An API key, or a token from `/tokens`; a service without keys needs none."
-_SUMMARY = "Tell where a photo was taken inside a 3D Gaussian Splatting scene."
+_KEYS = "An API key, or a token from `/tokens`; not needed if the service has no keys."
+_SUMMARY = "Estimate where a photo was taken inside a 3D Gaussian Splatting scene."
 _DESCRIPTION = """
-Post a photo to `/localize`, follow the job, read the pose. Poses are in the scene's own frame and units,
-camera axes as OpenCV has them (+x right, +y down, +z forward) unless a field says otherwise; quaternions
-are wxyz. A photo that can't be localized is an answer (`not_localized`, with a reason), not an error.
-Every error is a problem document (RFC 9457) with a stable `code`; each operation lists those it may give, each with
-an example. An address that isn't here is answered with `not_found`, another method with `method_not_allowed`.
+Post a photo to `/localize`, wait for the job, read the pose. Poses are in the scene's own frame and units, with the
+camera axes of OpenCV (+x right, +y down, +z forward) unless a field says otherwise; quaternions are wxyz.
+A photo that can't be localized is a result (`not_localized`, with a reason), not an error.
+Every error is a problem document (RFC 9457) with a stable `code`; each operation lists its codes, each with an
+example. Unknown paths get `not_found`, other methods `method_not_allowed`.
 A job that ended without a result has a problem document as its `error`.
 """
 
 
 def description(app: FastAPI) -> dict[str, Any]:
-    """Return the API's description; with the models that no route names by itself."""
+    """Return the description, with the models that no route declares."""
     if not app.openapi_schema:
         schema = get_openapi(
             title=app.title,
@@ -53,7 +53,7 @@ def description(app: FastAPI) -> dict[str, Any]:
 
 
 def _drop_default_validation(schema: dict[str, Any]) -> None:
-    """Take out what FastAPI says of its own validation: ours answers with a problem document of 400."""
+    """Remove FastAPI's own 422 responses: a failed validation is answered with a problem document and 400."""
     for operations in schema["paths"].values():
         for operation in operations.values():
             if "application/json" in operation["responses"].get("422", {}).get("content", {}):

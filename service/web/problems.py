@@ -1,4 +1,4 @@
-"""Every error as a problem document (RFC 9457), whoever raised it: our code, a validation, the router."""
+"""Every error becomes a problem document (RFC 9457), whether our code, a validation or the router raises it."""
 
 from __future__ import annotations
 
@@ -50,9 +50,10 @@ _log = logging.getLogger(__name__)
 
 MEDIA_TYPE = "application/problem+json"
 RETRY_AFTER_S = 5
-_LINGER_S = 2.0
+_DRAIN_S = 2.0
+"""How long the rest of a refused body is read and dropped."""
 
-# The first class that fits decides; SplatfixError itself, hence EstimatorFault, is our mistake.
+# The first matching class decides, so subclasses come before their base. SplatfixError itself is a bug.
 _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
     (InvalidRequest, 400),
     (BadInput, 422),
@@ -82,7 +83,7 @@ _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
     (SplatfixError, 500),
 )
 
-# Of HTTP itself; spelled out because Python's own phrases differ between versions.
+# Errors of HTTP itself. Not derived from http.HTTPStatus, whose phrases differ between Python versions.
 _HTTP_CODES = {
     400: "bad_request",
     404: "not_found",
@@ -95,34 +96,37 @@ _HTTP_CODES = {
 
 
 class Problem(Model):
-    """What went wrong, as RFC 9457 has it: the body of every error, `application/problem+json`."""
+    """An error as RFC 9457 defines it: the body of every error response, `application/problem+json`."""
 
     type: str
-    """`urn:splatfix:error:<code>`, or `about:blank` where the status says it all."""
+    """`urn:splatfix:error:<code>`."""
     title: str
+    """The code in words."""
     status: int
+    """The HTTP status."""
     detail: str
+    """What is wrong."""
     instance: str
-    """The path that was asked for."""
+    """Path of the request."""
     code: str
-    """Stable, for programs."""
+    """Stable name of the error, for programs."""
     where: str = ""
-    """The field, file or element concerned; empty if there is none."""
+    """Field, file or element that is concerned; empty if there is none."""
     hint: str = ""
     """What to do about it."""
 
 
 def problem_of(error: Exception, instance: str) -> Problem:
-    """Describe an exception; what is not ours is told to the log, not to the caller."""
+    """Describe an exception. Details of unexpected ones go to the log only."""
     if isinstance(error, SplatfixError):
         status = next(status for kind, status in _STATUS if isinstance(error, kind))
         return _problem(status, error.code, error.message, instance, error.where, error.hint)
     if isinstance(error, ClientDisconnect):
-        return _problem(400, "bad_request", "The client left before it had sent everything.", instance)
+        return _problem(400, "bad_request", "The client disconnected before it had sent everything.", instance)
     if isinstance(error, HTTPException):
         code = _HTTP_CODES.get(error.status_code, "http_error")
         return _problem(error.status_code, code, str(error.detail), instance)
-    return _problem(500, "internal_error", "The service failed; its log says why.", instance)
+    return _problem(500, "internal_error", "The service failed; the reason is in its log.", instance)
 
 
 def _problem(status: int, code: str, detail: str, instance: str, where: str = "", hint: str = "") -> Problem:
@@ -139,12 +143,12 @@ def _problem(status: int, code: str, detail: str, instance: str, where: str = ""
 
 
 def _sendable(text: str) -> str:
-    """Replace what isn't Unicode text: halves of surrogate pairs, which JSON lets callers send."""
+    """Replace unpaired surrogates, which JSON can contain and UTF-8 can't."""
     return text.encode("utf-8", "replace").decode()
 
 
 def problem_response(error: Exception, path: str) -> Response:
-    """Answer with the error's problem document."""
+    """Return the response for an exception."""
     headers = dict(getattr(error, "headers", None) or {})
     if isinstance(error, SplatfixError) and error.retry_after_s:
         headers["Retry-After"] = str(error.retry_after_s)
@@ -152,31 +156,31 @@ def problem_response(error: Exception, path: str) -> Response:
 
 
 def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | None = None) -> Response:
-    """Answer with a problem document, as concerns `path`."""
-    told = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
+    """Return the response for a problem of the request to `path`."""
+    retry = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
     problem = problem.model_copy(update={"instance": path})
-    return Response(problem.model_dump_json(), problem.status, {**told, **(headers or {})}, MEDIA_TYPE)
+    return Response(problem.model_dump_json(), problem.status, {**retry, **(headers or {})}, MEDIA_TYPE)
 
 
 async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer before the body was read, and wait a moment for what of it is on its way.
+    """Send a response before the body is read; then drop what still arrives of the body for a moment.
 
-    A connection that is closed while data comes in is reset, and a client that still sends then loses the answer.
+    TCP resets a connection that is closed while data arrives, and the client would lose the response.
     """
 
-    async def held_open(message: Message) -> None:
+    async def keep_open(message: Message) -> None:
         await send({**message, "more_body": True} if message["type"] == "http.response.body" else message)
 
-    await response(scope, receive, held_open)
+    await response(scope, receive, keep_open)
     with suppress(TimeoutError):
-        async with asyncio.timeout(_LINGER_S):
+        async with asyncio.timeout(_DRAIN_S):
             while (await receive()).get("more_body"):
                 pass
     await send({"type": "http.response.body", "body": b""})
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the app a problem document."""
+    """Make the app answer every error with a problem document."""
 
     async def answer(request: Request, error: Exception) -> Response:
         response = problem_response(error, request.url.path)
@@ -190,12 +194,12 @@ def install(app: FastAPI) -> None:
 
     app.add_exception_handler(SplatfixError, answer)
     app.add_exception_handler(HTTPException, answer)
-    app.add_exception_handler(ClientDisconnect, answer)  # nobody hears it, but it is no failure of ours
+    app.add_exception_handler(ClientDisconnect, answer)  # nobody reads it; keeps it out of the log
     app.add_exception_handler(RequestValidationError, answer_validation)
 
 
 def _allowed(request: Request) -> set[str]:
-    """Return the methods of an address; the router tells those of the first route that fits only."""
+    """Return the methods of a path. The router's own answer has those of the first matching route only."""
     methods: set[str] = set()
     for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT"):
         scope = {**request.scope, "method": method}
@@ -204,13 +208,13 @@ def _allowed(request: Request) -> set[str]:
 
 
 def described(errors: Sequence[Any]) -> tuple[str, str]:
-    """Return where and what of pydantic's errors: the first one's place, all their messages."""
+    """Return the field of pydantic's first error, and the messages of all, joined."""
     places = [".".join(str(part) for part in e["loc"]) for e in errors]
-    told = [e["msg"] if p == places[0] else f"{p}: {e['msg']}" for p, e in zip(places, errors, strict=True)]
-    return places[0], "; ".join(told) + "."
+    messages = [e["msg"] if p == places[0] else f"{p}: {e['msg']}" for p, e in zip(places, errors, strict=True)]
+    return places[0], "; ".join(messages) + "."
 
 
 def invalid_request(errors: Sequence[Any]) -> InvalidRequest:
-    """Make our error of FastAPI's, which names the part of the request (query, path, header) first."""
+    """Convert FastAPI's validation errors; their location begins with the part of the request (query, path, header)."""
     where, message = described(errors)
     return InvalidRequest(message, where=where)

@@ -1,8 +1,8 @@
-"""The viewer as a child process: kept alive while the service lives, and no longer.
+"""Runs the viewer as a child process for as long as the service runs.
 
-Started as `python -m viewer --service URL --port N` on loopback; it watches its parent process, and ends
-when that is gone, however it went. A crash of the viewer costs the browsers their connection and nothing
-else: it is started again, later each time if it does not stay up.
+It is started as `python -m viewer --service URL --port N` on loopback, and exits by itself when its parent process is
+gone. After a crash it is started again, with a growing pause if it crashes repeatedly; browsers only lose their
+connection.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ _GRACE_S = 3.0
 
 
 class ViewerChild:
-    """Supervises one viewer; `supervise` runs until it is cancelled."""
+    """Supervises one viewer process."""
 
     def __init__(self, service_url: str, key: str) -> None:
-        """`key` lets the viewer in; it goes by the environment, since everybody can see a process's arguments."""
-        # Each browser has threads of its own there: with an arena for each, what they free is lost to the others.
+        """`key` is the viewer's API key. It is passed in the environment: other users can see a process's arguments."""
+        # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
         self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"SPLATFIX_VIEWER_KEY": key}
         self.port = _free_port()
         self.command = [sys.executable, "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
 
     async def supervise(self) -> None:
+        """Start the viewer, and start it again whenever it ends, until this is cancelled."""
         pause = _FIRST_PAUSE_S
         while True:
             began = time.monotonic()
@@ -42,7 +43,7 @@ class ViewerChild:
             await asyncio.sleep(pause)
 
     async def _run_once(self) -> None:
-        # Its log goes to stderr; on stdout is viser's banner with an address that is not for people.
+        # The log goes to stderr. On stdout viser prints its own address, which users shouldn't open.
         nothing = asyncio.subprocess.DEVNULL
         child = await asyncio.create_subprocess_exec(
             *self.command, stdin=nothing, stdout=nothing, env=self._environment
@@ -66,6 +67,6 @@ async def _end(child: asyncio.subprocess.Process) -> None:
 
 
 def _free_port() -> int:
-    """Return a port that was free a moment ago; the viewer, started again, comes back on the same one."""
+    """Return a free port. It is chosen once, so that the relay finds the viewer after a restart."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return listener.getsockname()[1]

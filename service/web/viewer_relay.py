@@ -1,9 +1,9 @@
-"""The viewer under /viewer on the service's own port: HTTP and WebSocket handed on to a server on loopback.
+"""Relays HTTP and WebSocket under /viewer to the viewer's server on loopback, so that the service has one port.
 
-The viewer's page finds its WebSocket by its own address: the page /viewer/jobs/ID/ connects to
-/viewer/jobs/ID. What follows /viewer is handed on, so the viewer knows from the path which job a browser
-asks for. All pages are one and the same file, so a path that the viewer has no file for gets that page.
-A browser without a GPU says so in a cookie (`static/viewer.js`); the viewer hears it as a query.
+The viewer's page derives the address of its WebSocket from its own: the page /viewer/jobs/ID/ connects to
+/viewer/jobs/ID. The path after /viewer is passed on, and names the job to show. All pages are the same file, so the
+relay returns it for every path that the viewer has no file for. A browser without a GPU sets a cookie
+(`static/viewer.js`), which the relay passes on as a query parameter.
 """
 
 from __future__ import annotations
@@ -31,16 +31,18 @@ _TRY_AGAIN_LATER = 1013
 
 @runtime_checkable
 class Upstream(Protocol):
+    """The viewer's server."""
+
     port: int
-    """On loopback; whether anybody listens there is found out by trying."""
+    """On loopback. Nothing may listen there, while the viewer starts."""
 
 
 class Relay:
-    """Hands everything under /viewer on; `router` has the routes."""
+    """Passes requests and messages on; `router` has the routes to include in an app."""
 
     def __init__(self, upstream: Upstream) -> None:
         self._upstream = upstream
-        # Loopback: a proxy from the environment must not stand between.
+        # trust_env: HTTP_PROXY must not apply to loopback.
         self._http = httpx.AsyncClient(trust_env=False, timeout=30.0)
         self.router = APIRouter(include_in_schema=False)
         for path in ("/viewer", "/viewer/{path:path}"):
@@ -56,7 +58,7 @@ class Relay:
         if answer.status_code == 404:
             answer = await self._ask("")
         content, kind = answer.content, answer.headers.get("content-type", "")
-        if kind.startswith("text/html"):  # with our own script, which must run before viser's opens the socket
+        if kind.startswith("text/html"):  # our script must run before viser's, which opens the WebSocket
             script = f'<head><script src="{request.scope.get("root_path", "")}/ui/viewer.js"></script>'
             content = content.replace(b"<head>", script.encode(), 1)
         return Response(content, answer.status_code, media_type=kind)
@@ -65,7 +67,7 @@ class Relay:
         try:
             return await self._http.get(f"http://127.0.0.1:{self._upstream.port}/{path}")
         except (httpx.HTTPError, httpx.InvalidURL) as error:
-            raise HTTPException(503, "The viewer does not answer; it may just be starting.") from error
+            raise HTTPException(503, "The viewer does not answer; it may be starting.") from error
 
     @route_policy(role="read", key_in_address=True)
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
@@ -73,7 +75,7 @@ class Relay:
         query = "?gl=software" if browser.cookies.get("splatfix_gl") == "software" else ""
         uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{query}"
         try:
-            # No size limit and no compression: whole scenes pass here, on loopback.
+            # No size limit and no compression: messages contain whole scenes, on loopback.
             async with connect(
                 uri, subprotocols=offered or None, max_size=None, compression=None, proxy=None
             ) as viewer:
@@ -92,7 +94,7 @@ async def _to_viewer(browser: WebSocket, viewer: ClientConnection) -> None:
 
 
 async def _to_browser(viewer: ClientConnection, browser: WebSocket) -> None:
-    with suppress(ConnectionClosed):  # told by an exception unless it was closed with code 1000
+    with suppress(ConnectionClosed):  # raised unless the connection was closed with code 1000
         async for message in viewer:
             if isinstance(message, str):
                 await browser.send_text(message)
@@ -102,7 +104,7 @@ async def _to_browser(viewer: ClientConnection, browser: WebSocket) -> None:
 
 
 async def _first_of(*directions: Coroutine[Any, Any, None]) -> None:
-    """Run both directions until one ends, since then the connection is over."""
+    """Run both directions until one of them ends, and with it the connection."""
     tasks = [asyncio.ensure_future(direction) for direction in directions]
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -110,6 +112,6 @@ async def _first_of(*directions: Coroutine[Any, Any, None]) -> None:
         for task in tasks:
             task.cancel()
         for task in tasks:
-            # RuntimeError is starlette's word for a socket that was closed meanwhile.
+            # RuntimeError: starlette's error for a WebSocket that was closed meanwhile.
             with suppress(asyncio.CancelledError, ConnectionClosed, WebSocketDisconnect, RuntimeError):
                 await task

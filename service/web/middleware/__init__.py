@@ -1,1 +1,1 @@
-"""What every request passes through before its route."""
+"""ASGI middleware, from the outermost: proxy, route_lookup, authentication, limits."""

@@ -1,4 +1,4 @@
-"""The outermost layer: sub-path, request id, security headers, slow readers, bugs, log and metrics."""
+"""The outermost middleware: sub-path of a proxy, request id, security headers, slow readers, uncaught errors, log."""
 
 from __future__ import annotations
 
@@ -20,20 +20,22 @@ _log = logging.getLogger(__name__)
 REQUEST_ID = "X-Request-ID"
 _HEADERS = {
     "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",  # an address may hold a key for a moment
+    "Referrer-Policy": "no-referrer",  # an address may contain a key, until the redirect
     "X-Frame-Options": "SAMEORIGIN",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-# Ours have no inline script; the viewer's page and /docs are made by others.
+# Only for our own pages, which have no inline scripts; the viewer's page and /docs do.
 _PAGES_POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
 )
-_QUIET = ("/livez", "/readyz", "/metrics")
+_NOT_LOGGED = ("/livez", "/readyz", "/metrics")
 
 
-class Edge:
+class Proxy:
+    """ASGI middleware. Sets `root_path`, so that links are right behind a proxy that serves a sub-path."""
+
     def __init__(self, app: ASGIApp, metrics: Metrics, default_root: str, send_s: float) -> None:
         self._app, self._metrics, self._send_s = app, metrics, send_s
         self._default_root = default_root.rstrip("/")
@@ -46,38 +48,38 @@ class Edge:
         if scope["type"] == "websocket":
             await self._app(scope, receive, send)
             return
-        answer = _Answer(scope, send, self._send_s)
+        response = _Response(scope, send, self._send_s)
         began = time.perf_counter()
-        with bound(request_id=answer.request_id):
+        with bound(request_id=response.request_id):
             try:
-                await self._app(scope, receive, answer.send)
+                await self._app(scope, receive, response.send)
             except Exception as error:
-                if answer.dropped:
-                    _log.info("a client took no more of its answer, and was dropped: %s", scope["path"])
-                elif answer.begun:  # it can only be broken off
+                if response.dropped:
+                    _log.info("a client stopped reading its response, and was dropped: %s", scope["path"])
+                elif response.begun:  # too late for a problem document: the connection is cut
                     raise
                 else:
                     _log.exception("%s %s failed", scope["method"], scope["path"])
-                    await problem_response(error, scope["path"])(scope, receive, answer.send)
+                    await problem_response(error, scope["path"])(scope, receive, response.send)
             finally:
-                self._tell(scope, answer.status, time.perf_counter() - began)
+                self._report(scope, response.status, time.perf_counter() - began)
 
-    def _tell(self, scope: Scope, status: int, seconds: float) -> None:
+    def _report(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "other")
         self._metrics.request(scope["method"], route, status, seconds)
-        if scope["path"] not in _QUIET:
-            # The path without its query, which may hold a key.
+        if scope["path"] not in _NOT_LOGGED:
+            # Without the query, which may contain a key.
             _log.info("%s %s %d %.0f ms", scope["method"], scope["path"], status, 1000 * seconds)
 
 
-class _Answer:
-    """A response on its way: gets our headers; one that a client doesn't take is given up."""
+class _Response:
+    """A response while it is sent: adds headers, and gives up if the client stops reading."""
 
     def __init__(self, scope: Scope, send: Send, send_s: float) -> None:
         self._send, self._send_s = send, send_s
         given = Headers(scope=scope).get(REQUEST_ID, "")
         self.request_id = given if re.fullmatch(r"[\w.-]{1,64}", given) else secrets.token_hex(8)
-        self.status = 499  # nginx's word for a client that left before the answer
+        self.status = 499  # as in nginx: the client closed the connection before the response
         self.begun = self.dropped = False
         path = scope["path"].removeprefix(scope.get("root_path", ""))
         self._own_page = path == "/" or path.startswith("/ui/")
@@ -101,9 +103,9 @@ class _Answer:
 
 
 def _sub_path(scope: Scope, default: str) -> dict[str, str]:
-    """Return the sub-path under which a proxy shows the app, and the path with it (as ASGI has it)."""
+    """Return ASGI's `root_path`, the sub-path under which a proxy serves the app, and `path` with it."""
     given = Headers(scope=scope).get("x-forwarded-prefix", "").rstrip("/")
-    # Only what is a plain path: it ends up in links.
+    # A client can send the header: only plain paths are accepted, since it ends up in links.
     root = given if re.fullmatch(r"(/[\w~-][\w.~-]*){1,8}", given) else default
     path = scope["path"]
     if root and path != root and not path.startswith(f"{root}/"):

@@ -1,4 +1,4 @@
-"""How domain values become the models of `schemas`."""
+"""Converts domain values to the models of the API."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from service.web.schemas.poses import (
 )
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Camera axes: OpenGL's y points up and its z backwards. Its own inverse."""
+"""Changes camera axes: OpenGL's y points up and its z backwards. It is its own inverse."""
 
 
 def rows(matrix: np.ndarray) -> Matrix:
@@ -46,7 +46,7 @@ def rows(matrix: np.ndarray) -> Matrix:
 
 
 def transform_out(target_from_source: np.ndarray) -> Transform:
-    """Spell out a target_from_source."""
+    """Convert a 4x4 target_from_source."""
     return Transform(
         matrix=rows(target_from_source),
         translation=target_from_source[:3, 3].tolist(),
@@ -55,7 +55,7 @@ def transform_out(target_from_source: np.ndarray) -> Transform:
 
 
 def pose_out(pose: Pose) -> PoseOut:
-    """Spell out a pose in both conventions of camera axes."""
+    """Convert a pose, to both conventions of camera axes."""
     opengl = Pose(pose.world_from_camera @ OPENCV_FROM_OPENGL)
     return PoseOut(
         position=pose.position_in_world.tolist(),
@@ -69,14 +69,14 @@ def pose_out(pose: Pose) -> PoseOut:
 
 
 def geopose_out(anchor: GeoAnchor, pose: Pose) -> GeoPose:
-    """Spell out a pose on Earth."""
+    """Convert a pose to latitude, longitude, height and orientation on Earth."""
     (latitude, longitude, height), (w, x, y, z) = geographic(anchor, pose)
     position = GeoPosition(lat=latitude, lon=longitude, h=height)
     return GeoPose(position=position, quaternion=GeoQuaternion(x=x, y=y, z=z, w=w))
 
 
 def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
-    """Spell out a camera model."""
+    """Convert a camera model."""
     return IntrinsicsOut(
         model=intrinsics.model,
         width=intrinsics.width,
@@ -91,19 +91,19 @@ def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
 
 
 def camera_out(camera: Camera) -> CameraOut:
-    """Spell out a camera."""
+    """Convert a camera."""
     return CameraOut(
         intrinsics=intrinsics_out(camera.intrinsics), world_from_camera=rows(camera.pose.world_from_camera)
     )
 
 
 def named_camera_out(named: NamedCamera) -> NamedCameraOut:
-    """Spell out a training camera."""
+    """Convert a training camera."""
     return NamedCameraOut(name=named.name, **camera_out(named.camera).model_dump())
 
 
 def record_out(record: IterationRecord) -> Record:
-    """Spell out one step of a job."""
+    """Convert one step of a job."""
     matches, candidates = record.matches, record.candidates
     return Record(
         index=record.index,
@@ -130,7 +130,7 @@ def record_out(record: IterationRecord) -> Record:
 
 
 def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> Camera:
-    """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
+    """Return a record's camera: its pose in the photo's size, or the camera that its matches refer to."""
     if of_matches and record.matches is not None:
         camera = record.matches.render_camera
         return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
@@ -143,7 +143,7 @@ def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
 
 
 def covariance_out(matrix: np.ndarray) -> Covariance:
-    """Spell out the covariance of a pose, with its two standard deviations."""
+    """Convert the covariance of a pose (see `Verdict.covariance`), and add its two standard deviations."""
     return Covariance(
         matrix=rows(matrix),
         sigma_deg=float(np.degrees(np.sqrt(np.trace(matrix[:3, :3])))),
@@ -152,21 +152,21 @@ def covariance_out(matrix: np.ndarray) -> Covariance:
 
 
 def region_out(region: PriorRegion) -> RegionOut:
-    """Spell out what a prior admits."""
+    """Convert the region of a prior."""
     if isinstance(region, BoxPrior):
         return RegionOut(box=[region.lower_in_world.tolist(), region.upper_in_world.tolist()])
     return RegionOut(covariance=covariance_out(region.covariance))
 
 
 def timing_out(timing: StageTiming) -> Timing:
-    """Spell out the time that a stage took."""
+    """Convert the time that a stage took."""
     return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
 
 
 def result_out(
     estimate: PoseEstimate, decode: Timing, versions: dict[str, str], anchor: GeoAnchor | None = None
 ) -> Result:
-    """Spell out a finished estimate; `decode` is what reading the photo took, `anchor` the scene's."""
+    """Convert a finished estimate. `decode` is the time to read the photo, `anchor` the scene's geo_anchor."""
     verdict = estimate.verdict
     return Result(
         status=verdict.status,

@@ -1,6 +1,6 @@
-"""Every error that a caller can meet, by code, each with an example: what `openapi.yaml` shows.
+"""All errors of the API by code, each with an example, for `openapi.yaml`.
 
-An example is made of the exception that really is raised, so its status and form can't differ from the answer's.
+Examples are made from the exceptions that the code raises, so their status and fields are those of real responses.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     ),
     (
         e.NoGeoAnchor(
-            "scene 'studio' has no place on Earth.",
+            "scene 'studio' has no geo_anchor.",
             where="format",
             hint="Give its scene.json a geo_anchor, and localize again.",
         ),
@@ -110,7 +110,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (HTTPException(408, "The body took too long to arrive."), "/localize"),
     (HTTPException(413, "The body may have 67666666 bytes."), "/localize"),
     (HTTPException(415, "Send multipart/form-data or application/json, not 'image/jpeg'."), "/localize"),
-    (HTTPException(503, "The viewer does not answer; it may just be starting."), "/viewer/"),
+    (HTTPException(503, "The viewer does not answer; it may be starting."), "/viewer/"),
     (RuntimeError(), f"{_JOB}/photo"),
 )
 
@@ -118,9 +118,9 @@ EXAMPLES: dict[str, Problem] = {p.code: p for p in (problem_of(error, path) for 
 """By code."""
 
 ALWAYS = ("unauthorized", "forbidden", "internal_error")
-"""What any operation may answer."""
+"""Errors of every operation."""
 WITH_BODY = ("content_too_large", "rate_limited", "queue_full")
-"""What all that may have a body can answer, before it is read."""
+"""Errors of operations other than GET, sent before the body is read."""
 SCENE_ERRORS = (
     "scene_not_found",
     "scene_unloaded",
@@ -129,30 +129,30 @@ SCENE_ERRORS = (
     "scene_not_ready",
     "no_room",
 )
-"""Why a scene isn't there to work with."""
+"""Errors of operations that need a loaded scene."""
 
 _MEANINGS = {
-    400: "The request can't be understood",
+    400: "The request is malformed",
     401: "An API key is needed, or it is not valid",
-    403: "The key's role doesn't allow it, or another site's page asks",
-    404: "There is no such thing",
-    408: "The body took too long",
-    409: "Not yet, not any more, or there is nothing to give",
+    403: "The key's role is too low, or another site's page sent the request",
+    404: "Not found",
+    408: "The body took too long to arrive",
+    409: "The state of the job or scene does not allow it",
     413: "The body is too large",
     415: "Neither a multipart form nor JSON",
-    422: "A value is wrong: the photo, intrinsics, prior, options, or the scene's own file",
-    429: "Too many requests of yours; see Retry-After",
+    422: "A value is invalid: the photo, intrinsics, prior, options, or the scene's file",
+    429: "Too many requests of this client; see Retry-After",
     500: "The service failed",
-    501: "What was asked for can't run on this machine",
-    503: "Too much work is waiting, the disk is full, or the scene is still loading; see Retry-After",
-    504: "There was no answer in time",
+    501: "The requested plug-in can't run on this machine",
+    503: "The queue is full, storage failed, or the scene is still loading; see Retry-After",
+    504: "Not finished in time",
 }
 _RETRY = {"Retry-After": {"description": "Seconds", "schema": {"type": "integer"}, "example": RETRY_AFTER_S}}
 _CHALLENGE = {"WWW-Authenticate": {"schema": {"type": "string"}, "example": "Bearer"}}
 
 
 def errors(*codes: str, body: bool = False, always: tuple[str, ...] = ALWAYS) -> dict[int | str, dict[str, Any]]:
-    """Document the problem documents that an operation may answer with; `body`: it isn't a GET."""
+    """Return the `responses` of an operation for its error codes; `body`: it is no GET."""
     found: dict[int, dict[str, Any]] = {}
     for code in dict.fromkeys((*codes, *(WITH_BODY if body else ()), *always)):
         status = EXAMPLES[code].status

@@ -1,4 +1,4 @@
-"""A job's pose, or a sequence's, in the words of other programs."""
+"""Exports of poses as text: COLMAP, nerfstudio, TUM trajectories, OGC GeoPose."""
 
 from __future__ import annotations
 
@@ -29,26 +29,26 @@ EXPORT_TYPES: dict[ExportFormat, str] = {
 
 
 def exported(kind: ExportFormat, photo_name: str, created: datetime, result: Result) -> str:
-    """Return the pose, or those of a sequence that were localized, as text. Raises NoGeoAnchor."""
+    """Return the pose, or all localized poses of a sequence, as text. Raises NoGeoAnchor."""
     if result.frames is None:
-        places = [_Place(_field(photo_name), created.timestamp(), result.pose)]
+        poses = [_NamedPose(_field(photo_name), created.timestamp(), result.pose)]
     else:
-        places = _places(result.frames)
-    return _FORMATS[kind](places, result)
+        poses = _localized(result.frames)
+    return _FORMATS[kind](poses, result)
 
 
 def trajectory_of(frames: Sequence[FrameOut]) -> str:
-    """Return those that were localized as TUM's tools read them."""
-    return "".join(map(_tum_line, _places(frames)))
+    """Return the localized frames as a TUM trajectory: `timestamp tx ty tz qx qy qz qw`."""
+    return "".join(map(_tum_line, _localized(frames)))
 
 
-def _places(frames: Sequence[FrameOut]) -> list[_Place]:
+def _localized(frames: Sequence[FrameOut]) -> list[_NamedPose]:
     found = [frame for frame in frames if frame.status is Status.LOCALIZED]
-    return [_Place(_field(frame.name), frame.time_s, _pose_of(frame)) for frame in found]
+    return [_NamedPose(_field(frame.name), frame.time_s, _pose_of(frame)) for frame in found]
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _NamedPose:
     name: str
     time_s: float
     pose: PoseOut
@@ -59,17 +59,17 @@ def _pose_of(frame: FrameOut) -> PoseOut:
 
 
 def _field(name: str) -> str:
-    return re.sub(r"[^\w./+-]+", "_", name) or "photo.jpg"  # a space or line break would end the field
+    return re.sub(r"[^\w./+-]+", "_", name) or "photo.jpg"  # the formats separate fields by spaces and line breaks
 
 
-def _colmap(places: Sequence[_Place], result: Result) -> str:
-    """Two lines of images.txt each (the second lists observed points: none), after comments with the camera."""
+def _colmap(poses: Sequence[_NamedPose], result: Result) -> str:
+    """Two lines of images.txt for each pose (the second for observed points: none), after a comment with the camera."""
     k = result.intrinsics
     lines = [f"# cameras.txt: 1 {k.model} {k.width} {k.height} {_numbers(*_colmap_parameters(k))}"]
     lines.append("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
-    for number, place in enumerate(places, 1):
-        pose = place.pose.camera_from_world
-        lines += [f"{number} {_numbers(*pose.quaternion_wxyz, *pose.translation)} 1 {place.name}", ""]
+    for number, named in enumerate(poses, 1):
+        pose = named.pose.camera_from_world
+        lines += [f"{number} {_numbers(*pose.quaternion_wxyz, *pose.translation)} 1 {named.name}", ""]
     return "\n".join(lines) + "\n"
 
 
@@ -77,7 +77,7 @@ def _colmap_parameters(k: IntrinsicsOut) -> list[float]:
     return [*([k.fx] if k.model in ONE_FOCAL else [k.fx, k.fy]), k.cx, k.cy, *k.distortion]
 
 
-# nerfstudio's names of COLMAP's parameters after the principal point.
+# Names in nerfstudio of the COLMAP parameters after the principal point, in their order.
 _FISHEYE = ("k1", "k2", "k3", "k4")
 _DISTORTION = {
     "SIMPLE_RADIAL": ("k1",),
@@ -90,16 +90,16 @@ _DISTORTION = {
 }
 
 
-def _nerfstudio(places: Sequence[_Place], result: Result) -> str:
-    """An entry of `frames`, which brings its own intrinsics; of a sequence a file of them."""
-    entries = [_nerfstudio_frame(place, result.intrinsics) for place in places]
+def _nerfstudio(poses: Sequence[_NamedPose], result: Result) -> str:
+    """An entry of `frames` with its intrinsics; for a sequence an object with all entries."""
+    entries = [_nerfstudio_frame(named, result.intrinsics) for named in poses]
     return json.dumps({"frames": entries} if result.frames is not None else entries[0], indent=2) + "\n"
 
 
-def _nerfstudio_frame(place: _Place, k: IntrinsicsOut) -> dict[str, Any]:
+def _nerfstudio_frame(named: _NamedPose, k: IntrinsicsOut) -> dict[str, Any]:
     return {
-        "file_path": place.name,
-        "transform_matrix": place.pose.opengl.world_from_camera.matrix,
+        "file_path": named.name,
+        "transform_matrix": named.pose.opengl.world_from_camera.matrix,
         "camera_model": "OPENCV_FISHEYE" if "FISHEYE" in k.model else "OPENCV",
         "w": k.width,
         "h": k.height,
@@ -111,21 +111,21 @@ def _nerfstudio_frame(place: _Place, k: IntrinsicsOut) -> dict[str, Any]:
     }
 
 
-def _tum(places: Sequence[_Place], result: Result) -> str:
+def _tum(poses: Sequence[_NamedPose], result: Result) -> str:
     """`timestamp tx ty tz qx qy qz qw`, of world_from_camera."""
-    return "".join(map(_tum_line, places))
+    return "".join(map(_tum_line, poses))
 
 
-def _tum_line(place: _Place) -> str:
-    w, x, y, z = place.pose.world_from_camera.quaternion_wxyz
-    return f"{place.time_s:.6f} {_numbers(*place.pose.position, x, y, z, w)}\n"
+def _tum_line(named: _NamedPose) -> str:
+    w, x, y, z = named.pose.world_from_camera.quaternion_wxyz
+    return f"{named.time_s:.6f} {_numbers(*named.pose.position, x, y, z, w)}\n"
 
 
-def _geopose(places: Sequence[_Place], result: Result) -> str:
-    """Of a sequence the last."""
+def _geopose(poses: Sequence[_NamedPose], result: Result) -> str:
+    """The pose on Earth; of a sequence the last one."""
     if result.geopose is None:
         raise NoGeoAnchor(
-            f"scene '{result.scene.id}' has no place on Earth.",
+            f"scene '{result.scene.id}' has no geo_anchor.",
             where="format",
             hint="Give its scene.json a geo_anchor, and localize again.",
         )
@@ -136,7 +136,7 @@ def _numbers(*values: float) -> str:
     return " ".join(f"{value:.17g}" for value in values)
 
 
-_FORMATS: dict[ExportFormat, Callable[[Sequence[_Place], Result], str]] = {
+_FORMATS: dict[ExportFormat, Callable[[Sequence[_NamedPose], Result], str]] = {
     "colmap": _colmap,
     "nerfstudio": _nerfstudio,
     "tum": _tum,

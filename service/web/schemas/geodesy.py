@@ -1,11 +1,11 @@
-"""From a pose in a scene to a pose on Earth (OGC GeoPose 1.0). The only file with pyproj.
+"""Converts a pose in a scene to a pose on Earth (OGC GeoPose 1.0).
 
     enu_from_camera = enu_from_world @ world_from_camera      at the anchor, metres
     ecef = anchor_ecef + ecef_from_enu(anchor) @ enu          WGS84
-    quaternion: enu_from_camera at the camera's own place, whose up differs from the anchor's by the Earth's curve
+    quaternion: enu_from_camera at the camera's own position, where up differs from the anchor's
 
-GeoPose says what the quaternion turns from (East-North-Up), not which axes a camera has; here they are
-OpenGL's and WebXR's: +x right, +y up, +z backwards.
+GeoPose defines the quaternion's outer frame (East-North-Up), not the axes of a camera; here they are those of
+OpenGL and WebXR: +x right, +y up, +z backwards.
 """
 
 from __future__ import annotations
@@ -21,21 +21,22 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def geographic(anchor: GeoAnchor, pose: Pose) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "4"]]:
-    """Return latitude and longitude in degrees with the height in metres, and the quaternion wxyz."""
+    """Return a pose on WGS84: (latitude in degrees, longitude in degrees, height in metres), and a quaternion wxyz."""
     ecef_from_geodetic = Transformer.from_crs("EPSG:4979", "EPSG:4978")
-    place = np.array(ecef_from_geodetic.transform(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m))
+    origin = np.array(ecef_from_geodetic.transform(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m))
     ecef_from_enu = _ecef_from_enu(anchor.latitude_deg, anchor.longitude_deg)
+    # The anchor's matrix scales, too: metres per scene unit.
     scaled = anchor.enu_from_world[:3, :3]
     enu_from_world = scaled / np.cbrt(np.linalg.det(scaled))
     enu = scaled @ pose.position_in_world + anchor.enu_from_world[:3, 3]
-    latitude, longitude, height = ecef_from_geodetic.transform(*(place + ecef_from_enu @ enu), direction="INVERSE")
+    latitude, longitude, height = ecef_from_geodetic.transform(*(origin + ecef_from_enu @ enu), direction="INVERSE")
     ecef_from_camera = ecef_from_enu @ enu_from_world @ pose.world_from_camera[:3, :3] @ _OPENCV_FROM_OPENGL
-    turn = quat_from_rotation(_ecef_from_enu(latitude, longitude).T @ ecef_from_camera)
-    return np.array([latitude, longitude, height]), turn
+    rotation = quat_from_rotation(_ecef_from_enu(latitude, longitude).T @ ecef_from_camera)
+    return np.array([latitude, longitude, height]), rotation
 
 
 def _ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3 3"]:
-    """The columns are east, north and up at a place, in the Earth-centred frame."""
+    """Return the unit vectors east, north and up at a position, as columns, in the Earth-centred frame."""
     (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians([latitude_deg, longitude_deg])) for f in (np.sin, np.cos))
     return np.array(
         [

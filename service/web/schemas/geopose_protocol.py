@@ -1,8 +1,8 @@
-"""Open AR Cloud's GeoPoseProtocol: an AR client's words for "where am I", and the answer in the same words.
+"""Requests and responses of Open AR Cloud's GeoPoseProtocol, by which AR clients are localized on Earth.
 
-One camera reading of a request is used: its image, and its camera's parameters (COLMAP's models). A scene is
-chosen by the request's geolocation, or it is the only one that has a place on Earth. What the protocol has
-besides (other sensors, prior poses) is accepted and not used.
+The first camera reading of a request is used: its image, and its camera's parameters (in COLMAP's models). The scene is
+the only one with a geo_anchor, or the nearest to the request's geolocation. Other readings (sensors, prior poses) are
+accepted and ignored.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ _EARTH_M = 6_371_000.0
 
 
 class _Foreign(BaseModel):
-    """Of a protocol that is not ours: what we don't know is ignored."""
+    """A model of the protocol; unknown fields are ignored."""
 
     model_config = ConfigDict(use_attribute_docstrings=True, extra="ignore")
 
 
 class CameraParams(_Foreign):
     model: str | None = None
-    """COLMAP's name."""
+    """Name of the camera model in COLMAP."""
     modelParams: list[float] = Field(default_factory=list)
 
 
@@ -67,6 +67,8 @@ class GeoPoseRequest(_Foreign):
 
 
 class GeoPoseAccuracy(Model):
+    """Standard deviations of the pose."""
+
     position: float
     """Metres, mean of the components."""
     orientation: float
@@ -84,7 +86,7 @@ class GeoPoseResponse(Model):
 
 
 def image_of(request: GeoPoseRequest) -> tuple[bytes, dict[str, Any] | None]:
-    """Return the image file and its intrinsics, if they were sent. Raises InvalidRequest, InvalidIntrinsics."""
+    """Return the image file, and the intrinsics if they were sent. Raises InvalidRequest, InvalidIntrinsics."""
     if not request.sensorReadings.cameraReadings:
         raise InvalidRequest("at least one is required.", where="sensorReadings.cameraReadings")
     reading = request.sensorReadings.cameraReadings[0]
@@ -116,20 +118,20 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
 
 
 def nearest_scene(entries: Sequence[Entry], request: GeoPoseRequest) -> str:
-    """Return the scene to look in. Raises NoGeoAnchor."""
+    """Return the id of the scene to localize in. Raises NoGeoAnchor."""
     anchored = [(e.id, e.loaded.scene.info.geo_anchor) for e in entries if e.loaded]
     places = {scene_id: anchor for scene_id, anchor in anchored if anchor}
     readings = request.sensorReadings.geolocationReadings
     if len(places) == 1:
         return next(iter(places))
     if not places or not readings:
-        told = "no scene in memory has a place on Earth" if not places else "several scenes have a place on Earth"
-        raise NoGeoAnchor(f"{told}.", where="scene", hint="Name one (?scene=ID), or send a geolocation reading.")
+        reason = "no scene in memory has a geo_anchor" if not places else "several scenes have a geo_anchor"
+        raise NoGeoAnchor(f"{reason}.", where="scene", hint="Name one (?scene=ID), or send a geolocation reading.")
     return min(places, key=lambda scene_id: _distance_m(places[scene_id], readings[-1]))
 
 
 def _distance_m(anchor: GeoAnchor, reading: GeolocationReading) -> float:
-    """Along the sphere (haversine): near enough to tell which scene is nearer."""
+    """Return the great-circle distance (haversine formula, on a sphere)."""
     lat_a, lon_a, lat_b, lon_b = map(
         math.radians, (anchor.latitude_deg, anchor.longitude_deg, reading.latitude, reading.longitude)
     )
@@ -139,7 +141,7 @@ def _distance_m(anchor: GeoAnchor, reading: GeolocationReading) -> float:
 
 
 def response_of(request: GeoPoseRequest, result: Result, anchor: GeoAnchor) -> GeoPoseResponse:
-    """Answer in the protocol's words; `result` has a geopose."""
+    """Return the protocol's response to a result with a geopose."""
     assert result.geopose
     accuracy = None
     if result.covariance is not None:

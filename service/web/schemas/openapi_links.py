@@ -1,4 +1,4 @@
-"""OpenAPI links: where the id that one operation returns is used by others."""
+"""OpenAPI links: from an operation that returns an id to the operations that take it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 _JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose")
 _SCENE = ("get_scene", "scene_thumbnail", "scene_splats", "render_scene", "load_scene", "unload_scene", "delete_scene")
 
-# (operation, status) -> parameter, where it is found, the operations that take it.
+# (operation, status) -> parameter, where the response has it, the operations that take it.
 _LINKS = {
     ("localize_photo", "200"): ("job_id", "$response.body#/id", _JOB),
     ("localize_photo", "202"): ("job_id", "$response.body#/id", _JOB),
@@ -18,7 +18,7 @@ _LINKS = {
 
 
 def add_links(schema: dict[str, Any]) -> None:
-    """Put the links into an OpenAPI document."""
+    """Add the links to an OpenAPI document."""
     for operations in schema["paths"].values():
         for operation in operations.values():
             for status, response in operation["responses"].items():
