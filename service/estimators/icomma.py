@@ -94,6 +94,7 @@ def run(query: Query, tools: Tools, options: Options, config: IcommaConfig = ICO
     yield IterationRecord("start", start)
     for step in range(options.steps):
         pose, record = pose_of.pose(numbers), None
+        # Between two matchings the old correspondences stay valid: they are of scene points.
         if off_since is None and step % options.rematch_every == 0:
             matches, record = _rematch(Camera(intrinsics, pose), images, tools, config.min_matches)
         value, by_twist = loss_and_gradient(tools.rasterizer, intrinsics, pose, loss)
@@ -104,6 +105,7 @@ def run(query: Query, tools: Tools, options: Options, config: IcommaConfig = ICO
             by_twist = weight * by_match + (1 - weight) * by_twist
             off_since = step if distance < config.match_until else None
         if off_since is not None:
+            # The exponent is 1 / decay_steps at the very step that switched matching off.
             adam.rate = options.rate * config.decay ** ((step - off_since + 1) / config.decay_steps)
         numbers = numbers - adam.step(pose_of.gradient(numbers, by_twist))
         reached = pose_of.pose(numbers)

@@ -102,11 +102,13 @@ def _pixel_sampler(
     Pixels are of the photo's interest regions, or of the whole picture where those are smaller than `rays`.
     """
     region = np.flatnonzero(interest_region(photo))
+    # A photo without texture has hardly any feature points.
     if len(region) < rays:
         region = np.arange(photo.shape[0] * photo.shape[1])
 
     def draw_mask() -> Float32[np.ndarray, "h w 1"]:
         mask = np.zeros(photo.shape[0] * photo.shape[1], np.float32)
+        # Scaled to a mean of 1, so that gradient and learning rate keep their size.
         mask[rng.choice(region, min(rays, len(region)), replace=False)] = len(mask) / min(rays, len(region))
         return mask.reshape(*photo.shape[:2], 1)
 

@@ -131,6 +131,7 @@ class Prepared:
 def prepare(tools: Tools, cache_dir: Path | None) -> Prepared:
     """Return the scene's focus and viewpoints, and a renderer of the pruned scene: takes a second, once a scene."""
     cameras = index_cameras(tools.scene, tools.rasterizer, tools.rng)
+    # Evenly spread: neighbouring viewpoints see the same Gaussians.
     few = cameras[:: max(1, len(cameras) // PRUNING.num_views)]
     views = [Camera(sized(camera.intrinsics, PRUNING.long_side_px), camera.pose) for camera in few]
     scene = prune(tools.scene, contributions(tools.scene, tools.rasterizer, views))
@@ -180,10 +181,12 @@ def _sample(
         poses = around(parents, focus, degrees, share, count, tools.rng)
         if number == 0 and from_prior:
             poses[0] = start  # the prior itself is the first hypothesis
+        # What the best ones' matches were solved to is scored, too, with a render of its own.
         if number:
             poses = [*parents, *poses]
         for pose in poses:
             yield _score(pose, images, tools, options, scored)
+            # From this support on DO converges: further hypotheses would cost renders for nothing.
             if scored[-1].support > config.enough_support:
                 break
         scored.sort(key=lambda h: -h.support)
@@ -219,6 +222,7 @@ def _optimize_decoupled(
         camera = Camera(sized(images.query.intrinsics, options.render_px), pose)
         matches, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
         solved = _solve(matches, pose, images.query, tools, iteration if options.solver == "gradient" else None)
+        # Without enough matches the next render would be the same.
         if solved is None:
             yield _record("decouple", best, matches, None, view)
             break
@@ -251,6 +255,7 @@ def _solve(
     """
     if len(matches.photo_px) < DECOUPLED.min_points:
         return None
+    # Matchers return float32, too coarse for the normal equations.
     matched = MatchedPoints(
         matches.photo_px.astype(np.float64),
         matches.points_in_world.astype(np.float64),

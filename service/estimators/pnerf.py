@@ -119,6 +119,7 @@ def run(query: Query, tools: Tools, options: Options, config: PnerfConfig = PNER
         if step and step % options.resample_every == 0:
             hypotheses = _resampled(hypotheses, step // options.resample_every, tools, config)
         decay = config.decay ** (step / config.decay_steps)
+        # Per number: three of the rotation, three of the translation.
         rates = decay * np.repeat([options.turn_rate, options.shift_rate], 3)
         best, least = start, np.inf
         for hypothesis in hypotheses:
@@ -134,6 +135,7 @@ def _resampled(
     hypotheses: list[_Hypothesis], round_number: int, tools: Tools, config: PnerfConfig
 ) -> list[_Hypothesis]:
     """Keep the best, and replace the others by hypotheses drawn around them in turn; rounds count from 1."""
+    # Stable sort: with equal losses the result doesn't depend on chance.
     ranked = sorted(hypotheses, key=lambda hypothesis: hypothesis.loss)
     keep = min(len(hypotheses), max(config.min_parents, round(len(hypotheses) * config.kept_share / 2**round_number)))
     parents = ranked[:keep]

@@ -36,8 +36,10 @@ def _within(lines: Sequence[Line], key: str = "within_5deg_0p05", **wanted: str)
 
 def _ahead(statement: str, better: tuple[str, tuple[int, int]], worse: tuple[str, tuple[int, int]]) -> Claim | None:
     (name, (a, n)), (other, (b, m)) = better, worse
+    # Without results of both there is nothing to compare.
     if not n or not m:
         return None
+    # Shares, because the methods may have different numbers of queries.
     difference = a / n - b / m
     return Claim(statement, f"{name} {a}/{n}, {other} {b}/{m}", None if difference == 0 else difference > 0)
 

@@ -112,6 +112,7 @@ def _box_of(shown: Sequence[Vectors]) -> tuple[float, float, float, float]:
     """Return left, right, bottom, top of the matches' extent in the photo, with a margin."""
     ends = np.concatenate([np.concatenate([vectors.rendered_px, vectors.photo_px]) for vectors in shown])
     height, width = shown[0].photo.shape[:2]
+    # Percentiles, because single wrong matches reach far out.
     (left, top), (right, bottom) = np.percentile(ends, [0.5, 99.5], axis=0)
     margin = MARGIN * max(width, height)
     return (
@@ -123,6 +124,7 @@ def _box_of(shown: Sequence[Vectors]) -> tuple[float, float, float, float]:
 
 
 def _draw_vectors(place: Axes, vectors: Vectors, box: tuple[float, float, float, float]) -> None:
+    # A pale photo, so that the vectors stand out.
     faded = 255 - (255 - vectors.photo.astype(float)) * 0.45
     place.imshow(faded.astype(np.uint8))
     a, b = vectors.rendered_px - 0.5, vectors.photo_px - 0.5  # matplotlib puts the first pixel's centre at 0
@@ -137,6 +139,7 @@ def _draw_vectors(place: Axes, vectors: Vectors, box: tuple[float, float, float,
 def _draw_paths(place: Axes, paths: Sequence[Path3D], truth: Float[np.ndarray, "3"]) -> None:
     """Draw positions in the plane in which they extend most."""
     every = np.concatenate([path.positions for path in paths] + [truth[None]])
+    # The two principal directions of all positions.
     axes = np.linalg.svd(every - every.mean(0), full_matrices=False)[2][:2]
     for path in paths:
         place.plot(*(axes @ (path.positions - truth).T), marker=".", markersize=3, linewidth=1, label=path.name)
@@ -191,5 +194,6 @@ def growth(rows: Sequence[Mapping[str, Any]]) -> bytes:
 
 def _png(figure: Figure, dpi: int = DPI) -> bytes:
     stream = io.BytesIO()
+    # The figure's own canvas, without pyplot: no global state, no display.
     FigureCanvasAgg(figure).print_figure(stream, dpi=dpi, format="png")
     return with_palette(stream.getvalue())

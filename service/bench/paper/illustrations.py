@@ -103,8 +103,10 @@ def _shown(
     found = []
     for index in picked:
         number, matches = matched[index]
+        # Rendered pixels are scaled to the photo's, over which both ends are drawn.
         size = matches.render_camera.intrinsics
         scale = np.array([photo.shape[1] / size.width, photo.shape[0] / size.height])
+        # Where no matches agree all of them are drawn.
         keep = matches.inlier if matches.inlier.any() else np.ones(len(matches.inlier), bool)
         vectors = matches.render_px[keep] * scale, matches.photo_px[keep]
         label = title if count == 1 else f"{title}, step {number}"
@@ -183,6 +185,7 @@ def _share_curve(curves: Sequence[Sequence[Sequence[float]]]) -> tuple[list[floa
     good = np.zeros(len(steps))
     for curve in curves:
         numbers, degrees, units = np.array(curve).T
+        # The bound of Table 2.
         within = (degrees <= 5) & (units <= 0.05)
         good += within[np.searchsorted(numbers, steps, side="right") - 1]
     return [float(s) for s in steps], (good / len(curves)).tolist()

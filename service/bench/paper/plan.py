@@ -124,6 +124,7 @@ def cells(config: StudyConfig = STUDIES) -> tuple[Cell, ...]:
         method = _mc_do(f"mc_do:{row or 'descent'}", **options)
         share = config.table5_share if len(stages) == len(_STAGES) else 0.5 * config.table5_share
         found.append(Cell("table5", method, "random", share=share, photos=config.table5_photos))
+    # The default has no stages to leave out: one row, for comparison.
     found.append(Cell("table5", MAIN[0], "random", share=config.table5_share, photos=config.table5_photos))
     for loss in LOSSES:
         method = _mc_do(f"mc_do:{loss}", **_NO_STAGE | {"refinement_steps": config.table1_steps, "loss": loss})

@@ -61,6 +61,7 @@ def write(spec: RunSpec, folder: Path) -> None:
 def _pictures(spec: RunSpec, lines: Sequence[Line]) -> dict[str, bytes]:
     from service.bench.paper import illustrations  # loads matplotlib
 
+    # Figures render answers again, so the scenes are needed; tables need the lines alone.
     subjects = {name: load(spec, name) for name in spec.scenes}
     found = {"figure1": illustrations.figure_1(next(iter(subjects.values())))}
     both = illustrations.figures_2_and_3(subjects, lines)
@@ -98,6 +99,7 @@ def page(found: Sequence[Table], checked: Sequence[Claim], pictures: Mapping[str
     parts += [_table_html(table) for table in found]
     for name, png in pictures.items():
         source = f"data:image/png;base64,{base64.b64encode(png).decode()}"
+        # The heading is the figure's number; the caption has the rest.
         title, _, rest = FIGURES[name].partition(":")
         parts.append(f"<h2>{title}</h2><p class=note>{escape(rest.strip())}</p>")
         parts.append(f'<img alt="{escape(FIGURES[name])}" src="{source}">')

@@ -97,6 +97,7 @@ def run(spec: RunSpec, on_progress: Callable[[Progress], None] | None = None) ->
         for scene, cell, trial in _todo(spec, subjects):
             if (scene, cell.name, trial.photo, trial.number) in done:
                 continue
+            # Only scenes that still have queries to run are warmed up.
             if scene not in warm:
                 _warm(subjects[scene])
                 warm.add(scene)
@@ -104,6 +105,7 @@ def run(spec: RunSpec, on_progress: Callable[[Progress], None] | None = None) ->
             line = _answer(scene, subjects[scene], cell, trial, spec)
             stream.write(json.dumps(line) + "\n")
             stream.flush()
+            # A power cut may cost the query under way, never one that was reported.
             os.fsync(stream.fileno())
             lines.append(line)
             done.add(_key(line))
@@ -119,6 +121,7 @@ def read_lines(file: Path, repair: bool = False) -> list[dict[str, Any]]:
     if not file.is_file():
         return []
     data = file.read_bytes()
+    # An incomplete last line has no newline yet.
     whole = data[: data.rfind(b"\n") + 1]
     if repair and len(whole) < len(data):
         with file.open("r+b") as stream:
@@ -151,6 +154,7 @@ def _check_config(spec: RunSpec, subjects: Mapping[str, Subject]) -> None:
         "methods": {cell.method.name: cell.method.config() for cell in spec.cells},
         "scenes": {name: _scene_facts(one) for name, one in subjects.items()},
     }
+    # Tuples become lists, as they are in the stored file.
     now = json.loads(json.dumps(now))
     for part, entries in now.items():
         for name, value in entries.items():
@@ -203,6 +207,7 @@ def _todo(spec: RunSpec, subjects: Mapping[str, Subject]) -> Iterator[tuple[str,
 def _photos_of_cell(one: Subject, cell: Cell) -> Subject:
     if cell.photos is None or cell.photos >= len(one.photos):
         return one
+    # Evenly spread over the sequence, for neighbouring photos are alike.
     step = len(one.photos) / cell.photos
     return replace(one, photos=tuple(one.photos[int(i * step)] for i in range(cell.photos)))
 
@@ -210,6 +215,7 @@ def _photos_of_cell(one: Subject, cell: Cell) -> Subject:
 def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, spec: RunSpec) -> dict[str, Any]:
     """Answer one query; return its line."""
     method = cell.method
+    # Indexes are made before the clock starts: their time is a scene's, not a query's.
     one.loaded.prepare(method.estimator)
     wall, cpu = time.perf_counter(), time.process_time()
     estimate = answered(one, trial, Request(method.estimator, method.options, spec.seed))

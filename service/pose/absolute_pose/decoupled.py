@@ -91,6 +91,7 @@ def rotate_about(pose: Pose, centre_in_world: Float64[np.ndarray, "3"], rotation
     matrix = pose.world_from_camera.copy()
     turned = matrix[:3, :3] @ so3_exp(rotation)
     u, _, vt = np.linalg.svd(turned)
+    # The nearest rotation: rounding errors would add up over the steps.
     turned = u @ vt
     matrix[:3, 3] = centre_in_world + turned @ matrix[:3, :3].T @ (matrix[:3, 3] - centre_in_world)
     matrix[:3, :3] = turned
@@ -112,10 +113,12 @@ def least_squares_solve(matched: MatchedPoints, start: Pose, config: DecoupledCo
     pose, scale = start, np.inf
     for _ in range(config.steps):
         vectors, by_rotation, _ = linearize_matches(matched, pose, config)
+        # For the rotation, outliers are vectors that differ from the others; a common part is translation.
         around = vectors - np.median(vectors, axis=0)
         scale = _next_scale(around, scale, matched.px, config)
         rotation = _centred_step(by_rotation, vectors, geman_mcclure_weights(around, scale))
         length = float(np.linalg.norm(rotation))
+        # Shortened, not refused: the direction is still right.
         rotation = rotation * min(1.0, config.max_rotation_rad / max(length, 1e-9))
         pose = rotate_about(pose, matched.centre_in_world, rotation)
         vectors, _, by_translation = linearize_matches(matched, pose, config)
@@ -140,6 +143,7 @@ def linearize_matches(
     points = transformed(camera_from_world, matched.points_in_world)
     centre = transformed(camera_from_world, matched.centre_in_world[None])[0]
     behind = points[:, 2] < config.min_depth_share * np.linalg.norm(centre)
+    # Any finite place: vectors and Jacobians of these are overwritten below.
     points[behind] = [0.0, 0.0, 1.0]
     x, y, z = points.T
     by_point = np.zeros((len(points), 2, 3))

@@ -65,6 +65,7 @@ def estimate_absolute_pose(
         "min_iterations": config.min_trials,
         "max_iterations": max_trials,
         "progressive_sampling": True,
+        # Progressive to the end: later trials still prefer confident matches.
         "max_prosac_iterations": max_trials,
         "seed": 0,
     }

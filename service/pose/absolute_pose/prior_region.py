@@ -36,6 +36,7 @@ def distance_outside(region: PriorRegion, pose: Pose, config: PriorRegionConfig 
     """
     if isinstance(region, BoxPrior):
         position = pose.position_in_world
+        # By axis; the norm of the positive parts is the distance to the box's nearest point.
         outside = np.maximum(region.lower_in_world - position, position - region.upper_in_world)
         return float(np.linalg.norm(np.maximum(outside, 0.0)))
     twist = se3_log(region.pose.camera_from_world @ pose.world_from_camera)
@@ -56,5 +57,6 @@ def widened_prior(
         return None
     if isinstance(region, BoxPrior):
         return BoxPrior(region.lower_in_world - slack, region.upper_in_world + slack)
+    # Independent errors add their covariances.
     sigmas = np.r_[np.full(3, np.radians(config.slack_deg)), np.full(3, slack)]
     return GaussianPosePrior(region.pose, region.covariance + np.diag(sigmas**2))

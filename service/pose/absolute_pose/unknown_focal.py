@@ -66,6 +66,7 @@ def absolute_pose_unknown_focal(
         camera = intrinsics.corrected(correction)
         if one := estimate_absolute_pose(photo_px, points_in_world, camera, wide_px, config.trials):
             found.append(replace(one, correction=correction))
+    # Stable, so that of equal counts the shorter focal length is first, and results are reproducible.
     found.sort(key=lambda one: -one.num_inliers)
     if not found or found[0].num_inliers < config.min_inliers:
         return found[0] if found else None
@@ -102,6 +103,7 @@ def refine_with_intrinsics(
         # The prior's precision is in units of a standard deviation of one pixel for the correspondences.
         hessian[range(6, 9), range(6, 9)] += precision
         rhs[6:] -= precision * correction_vector(correction)
+        # The least-norm step where the matches leave a direction undetermined.
         step = np.linalg.lstsq(hessian, rhs, rcond=1e-12)[0]
         pose = Pose(pose.world_from_camera @ se3_exp(step[:6]))
         correction = prior.stepped(correction, step[6:])
@@ -123,6 +125,7 @@ def linearize_reprojection(
     moves the camera in its own frame. Both are zeros for points behind the camera.
     """
     x, y, z = transformed(pose.camera_from_world, np.asarray(points_in_world, np.float64)).T
+    # Points behind the camera would project as if they were ahead, and pull on the pose.
     ahead = z > 1e-9
     z = np.where(ahead, z, 1.0)
     u, v, zero = x / z, y / z, np.zeros(len(z))

@@ -21,6 +21,7 @@ class Adam:
         self._count += 1
         self._mean += (1 - self._beta_1) * (gradient - self._mean)
         self._square += (1 - self._beta_2) * (gradient**2 - self._square)
+        # Both moments start at zero: divided by what they would be for a constant gradient of one.
         mean = self._mean / (1 - self._beta_1**self._count)
         square = self._square / (1 - self._beta_2**self._count)
         return self.rate * mean / (np.sqrt(square) + self._epsilon)

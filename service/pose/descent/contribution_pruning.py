@@ -40,6 +40,7 @@ def contributions(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequenc
     """
     result = np.zeros(scene.count)
     for camera in cameras:
+        # As d loss / d pixel: the loss is the sum of the render's pixels.
         ones = np.ones((camera.intrinsics.height, camera.intrinsics.width, 3), np.float32)
         found = rasterizer.scene_gradients(camera, ones)
         seen = found.index
@@ -54,6 +55,7 @@ def prune(
     order = np.argsort(-contribution, kind="stable")
     total = np.cumsum(contribution[order])
     count = int(np.searchsorted(total, config.kept_share * total[-1])) + 1
+    # Sorted, so that the scene keeps its order.
     chosen = np.sort(order[:count])
     arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "scales", "opacities", "sh")}
     return replace(scene, **arrays)

@@ -59,6 +59,7 @@ def gradient_solve(
     for _ in range(config.steps):
         vectors, _, _ = linearize_matches(matched, pose)
         length = np.linalg.norm(vectors, axis=1)
+        # Points behind the camera have vectors without meaning.
         ahead = length < BEHIND_PX / 10
         weights = ahead * length / (length + config.short_px * matched.px)
         _, by_rotation = angle_loss(matched, pose, weights)

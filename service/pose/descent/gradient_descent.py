@@ -93,6 +93,7 @@ def descend(
         rotation = -rotation_adam.step(gradient[:3] + hat(arm).T @ gradient[3:])
         translation = -translation_adam.step(gradient[3:])
         pose = translate_in_camera(rotate_about(pose, focus.point_in_world, rotation), translation)
+    # Of the last pose only the loss is needed, a render without gradient.
     value, _ = loss(rasterizer.render([Camera(intrinsics, pose)])[0].rgb)
     yield DescentStep(pose, value)
 
@@ -124,6 +125,7 @@ class Se3:
         """
         matrix = se3_exp(xi) @ self._anchor
         inverse = np.linalg.inv(matrix)
+        # A translation of one normalized unit is 1 / scale scene units.
         scaled = np.concatenate([twist[:3], twist[3:] / self._scale])
         result = np.empty(6)
         for i in range(6):

@@ -63,6 +63,7 @@ def _undone(pose: Pose, focus: Focus, angles: Float64[np.ndarray, "3"], translat
     """Return (T Rz Ry Rx)^-1 pose; angles in rad."""
     rotation = np.eye(3)
     for axis in range(3):
+        # (Rz Ry Rx)^-1 = Rx^-1 Ry^-1 Rz^-1: the order of the axes is reversed.
         rotation = rotation @ so3_exp(-angles[axis] * np.eye(3)[axis])
     matrix = np.eye(4)
     matrix[:3, :3] = rotation @ pose.world_from_camera[:3, :3]
@@ -84,6 +85,7 @@ def poses_near_views(
     poses about their optical axes, against the view's upright.
     """
     weights = np.array([score if len(view.points_in_world) else 0.0 for view, score in zip(views, scores, strict=True)])
+    # Squared margins favour the best views; the floor keeps the sum positive where all scores are equal.
     weights = np.maximum(weights - config.min_score_share * weights.max(), 1e-9) ** 2
     poses = []
     for i in rng.choice(len(views), count, p=weights / weights.sum()):
@@ -91,6 +93,7 @@ def poses_near_views(
         target = view.points_in_world[rng.integers(len(view.points_in_world))].astype(np.float64)
         from_target = view.camera.pose.position_in_world - target
         distance = float(np.linalg.norm(from_target))
+        # A target off the view's own axis, and a position off the line to it: sampled views differ from the index.
         aside = config.lateral_share * distance * rng.standard_normal(3)
         position = target + (1 - rng.uniform(*config.approach)) * from_target + aside
         upright = look_at(position, target, -view.camera.pose.world_from_camera[:3, 1])

@@ -112,6 +112,7 @@ def _relative(photo: Photo, config: LossConfig) -> Loss:
 
     def of(render: Image) -> tuple[float, Image]:
         difference = render - target
+        # Held constant in the gradient, as in Instant-NGP.
         over = 1 / (render * render + np.float32(config.relative_floor))
         return float((difference * difference * over).mean()), 2 * difference * over / np.float32(difference.size)
 
@@ -120,6 +121,7 @@ def _relative(photo: Photo, config: LossConfig) -> Loss:
 
 def _feature(photo: Photo, config: LossConfig) -> Loss:
     region = interest_region(photo, config)
+    # The mean over F as a weighted mean over all pixels.
     extra = config.feature_weight * region * (region.size / max(int(region.sum()), 1))
     return _weighted(photo, (1 + extra[..., None]).astype(np.float32))
 

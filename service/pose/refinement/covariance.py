@@ -53,11 +53,14 @@ def jackknife_variance_scale(
 ) -> float:
     """Return s, the factor from the inverse hessian to the covariance; infinite where the hessian is singular."""
     hessian = hessians.sum(0)
+    # Unknowns differ by orders of magnitude: scaled to a unit diagonal, the hessian is well conditioned.
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     hessians, scores, hessian = hessians * np.outer(scale, scale), scores * scale, hessian * np.outer(scale, scale)
     try:
+        # A cell's share of the information, trace(H_cell H^-1); the shares add up to the number of unknowns.
         information = np.einsum("cij,ji->c", hessians, np.linalg.inv(hessian))
         quarters = _quarters(places, np.maximum(information, 0.0), config.cuts).astype(np.float64)
+        # The unknowns move by (H - H_quarter)^-1 score_quarter where a quarter is left out.
         left = (1 + config.ridge) * hessian - np.tensordot(quarters, hessians, 1)
         moves = np.linalg.solve(left, (quarters @ scores)[..., None])[..., 0]
     except np.linalg.LinAlgError:
@@ -70,6 +73,7 @@ def inverse_spd(hessian: Float64[np.ndarray, "k k"]) -> Float64[np.ndarray, "k k
     """Return the inverse, exactly symmetric; None if the matrix isn't positive definite."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-12))
     try:
+        # By the Cholesky factor: it fails where the matrix isn't positive definite.
         half = np.linalg.inv(np.linalg.cholesky(hessian * np.outer(scale, scale))) * scale
         result = half.T @ half
     except np.linalg.LinAlgError:
@@ -85,6 +89,7 @@ def _quarters(
     for angle in 0.5 * np.pi / cuts * np.arange(2 * cuts):
         along, across = places @ [np.cos(angle), np.sin(angle)], places @ [-np.sin(angle), np.cos(angle)]
         first = along > _weighted_median(along, information)
+        # Each half is cut at its own median, so that all quarters hold the same.
         for half in (first, ~first):
             beyond = across > _weighted_median(across, information * half)
             parts += [half & beyond, half & ~beyond]

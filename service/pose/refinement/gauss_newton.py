@@ -29,11 +29,13 @@ def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, con
         step = _step(level.jacobian, residuals, weights, state, loss, config)
         if not np.all(np.isfinite(step)):
             return np.inf
+        # Inverse compositional: the step moves the render, so the photo moves by its inverse.
         state.photo_from_render = state.photo_from_render @ se3_exp(-step[TWIST])
         state.photometric += step[PHOTOMETRIC]
         if state.prior:
             state.correction = state.prior.stepped(state.correction, step[CORRECTION])
         intrinsics = level.photo_intrinsics
+        # An upper bound of the image motion at the level's typical depth.
         moved_px = intrinsics.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
         if moved_px + intrinsics.long_side * np.abs(step[CORRECTION]).max() < settled_px:
             break
@@ -60,10 +62,12 @@ def _step(
     size = len(jacobian)
     hessian, rhs = normal_equations(jacobian, weights, residuals, state.factors)
     if state.prior:
+        # With L1 weights the hessian is about `loss` times the information, so the prior is scaled likewise.
         precision = config.correlated_pixels * loss * state.prior.precision
         hessian[range(10, 13), range(10, 13)] += precision
         rhs[CORRECTION] -= precision * correction_vector(state.correction)
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
+    # Damping keeps unknowns without any gradient in place, such as the blur of a flat render.
     damped = hessian * scale * scale[:, None]
     damped[range(size), range(size)] += 1e-6
     step = np.zeros(13)

@@ -16,6 +16,7 @@ def linearize(render, depth, pixels, k):
     `correction_vector` (3). The jacobian is at the identity and a gain of 1.
     """
     fx, fy, cx, cy = k[0], k[1], k[2], k[3]
+    # The border is left out: central differences need both neighbours.
     inner = render.shape[1] - 2
     n = len(pixels)
     points = np.empty((3, n), np.float32)
@@ -30,6 +31,7 @@ def linearize(render, depth, pixels, k):
         du = 0.5 * (render[row, column + 1] - render[row, column - 1]) * fx
         dv = 0.5 * (render[row + 1, column] - render[row - 1, column]) * fy
         along = du * x + dv * y
+        # A point X of the render moves by w x X + v with the twist (w, v).
         jacobian[0, i] = -dv - along * y
         jacobian[1, i] = du + along * x
         jacobian[2, i] = dv * x - du * y
@@ -38,9 +40,11 @@ def linearize(render, depth, pixels, k):
         jacobian[5, i] = -along / z
         jacobian[6, i] = render[row, column]
         jacobian[7, i] = 1.0
+        # d / d gamma, then d / d blur: the laplacian.
         jacobian[8, i] = render[row, column] * (np.float32(1) - render[row, column])
         around = render[row, column + 1] + render[row, column - 1] + render[row + 1, column] + render[row - 1, column]
         jacobian[9, i] = around - np.float32(4) * render[row, column]
+        # A longer focal length magnifies the photo; a shift of the principal point carries it along.
         jacobian[10, i] = -along
         jacobian[11, i] = -du / fx * side
         jacobian[12, i] = -dv / fy * side
@@ -65,6 +69,7 @@ def fill_residuals(photo, points, basis, transform, k, photometric, l1_floor, re
             continue
         column, row = np.int32(columns[i]), np.int32(rows[i])
         a, b = columns[i] - np.float32(column), rows[i] - np.float32(row)
+        # Unsigned indices spare numba's handling of negative ones.
         at = np.uint32(row * width + column)
         below = at + np.uint32(width)
         upper = flat[at] + a * (flat[at + np.uint32(1)] - flat[at])
@@ -89,6 +94,7 @@ def _project_points(points, t, k, shape, columns, rows):
     """Fill where the points project to, in pixels from the centre of the photo's first pixel; column -1 if outside."""
     fx, fy, cx, cy = k[0], k[1], k[2] - np.float32(0.5), k[3] - np.float32(0.5)
     last_column, last_row = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
+    # Scalars instead of array reads let the loop vectorize.
     t00, t01, t02, t03 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
     t10, t11, t12, t13 = t[1, 0], t[1, 1], t[1, 2], t[1, 3]
     t20, t21, t22, t23 = t[2, 0], t[2, 1], t[2, 2], t[2, 3]
@@ -98,6 +104,7 @@ def _project_points(points, t, k, shape, columns, rows):
         inverse_depth = np.float32(1) / depth
         u = fx * ((t00 * x + t01 * y + t02 * z + t03) * inverse_depth) + cx
         v = fy * ((t10 * x + t11 * y + t12 * z + t13) * inverse_depth) + cy
+        # A depth of 0 gives inf or NaN, which pass none of these comparisons.
         inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < last_column) & (v < last_row)
         columns[i] = u if inside else np.float32(-1)
         rows[i] = v
@@ -115,6 +122,7 @@ def normal_equations(jacobian, weights, residuals, factors):
             weighted[i] = jacobian[a, i] * weights[i]
             total += weighted[i] * residuals[i]
         rhs[a] = factors[a] * total
+        # The hessian is symmetric: the lower triangle is enough.
         for b in range(a + 1):
             total = np.float32(0)
             for i in range(n):

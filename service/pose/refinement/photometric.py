@@ -87,5 +87,6 @@ def refine_photometric(
         if not np.isfinite(loss):
             return RefinementResult(start.pose, correction, loss)
     assert level is not None
+    # The unknown is photo_from_render; the photo's camera is at its inverse from the render's.
     pose = moved(camera.pose, se3_log(np.linalg.inv(state.photo_from_render)))
     return RefinementResult(pose, state.correction, loss, FinalLevel(frame, level, state.photometric))

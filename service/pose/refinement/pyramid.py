@@ -23,6 +23,7 @@ def clip_like_photo(
     """
     if np.count_nonzero(photo >= config.saturated) < config.saturated_share * photo.size:
         return frame.rgb
+    # Means of blocks, so that a small misalignment hardly changes the ratio.
     size = (photo.shape[1] // config.exposure_block_px, photo.shape[0] // config.exposure_block_px)
     observed, expected = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in (photo, frame.rgb))
     observed = observed / np.float32(255)
@@ -36,6 +37,7 @@ def clip_like_photo(
 
 def luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     """Return the mean of the channels, 0..1."""
+    # 3 * 255 for bytes.
     scale = np.float32(1 / 765 if rgb.dtype == np.uint8 else 1 / 3)
     return (rgb[..., 0].astype(np.float32) + rgb[..., 1] + rgb[..., 2]) * scale
 
@@ -58,6 +60,7 @@ def occluder_depth(frame: Frame, config: PyramidConfig) -> Float32[np.ndarray, "
     """
     depth = np.where(frame.alpha > config.min_alpha, frame.median_depth, np.float32(0))
     around = np.ones((2 * config.edge_px + 1, 2 * config.edge_px + 1), np.uint8)
+    # Erosion takes the minimum over the window: the nearest depth around.
     nearest = cv2.erode(np.where(depth > 0, depth, FAR), around)
     edge = (nearest < FAR) & ((depth == 0) | (depth > (1 + config.edge_jump) * nearest))
     return np.where(edge, nearest, depth).astype(np.float32)
@@ -68,6 +71,7 @@ def depth_pyramid(depth: Float32[np.ndarray, "h w"], levels: int, max_ratio: flo
     result = [depth]
     for _ in range(levels - 1):
         fine = result[-1]
+        # An odd last row or column is dropped.
         height, width = fine.shape[0] // 2 * 2, fine.shape[1] // 2 * 2
         quads = np.stack([fine[y:height:2, x:width:2] for y in (0, 1) for x in (0, 1)])
         nearest, farthest = quads.min(0), quads.max(0)

@@ -89,6 +89,7 @@ def _scores(
     scores, hessians, places = scores_by_cell(
         jacobian, weights, residuals, level.pixels, inner, config.l1_floor, uncertainty.cell_px
     )
+    # Of twist and photometric parameters alone: with exact intrinsics the correction isn't an unknown.
     found = jackknife_variance_scale(scores[:, :FOCAL], hessians[:, :FOCAL, :FOCAL], places, uncertainty)
     return scores, hessians, uncertainty.variance_share * max(found, uncertainty.min_variance_scale)
 
@@ -131,6 +132,7 @@ def _covariance(
         found = inverse_spd(hessian[:FOCAL, :FOCAL])
         return None if found is None else scale * found[TWIST, TWIST]
     information = hessian / scale
+    # A prior is information: added before the photometric parameters are marginalized.
     information[CORRECTION, CORRECTION] += np.diag(IntrinsicsPrior(focal_sigma).precision)
     keep = np.r_[TWIST, CORRECTION]
     found = inverse_spd(information)
