@@ -1,0 +1,251 @@
+"""The mutation run: small faults are put into the code one by one, and the tests shall notice them.
+
+    python tests/mutation_run.py --out mutants.jsonl [--seed 0] [--count 60] [--workers 2] [--limit-s 600]
+
+Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/, all kinds alike, is applied in a
+copy of the last commit, and the tests that run its line are started until one fails. Which those are is measured first,
+by one run of all tests (some ten minutes), and kept beside the output. Compiled kernels and processes of their own
+can't be measured: they have the test files that name the module, then those of the modules that import it, else all. A
+failing test counts if it passes without the mutant; one that does not end within the limit has not noticed anything.
+
+The output has a line of JSON for each mutant; a run that was stopped goes on where it was. A mutant that changes
+nothing that anybody could see is marked by hand: `"equivalent": "why"` in its line. Prints the sums.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import queue
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from coverage import CoverageData
+from mutations import KINDS, Mutant, mutants_of
+
+ROOT = Path(__file__).parents[1]
+LIMIT = "time limit"
+FEW = 40
+"""Tests of one line: with more, those of the files that import the module come first."""
+
+
+def drawn(root: Path, count: int, seed: int) -> list[Mutant]:
+    """Return mutants by chance, the kinds in turn; of a longer list the first are the same."""
+    found = [
+        mutant
+        for folder in ("service", "viewer")
+        for path in sorted((root / folder).rglob("*.py"))
+        for mutant in mutants_of(str(path.relative_to(root)), path.read_bytes())
+    ]
+    by_kind = [[mutant for mutant in found if mutant.kind == kind] for kind in KINDS]
+    for mutants in by_kind:
+        random.Random(seed).shuffle(mutants)
+    in_turn = (mutant for row in zip_longest(*by_kind) for mutant in row if mutant)
+    return [mutant for mutant, _ in zip(in_turn, range(count), strict=False)]
+
+
+# ------------------------------------------------------------------ which tests run a line
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """Which tests run a line, by the measured contexts `file::test|phase`."""
+
+    data: CoverageData
+    names: dict[str, str]
+    """Path in the repository -> path in the data."""
+
+    @classmethod
+    def read(cls, file: Path) -> Coverage:
+        data = CoverageData(str(file))
+        data.read()
+        return cls(data, {re.sub(r"^.*?/(?=(service|viewer)/)", "", name): name for name in data.measured_files()})
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Return the tests that run the line; of what a fixture runs, all tests of the file."""
+        found = set()
+        for context in self.data.contexts_by_lineno(self.names.get(mutant.file, "")).get(mutant.line, []):
+            test, _, phase = context.partition("|")
+            if test:
+                found.add(test if phase == "run" else test.split("::")[0])
+        return sorted(test for test in found if "::" not in test or test.split("::")[0] not in found)
+
+    def files(self, source: str) -> set[str]:
+        """Return the test files that run any line of a source file."""
+        contexts = self.data.contexts_by_lineno(self.names.get(source, "")).values()
+        return {test.split("::")[0] for tests in contexts for test in tests if test}
+
+
+def measured(copy: Copy, file: Path) -> None:
+    """Run all tests once and write which of them run which line."""
+    file.unlink(missing_ok=True)
+    command = ["-n", "2", "--dist", "loadfile", "--cov=service", "--cov=viewer", "--cov-context=test", "--cov-report="]
+    done = copy.pytest(command, 3600, COVERAGE_FILE=str(file.absolute()))
+    if done.returncode != 0:
+        file.unlink(missing_ok=True)
+        raise SystemExit(f"the tests must pass before anything is changed:\n{done.stdout[-3000:]}")
+
+
+def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]]:
+    """Yield what to run, one after the other until something fails."""
+    tests, near = coverage.tests(mutant), {str(p) for p in naming(mutant.file, copy) if p.parts[0] == "tests"}
+    if not tests:
+        importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
+        yield sorted(near)
+        yield sorted(importing - near) if importing else ["tests"]
+    elif len(tests) <= FEW:
+        yield tests
+    else:
+        yield [test for test in tests if test.split("::")[0] in near]
+        yield [test for test in tests if test.split("::")[0] not in near]
+
+
+def naming(file: str, copy: Path) -> list[Path]:
+    """Return the files of tests and source that name the module of a file."""
+    module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    package, _, name = module.rpartition(".")
+    named = re.compile(rf"\b{re.escape(module)}\b|from {re.escape(package)} import .*\b{name}\b")
+    paths = [*(copy / "tests").glob("test_*.py"), *(copy / "service").rglob("*.py"), *(copy / "viewer").rglob("*.py")]
+    return [path.relative_to(copy) for path in paths if named.search(path.read_text("utf-8"))]
+
+
+# ------------------------------------------------------------------ applying a mutant
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """A copy of the last commit, with code caches of its own."""
+
+    folder: Path
+
+    @classmethod
+    def make(cls, folder: Path) -> Copy:
+        folder.mkdir()
+        archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout
+        subprocess.run(["tar", "-x"], cwd=folder, input=archive, check=True)
+        return cls(folder)
+
+    def pytest(self, arguments: Sequence[str], limit_s: float, **environment: str) -> subprocess.CompletedProcess[str]:
+        """Run tests; what takes longer has return code -1."""
+        cache = {"SPLATFIX_CACHE_DIR": str(self.folder / ".cache"), "PYTHONPATH": str(self.folder)}
+        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
+        with tempfile.TemporaryFile("w+") as output:
+            process = subprocess.Popen(
+                command,
+                cwd=self.folder,
+                env=os.environ | cache | environment,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+            try:
+                code = process.wait(limit_s)
+            except subprocess.TimeoutExpired:
+                code = -1
+            finally:
+                _end_group(process)
+            output.seek(0)
+            return subprocess.CompletedProcess(command, code, output.read())
+
+    def first_failure(self, tests: Sequence[str], limit_s: float) -> str | None:
+        """Return the test that fails first, or "time limit", or None if all pass."""
+        listed = self.folder / ".tests"
+        listed.write_text("\n".join(tests))
+        done = self.pytest(["-x", f"@{listed}"], limit_s)
+        if done.returncode in (0, 5):  # 5: there was no test
+            return None
+        failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.M)
+        return LIMIT if done.returncode == -1 else failed[1] if failed else f"exit code {done.returncode}"
+
+
+def _end_group(process: subprocess.Popen) -> None:
+    """End a run and the servers that it left behind."""
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def judged(mutant: Mutant, copy: Copy, coverage: Coverage, limit_s: float) -> dict[str, Any]:
+    """Apply a mutant, run its tests, and take it back."""
+    path = copy.folder / mutant.file
+    source, times = path.read_bytes(), path.stat()
+    begun, failed = time.monotonic(), None
+    try:
+        path.write_bytes(mutant.applied(source))
+        for tests in stages(mutant, coverage, copy.folder):
+            left_s = limit_s - (time.monotonic() - begun)
+            failed = copy.first_failure(tests, max(left_s, 1)) if tests else None
+            if failed:
+                break
+    finally:
+        path.write_bytes(source)
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # compiled kernels are found by it
+    flaky = failed is not None and "::" in failed and copy.first_failure([failed], limit_s) == failed
+    return {
+        **{name: getattr(mutant, name) for name in ("file", "line", "column", "kind", "before", "after")},
+        "noticed": failed not in (None, LIMIT) and not flaky,
+        "by": failed,
+        "flaky": flaky,
+        "covered": bool(coverage.tests(mutant)),
+        "seconds": round(time.monotonic() - begun, 1),
+        "equivalent": None,
+    }
+
+
+# ------------------------------------------------------------------ the run
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--limit-s", type=float, default=600)
+    asked = parser.parse_args()
+    written = [json.loads(line) for line in asked.out.read_text().splitlines()] if asked.out.exists() else []
+    done = {tuple(row[name] for name in ("file", "line", "column", "before", "after")) for row in written}
+    todo = [mutant for mutant in drawn(ROOT, asked.count, asked.seed) if mutant.key not in done]
+    with tempfile.TemporaryDirectory() as folder, asked.out.open("a") as out:
+        copies: queue.SimpleQueue[Copy] = queue.SimpleQueue()
+        for i in range(asked.workers):
+            copies.put(Copy.make(Path(folder, str(i))))
+        contexts = asked.out.with_suffix(".coverage")
+        if not contexts.exists():
+            measured(Copy.make(Path(folder, "measured")), contexts)
+        coverage = Coverage.read(contexts)
+
+        def judge(mutant: Mutant) -> None:
+            copy = copies.get()
+            try:
+                row = judged(mutant, copy, coverage, asked.limit_s)
+            finally:
+                copies.put(copy)
+            written.append(row)
+            out.write(json.dumps(row) + "\n")
+            out.flush()
+
+        with ThreadPoolExecutor(asked.workers) as pool:
+            for judging in [pool.submit(judge, mutant) for mutant in todo]:
+                judging.result()
+    counted = [row for row in written if not row["equivalent"]]
+    missed = [f"{row['file']}:{row['line']} {row['before']} -> {row['after']}" for row in counted if not row["noticed"]]
+    print(json.dumps({"mutants": len(counted), "noticed": len(counted) - len(missed), "missed": missed}, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,72 @@
+"""The faults of mutations.py are faults: each changes what a function of the test's own computes."""
+
+from __future__ import annotations
+
+import pytest
+from api_server import ROOT
+from mutations import KINDS, mutants_of
+
+SOURCE = b'''"""A module \xe2\x80\x94 not all of it is ASCII."""
+from __future__ import annotations
+import logging
+LIMIT = -3
+log = logging.getLogger(__name__)
+
+class Config:
+    ratio: float | None = 0.8
+
+def weighed(values: list[int], seen: list[int], top: int = 5, *, exact: bool = False) -> float:
+    """1 < 2 and 3 + 4"""
+    total = 0.0
+    for value in values:
+        if value > LIMIT and not (exact or value == 2) and value < top:
+            seen.append(value)
+        log.info("a + b")
+        total = total + value * 2
+    return total - len(seen) // 2 if seen is not None else f"{1 + 2}"
+'''
+
+
+def compute(source: bytes) -> list[object]:
+    namespace = {"__name__": "toy"}
+    exec(compile(source, "toy", "exec"), namespace)
+    found = [namespace["Config"].ratio]
+    for values in ([1, 2, 3], [-3, 4], [9, 1], [-6, -5, 0, 5, 8], [-7, 0, 1]):
+        for options in ({}, {"exact": True}):
+            seen = []
+            try:
+                found.append((namespace["weighed"](values, seen, **options), seen))
+            except (TypeError, ZeroDivisionError) as error:
+                found.append(repr(error))
+    return found
+
+
+MUTANTS = mutants_of("toy.py", SOURCE)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: f"{m.line}-{m.before[:20]}-{m.after[:20]}")
+def test_a_mutant_computes_something_else(mutant):
+    changed = mutant.applied(SOURCE)
+    assert len(changed) - len(SOURCE) == len(mutant.after) - len(mutant.before)
+    assert compute(changed) != compute(SOURCE)
+
+
+def test_every_kind_is_there_and_nothing_that_no_test_could_notice():
+    assert {mutant.kind for mutant in MUTANTS} == set(KINDS)
+    changes = {(mutant.before, mutant.after) for mutant in MUTANTS}
+    assert {("0.8", "1.6"), ("3", "6"), ("5", "10"), ("seen.append(value)", "pass")} <= changes
+    assert ("value > LIMIT", "(value >= LIMIT)") in changes
+    assert ("value * 2", "(value / 2)") in changes
+    assert ("not (exact or value == 2)", "(exact or value == 2)") in changes
+    texts = " ".join(before for before, _ in changes)
+    assert "log.info" not in texts
+    assert "1 + 2" not in texts
+    assert "None = " not in texts
+
+
+def test_every_mutant_of_the_packages_is_python_again():
+    paths = sorted(path for folder in ("service", "viewer") for path in (ROOT / folder).rglob("*.py"))
+    for path in paths[::7]:
+        source = path.read_bytes()
+        for mutant in mutants_of(path.name, source)[::5]:
+            compile(mutant.applied(source), str(path), "exec")
