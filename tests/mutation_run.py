@@ -89,10 +89,19 @@ class Coverage:
         return {test.split("::")[0] for tests in contexts for test in tests if test}
 
 
-def measured(copy: Copy, file: Path) -> None:
+def measured(copy: Copy, workers: int, file: Path) -> None:
     """Run all tests once and write which of them run which line."""
     file.unlink(missing_ok=True)
-    command = ["-n", "2", "--dist", "loadfile", "--cov=service", "--cov=viewer", "--cov-context=test", "--cov-report="]
+    command = [
+        "-n",
+        str(workers),
+        "--dist",
+        "loadfile",
+        "--cov=service",
+        "--cov=viewer",
+        "--cov-context=test",
+        "--cov-report=",
+    ]
     done = copy.pytest(command, 3600, COVERAGE_FILE=str(file.absolute()))
     if done.returncode != 0:
         file.unlink(missing_ok=True)
@@ -136,17 +145,24 @@ class Copy:
         folder.mkdir()
         archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout
         subprocess.run(["tar", "-x"], cwd=folder, input=archive, check=True)
-        return cls(folder)
+        copy = cls(folder)
+        warm = [sys.executable, "-m", "service", "doctor", "--warm"]
+        subprocess.run(warm, cwd=folder, env=copy.environment, check=True, stdout=subprocess.DEVNULL)
+        return copy
+
+    @property
+    def environment(self) -> dict[str, str]:
+        return os.environ | {"SPLATFIX_CACHE_DIR": str(self.folder / ".cache"), "PYTHONPATH": str(self.folder)}
 
     def pytest(self, arguments: Sequence[str], limit_s: float, **environment: str) -> subprocess.CompletedProcess[str]:
-        """Run tests; what takes longer has return code -1."""
-        cache = {"SPLATFIX_CACHE_DIR": str(self.folder / ".cache"), "PYTHONPATH": str(self.folder)}
-        command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", *arguments]
+        """Run tests; what takes longer has return code -1. A test may have to compile changed kernels first."""
+        options = ["-p", "no:cacheprovider", "--timeout=240"]
+        command = [sys.executable, "-m", "pytest", *options, *arguments]
         with tempfile.TemporaryFile("w+") as output:
             process = subprocess.Popen(
                 command,
                 cwd=self.folder,
-                env=os.environ | cache | environment,
+                env=self.environment | environment,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
@@ -208,6 +224,35 @@ def judged(mutant: Mutant, copy: Copy, coverage: Coverage, limit_s: float) -> di
 # ------------------------------------------------------------------ the run
 
 
+def judge_all(todo: Sequence[Mutant], workers: int, limit_s: float, out: Path) -> None:
+    """Judge mutants, several at a time, and add their lines to the output."""
+    with tempfile.TemporaryDirectory() as folder, out.open("a") as lines, ThreadPoolExecutor(workers) as pool:
+        copies = list(pool.map(Copy.make, [Path(folder, str(i)) for i in range(workers)]))
+        contexts = out.with_suffix(".coverage")
+        if not contexts.exists():
+            measured(copies[0], workers, contexts)
+        coverage = Coverage.read(contexts)
+        idle: queue.SimpleQueue[Copy] = queue.SimpleQueue()
+        for copy in copies:
+            idle.put(copy)
+
+        def judge(mutant: Mutant) -> None:
+            copy = idle.get()
+            try:
+                row = judged(mutant, copy, coverage, limit_s)
+            finally:
+                idle.put(copy)
+            lines.write(json.dumps(row) + "\n")
+            lines.flush()
+
+        for judging in [pool.submit(judge, mutant) for mutant in todo]:
+            judging.result()
+
+
+def rows_of(out: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
@@ -216,32 +261,10 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--limit-s", type=float, default=600)
     asked = parser.parse_args()
-    written = [json.loads(line) for line in asked.out.read_text().splitlines()] if asked.out.exists() else []
-    done = {tuple(row[name] for name in ("file", "line", "column", "before", "after")) for row in written}
+    done = {tuple(row[name] for name in ("file", "line", "column", "before", "after")) for row in rows_of(asked.out)}
     todo = [mutant for mutant in drawn(ROOT, asked.count, asked.seed) if mutant.key not in done]
-    with tempfile.TemporaryDirectory() as folder, asked.out.open("a") as out:
-        copies: queue.SimpleQueue[Copy] = queue.SimpleQueue()
-        for i in range(asked.workers):
-            copies.put(Copy.make(Path(folder, str(i))))
-        contexts = asked.out.with_suffix(".coverage")
-        if not contexts.exists():
-            measured(Copy.make(Path(folder, "measured")), contexts)
-        coverage = Coverage.read(contexts)
-
-        def judge(mutant: Mutant) -> None:
-            copy = copies.get()
-            try:
-                row = judged(mutant, copy, coverage, asked.limit_s)
-            finally:
-                copies.put(copy)
-            written.append(row)
-            out.write(json.dumps(row) + "\n")
-            out.flush()
-
-        with ThreadPoolExecutor(asked.workers) as pool:
-            for judging in [pool.submit(judge, mutant) for mutant in todo]:
-                judging.result()
-    counted = [row for row in written if not row["equivalent"]]
+    judge_all(todo, asked.workers, asked.limit_s, asked.out)
+    counted = [row for row in rows_of(asked.out) if not row["equivalent"]]
     missed = [f"{row['file']}:{row['line']} {row['before']} -> {row['after']}" for row in counted if not row["noticed"]]
     print(json.dumps({"mutants": len(counted), "noticed": len(counted) - len(missed), "missed": missed}, indent=1))
     return 0
