@@ -6,7 +6,10 @@ STUDIO_PYTHON ?= python3.11
 BIN := .venv/bin
 STUDIO_BIN := scenes/studio/.venv/bin
 
-.PHONY: setup demo test lint check studio clean
+# Files are shared out among the cores; a file's tests share their servers.
+PYTEST := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+
+.PHONY: setup demo test coverage newest lint check studio clean
 
 setup: .venv/ready
 
@@ -26,9 +29,16 @@ check: setup
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# Files are shared out among the cores; a file's tests share their servers.
 test: check
-	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+	$(PYTEST)
+
+# The same, and which lines the tests run in their own process: some 30 % slower.
+coverage: check
+	COVERAGE_FILE="$$(mktemp -d)/coverage" $(PYTEST) --cov --cov-report=term:skip-covered
+
+# Some of the tests with the newest versions that the ranges allow.
+newest: setup
+	.ci/newest
 
 lint: setup
 	$(BIN)/ruff check --fix .
