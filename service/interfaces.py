@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 
-from service.results import IterationRecord
-from service.types import Camera, GaussianScene, Query
+from service.results import IterationRecord, Verdict
+from service.types import Camera, GaussianScene, IntrinsicsCorrection, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,37 +146,52 @@ class ImageMatcher(Protocol):
 
 @dataclass(slots=True)
 class RenderTally:
-    """Counts a job's renders: pictures, and gradients as one more each."""
+    """Counts a job's renders, and a gradient as one more."""
 
     count: int = 0
 
 
+Prepared = TypeVar("Prepared", covariant=True)
+
+
 @dataclass(frozen=True, slots=True)
-class Tools:
-    """What an estimator works with; bound to one scene and one job."""
+class Tools(Generic[Prepared]):
+    """What an estimator works with, for one scene and one job. `Prepared` is what its `prepare` returns."""
 
     scene: GaussianScene
     rasterizer: Rasterizer
     matcher: Matcher
     rng: np.random.Generator
     """Seeded by the job's seed: the only source of randomness."""
-    prepared: Any = None
-    """What the estimator's own `prepare` made for this scene, shared by all jobs; None if it has none."""
-    memo: dict[Any, Any] = field(default_factory=dict)
-    """What one part of the job computed and another wants too (the photo's features, the last render): a cache
-    of this job alone; it never changes a result's meaning."""
+    prepared: Prepared
+    """What the estimator's own `prepare` made for this scene, shared by all jobs; None if it has none, and while it
+    prepares."""
     image_matcher: ImageMatcher | None = None
     """In the place of `matcher` for methods that match renders with the photo; those that need features refuse."""
     tally: RenderTally = field(default_factory=RenderTally)
     """Of `rasterizer`; an estimator that renders with another one wraps it with `counted`, too."""
 
 
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What an estimator returns when it has come to an end by itself."""
+
+    pose: Pose
+    correction: IntrinsicsCorrection
+    """Of the query's intrinsics."""
+    verdict: Verdict
+    """The verification gate's on this pose and these intrinsics."""
+
+
 @runtime_checkable
 class Estimator(Protocol):
-    """A plain generator function satisfies it. The last record's pose is the answer.
+    """A plain generator function satisfies it: it yields records, and the last record's pose is the answer.
 
-    It yields at least one record; long stages yield per hypothesis, so that budget and cancel take effect. It
-    never prints, never sees the truth, and cleans up in `finally`.
+    It yields at least one record; long stages yield per hypothesis, so that budget and cancel take effect. An estimator
+    that has verified its answer returns it with the verdict; of others, and of those cut short, the driver renders and
+    verifies the last record's pose. It never prints, never sees the truth, and cleans up in `finally`.
     """
 
-    def __call__(self, query: Query, tools: Tools, options: Any) -> Iterator[IterationRecord]: ...
+    def __call__(
+        self, query: Query, tools: Tools[Any], options: Any
+    ) -> Generator[IterationRecord, None, Answer | None]: ...

@@ -1,8 +1,8 @@
-"""Read this first: a photo and a scene go in, a pose with its trace and its verdict comes out.
+"""Read this first: from a photo and a scene to a pose with its trace and verdict.
 
-This is the composition root: the one place where names become objects. It holds the driver that runs every
-estimator: it owns the clock, the budget and the cancel flag, stamps the records, and puts the same verification
-gate behind every method. Jobs, CLI, bench and tests call `localize`; nothing else iterates an estimator.
+This is the composition root, where names of plug-ins become objects. Its driver runs every estimator: it holds the
+clock, the budget and the cancel flag, stamps the records, and applies the same verification gate to every method. Jobs,
+CLI, bench and tests call `localize`; nothing else iterates an estimator.
 
     from service.localize import LoadedScene, localize
     from service.photos.images import read_query
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,15 +25,17 @@ import numpy as np
 
 from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
-from service.interfaces import ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
+from service.interfaces import Answer, ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
-from service.pose.verification.gate import LOCALIZED, doubted, verify
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import ViewRenderer
+from service.pose.verification.gate import VERIFICATION, downgraded, verify
 from service.render import RASTERIZERS
 from service.render.counted import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
-from service.types import GaussianScene, Query
+from service.types import GaussianScene, Pose, Query
 
 DEFAULT_ESTIMATOR = "view_index"
 RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
@@ -110,7 +112,7 @@ class LoadedScene:
             return None
         with self._lock:
             if estimator not in self._prepared:
-                tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0))
+                tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0), None)
                 self._prepared[estimator] = make(tools, self.cache_dir)
                 release(self.scene)
             return self._prepared[estimator]
@@ -154,6 +156,8 @@ class Request:
     budget_renders: int | None = None
     """Renders after which it is; a step that was begun is finished. A measure that no other load disturbs."""
     cancel: threading.Event | None = None
+    config: Any = None
+    """The estimator's tuning, for benches; None: its default."""
 
 
 def localize(
@@ -177,25 +181,66 @@ def localize(
         image_matcher=loaded.image_matcher,
         tally=tally,
     )
+    tuning = {} if request.config is None else {"config": request.config}
     clock = Clock()
-    records: list[IterationRecord] = []
-    exhausted = False
-    with closing(plugin.run(query, tools, options)) as steps:
-        for record in _driven(steps, clock, request.cancel):
-            records.append(record)
-            if on_record:
-                on_record(record)
-            exhausted = _exhausted(request, clock, tally)
-            if exhausted:
-                break
-    if not records:
+    trace = _Trace(clock, on_record)
+    with closing(plugin.run(query, tools, options, **tuning)) as steps:
+        answer = _drive(steps, trace, request, tally)
+    if not trace.records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
-    renders = tally.count
-    query = query.corrected(records[-1].lens)
-    verdict = _qualified(verify(query, records[-1].pose, tools), records[-1], exhausted)
-    return estimate_of(
-        query, loaded, request, verdict, records, timings=_timings(records, clock), renders=renders, exhausted=exhausted
+    renders, last = tally.count, trace.records[-1]
+    query = query.corrected(last.correction)
+    verdict = (
+        answer.verdict if answer else render_and_verify(QueryImages(query, loaded.matcher), last.pose, tools.rasterizer)
     )
+    verdict = _qualified(verdict, last, trace.exhausted)
+    timings = _timings(trace.records, clock)
+    return estimate_of(
+        query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
+    )
+
+
+@dataclass(slots=True)
+class _Trace:
+    """The records of a job so far."""
+
+    clock: Clock
+    on_record: Callable[[IterationRecord], None] | None
+    records: list[IterationRecord] = field(default_factory=list)
+    exhausted: bool = False
+    """The budget ended before the estimator."""
+
+    def add(self, record: IterationRecord) -> None:
+        """Number, stamp, keep and report a record."""
+        index, wall_s, cpu_s = len(self.records), self.clock.wall_s, self.clock.cpu_s
+        self.records.append(replace(record, index=index, elapsed_s=wall_s, cpu_s=cpu_s))
+        if self.on_record:
+            self.on_record(self.records[-1])
+
+
+def _drive(
+    steps: Generator[IterationRecord, None, Answer | None], trace: _Trace, request: Request, tally: RenderTally
+) -> Answer | None:
+    """Run an estimator until it ends, or its budget does; return its answer in the first case.
+
+    Raises Cancelled between two records after the request's cancel flag was set.
+    """
+    while True:
+        try:
+            record = next(steps)
+        except StopIteration as end:
+            return end.value
+        if request.cancel is not None and request.cancel.is_set():
+            raise Cancelled
+        trace.add(record)
+        trace.exhausted = _exhausted(request, trace.clock, tally)
+        if trace.exhausted:
+            return None
+
+
+def render_and_verify(images: QueryImages, pose: Pose, rasterizer: Rasterizer) -> Verdict:
+    """Return the gate's verdict on a pose, from a render made for that."""
+    return verify(images, pose, ViewRenderer(rasterizer).at(images.query, pose))
 
 
 def estimate_of(
@@ -209,7 +254,7 @@ def estimate_of(
     renders: int,
     exhausted: bool = False,
 ) -> PoseEstimate:
-    """Put an estimate together; the last record's pose is the answer, the query has the lens that goes with it."""
+    """Return the estimate; the last record's pose is the answer, the query has the intrinsics that belong to it."""
     info = loaded.scene.info
     return PoseEstimate(
         pose=records[-1].pose,
@@ -231,7 +276,7 @@ def estimate_of(
 
 
 def _require_matching(estimator: str, loaded: LoadedScene) -> None:
-    """Raise InvalidOptions where a method would have to match with another matcher than the one asked for."""
+    """Raise InvalidOptions where the method can't use the image matcher that was requested."""
     if loaded.image_matcher and not getattr(ESTIMATORS.load(estimator), "MATCHES_IMAGES", False):
         raise InvalidOptions(
             f"'{loaded.image_matcher.name}' has no features of one image, which '{estimator}' needs.",
@@ -275,25 +320,15 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
 
 
 def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verdict:
-    """Put on record what the gate can't see in the render: a mirrored photo, other answers, too small a budget."""
+    """Return the verdict with what a render doesn't show: a mirrored photo, other answers, too small a budget."""
     if last.mirrored:
-        return replace(doubted(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
-    share = 1.0 if last.rivals is None else 1.0 - float(last.rivals.scores.sum())
-    if share < LOCALIZED:
-        return doubted(verdict, Reason.AMBIGUOUS, share * verdict.score)
+        return replace(downgraded(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
+    share = 1.0 if last.alternatives is None else 1.0 - float(last.alternatives.scores.sum())
+    if share < VERIFICATION.min_localized:
+        return downgraded(verdict, Reason.AMBIGUOUS, share * verdict.score)
     if exhausted and verdict.status is not Status.LOCALIZED:
         return replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
     return verdict
-
-
-def _driven(
-    steps: Iterator[IterationRecord], clock: Clock, cancel: threading.Event | None
-) -> Iterator[IterationRecord]:
-    """Number and stamp the records; stop between two of them when cancelled."""
-    for index, record in enumerate(steps):
-        if cancel is not None and cancel.is_set():
-            raise Cancelled
-        yield replace(record, index=index, elapsed_s=clock.wall_s, cpu_s=clock.cpu_s)
 
 
 class Clock:
@@ -312,7 +347,7 @@ class Clock:
 
 
 def _timings(records: list[IterationRecord], clock: Clock) -> tuple[StageTiming, ...]:
-    """Time by stage: a record's stage is charged with the time since the record before; the rest is the gate's."""
+    """Time by stage: a record's stage is charged with the time since the record before; the rest is verification's."""
     spent: dict[str, list[float]] = {}
     wall = cpu = 0.0
     for record in records:

@@ -1,4 +1,4 @@
-"""What an estimator tells: a record of each step, the gate's verdict, and the answer with both.
+"""Results: a record of each step of an estimator, the gate's verdict, and the answer with both.
 
 Frozen, slotted, arrays really read-only, as everything in `service/types.py`, which has the conventions.
 """
@@ -18,7 +18,7 @@ from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrectio
 
 @dataclass(frozen=True, slots=True)
 class MatchVectors:
-    """Matches between the photo and a render, for looking at; at most 300."""
+    """Matches between the photo and a render, for display; at most 300."""
 
     photo_px: Float32[np.ndarray, "m 2"]
     """In pixels of `Query.rgb`."""
@@ -49,7 +49,7 @@ class MatchVectors:
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Poses that a stage weighed against one another."""
+    """Poses that a stage compared."""
 
     world_from_camera: Float64[np.ndarray, "k 4 4"]
     scores: Float64[np.ndarray, "k"]
@@ -58,24 +58,25 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True)
 class IterationRecord:
-    """One line of the trace: what an estimator knows after a step. Small, no images."""
+    """One line of the trace: an estimator's answer after a step. Small, without images."""
 
     stage: str
     pose: Pose
-    """The answer that the estimator would give if it were stopped here: best so far."""
-    lens: IntrinsicsCorrection = NO_CORRECTION
-    """What goes with the pose; other than the default only where the photo's intrinsics are approximate."""
+    """The answer if the estimator is stopped here: the best pose so far."""
+    correction: IntrinsicsCorrection = NO_CORRECTION
+    """Of the intrinsics, belongs to the pose; other than the default only where they are approximate."""
     loss: float | None = None
     """The stage's own objective; comparable within a stage only."""
     num_matches: int | None = None
     num_inliers: int | None = None
     step_deg: float | None = None
-    """How far the pose turned in this step."""
+    """By how much the pose rotated in this step."""
     step_units: float | None = None
     matches: MatchVectors | None = None
     candidates: Candidates | None = None
-    rivals: Candidates | None = None
-    """Other answers that the gate accepts too, most probable first; scores are probabilities, the pose has the rest."""
+    alternatives: Candidates | None = None
+    """Other poses that the gate accepts, too, most probable first; scores are probabilities, the record's own pose has
+    the rest."""
     mirrored: bool = False
     """The photo's mirror image fits the scene better."""
     index: int = 0
@@ -149,13 +150,13 @@ HINTS: dict[Reason, str] = {
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the verification gate says of a pose."""
+    """The verification gate's decision on a pose."""
 
     status: Status
     reason: Reason
     score: float
     """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
-    every estimator; at most 0.5 where the lens is in doubt. At least 0.8 is `localized`."""
+    every estimator; at most 0.5 where the intrinsics or the position are in doubt. At least 0.8 is `localized`."""
     inliers: int
     """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
     photo of a sequence that its alignment alone makes clear."""
@@ -170,7 +171,7 @@ class Verdict:
     focal_sigma: float = 0.0
     """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
     signals: Mapping[str, float] = field(default_factory=dict)
-    """All that the gate measured, by name; `service/pose/verification/gate.py` says what each is."""
+    """All signals that the gate measured, by name; `service/pose/verification/gate.py` describes them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,7 +183,7 @@ class StageTiming:
 
 @dataclass(frozen=True, slots=True)
 class PoseEstimate:
-    """A finished localization: the answer, what it rests on, and how it came about."""
+    """A finished localization: the answer, the evidence for it, and its trace."""
 
     pose: Pose
     verdict: Verdict
@@ -197,17 +198,17 @@ class PoseEstimate:
     seed: int
     budget_exhausted: bool
     renders: int
-    """Pictures that the estimator rendered, and gradients as one more each; the gate's own not counted."""
+    """Renders of the estimator, a gradient counted as one more; those of a verification after it are not counted."""
     timings: tuple[StageTiming, ...]
     warnings: tuple[str, ...]
     records: tuple[IterationRecord, ...]
     considered: tuple[tuple[str, int], ...] = ()
-    """Where the photo was looked for in several scenes: each one's id, and how many matches agreed, best first."""
+    """Where several scenes were searched: each one's id, and how many matches agreed, best first."""
 
     @property
     def alternatives(self) -> tuple[tuple[Pose, float], ...]:
         """Other poses that explain the photo, too, and how probable each is, most probable first."""
-        rivals = self.records[-1].rivals if self.records else None
-        if rivals is None:
+        others = self.records[-1].alternatives if self.records else None
+        if others is None:
             return ()
-        return tuple(zip(map(Pose, rivals.world_from_camera), map(float, rivals.scores), strict=True))
+        return tuple(zip(map(Pose, others.world_from_camera), map(float, others.scores), strict=True))

@@ -1,10 +1,10 @@
-"""Follow one camera through a scene: several photos, or a video's frames, one after the other.
+"""Tracking: the trajectory of one camera through a scene, from several photos or a video's frames in their order.
 
-    last pose, carried on at constant velocity -> align with the last render -> render there, align again -> glance
-    in doubt: the verification gate -> if that doubts, too: `localize`, as for a single photo
+    last pose, extrapolated at constant velocity -> refine on the last render -> render there, refine again
+    -> photometric verification; in doubt the whole verification gate; if that refuses, too: `localize`, as a photo
 
-A photo costs one small render where the motion is smooth, and each is aligned with the scene itself: errors don't add
-up. What several photos tell of their lens is put together, so that it needn't be known.
+A photo costs one small render where the motion is smooth. Each is refined against the scene itself, so that errors
+don't accumulate. The photos share one camera: an approximate focal length becomes more certain with each.
 
     from service.tracking import Tracker
     tracker = Tracker(scene)
@@ -21,37 +21,59 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from service.geometry import moved, pose_distance, se3_log
-from service.interfaces import Frame, RenderTally, Tools
-from service.localize import Cancelled, Clock, LoadedScene, Request, estimate_of, localize, rasterizer_for
+from service.interfaces import Frame, Rasterizer, RenderTally
+from service.localize import (
+    Cancelled,
+    Clock,
+    LoadedScene,
+    Request,
+    estimate_of,
+    localize,
+    rasterizer_for,
+    render_and_verify,
+)
 from service.photos.sequence import SequencePhoto
 from service.pose.features.image_sizes import sized
-from service.pose.features.views import known_at, photo_at
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import RenderedView, ViewRenderer
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import appearance
-from service.pose.verification.gate import clear, geometry_signals, judged, verify
+from service.pose.verification.gate import VERIFICATION, VerificationConfig, judge, photometric_suffices
+from service.pose.verification.signals import geometry_signals
 from service.render.counted import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose, Query
 
-TRACK_PX = 256
-"""Long side of the renders that are aligned with."""
-LEVELS = 3
-ROUNDS = 3
-"""Renders to align with, at most."""
-SETTLED_PX = 0.5
-"""Where alignment moved what is seen by less, another render would be the same."""
-GATE_EVERY = 30
-"""Photos after which the gate is asked all the same."""
-LONGEST_STEP = 2.0
-"""Intervals over which a velocity is believed."""
-LENS_TURN_DEG, LENS_SHARE = 3.0, 0.03
-"""Photos that see the scene from nearby err alike: the lens is estimated again only after such a turn, or such a way
-(share of the distance to what is seen)."""
-LENS_SETTLED = 0.002
-"""Standard deviation of the focal length's logarithm from which on the lens is left as it is."""
-OF_THE_LENS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
-"""Doubts about the lens, not about the place: no reason to look elsewhere."""
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """How a camera is followed."""
+
+    render_px: int = 256
+    """Long side of the renders that are refined on."""
+    levels: int = 3
+    """Of the image pyramid, on the last render."""
+    max_renders: int = 3
+    """To refine on, for one photo."""
+    settled_px: float = 0.5
+    """Where a step moved the image by less, another render would be the same."""
+    verify_every: int = 30
+    """Photos after which the whole gate verifies one, whatever the pixels say."""
+    max_intervals: float = 2.0
+    """Intervals between photos over which a velocity is extrapolated."""
+    new_view_deg: float = 3.0
+    new_view_share: float = 0.03
+    """The intrinsics are estimated again only after such a rotation, or such a way (share of the distance to what is
+    seen): photos that see the scene from nearly the same place err alike."""
+    settled_focal_sigma: float = 0.002
+    """Standard deviation of the focal length's logarithm from which on the intrinsics are kept."""
+    verification: VerificationConfig = VERIFICATION
+
+
+TRACKING = TrackingConfig()
+INTRINSICS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
+"""Doubts about the intrinsics, not about the pose: no reason to search elsewhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +83,7 @@ class SequencePose:
     photo: SequencePhoto
     estimate: PoseEstimate
     exhausted: bool
-    """The budget is spent: this was the last photo that was looked at."""
+    """The budget is spent: this was the last photo that was localized."""
 
 
 def localize_sequence(
@@ -80,16 +102,17 @@ def localize_sequence(
 
 
 class Tracker:
-    """One camera on its way; its photos come in the order in which they were taken. For one thread."""
+    """Follows one camera; its photos come in the order in which they were taken. For one thread."""
 
-    def __init__(self, loaded: LoadedScene, request: Request | None = None) -> None:
-        """The request says how to localize what can't be followed; its budget is for all photos together."""
-        self._loaded, self._request = loaded, request or Request()
+    def __init__(self, loaded: LoadedScene, request: Request | None = None, config: TrackingConfig = TRACKING) -> None:
+        """The request says how to localize where tracking fails; its budget is for all photos together."""
+        self._loaded, self._request, self._config = loaded, request or Request(), config
         self._clock, self._renders, self._unverified = Clock(), 0, 0
-        self._lens = _SharedLens()
+        self._intrinsics = _SharedIntrinsics(config)
         self._past: deque[tuple[float, Pose]] = deque(maxlen=2)
         """When and where the camera was last; empty while it is lost."""
-        self._seen: _Seen | None = None
+        self._rendered: RenderedView | None = None
+        """The last render."""
 
     @property
     def exhausted(self) -> bool:
@@ -99,17 +122,17 @@ class Tracker:
     def track(self, query: Query, time_s: float | None = None) -> PoseEstimate:
         """Return where the next photo was taken; without times, photos come at equal intervals.
 
-        The photos' intrinsics are one camera's: what one of them tells of an approximate lens holds for the next.
-        Raises what `localize` raises.
+        The photos' intrinsics are one camera's: what one of them adds to an approximate focal length holds for the
+        next. Raises what `localize` raises.
         """
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled
         if time_s is None:
             time_s = self._past[-1][0] + 1.0 if self._past else 0.0
-        told, expected = self._lens.told(query), self._expected(time_s)
-        estimate = self._followed(told, expected) if expected else None
-        if estimate is None or not _placed(estimate.verdict):
-            estimate = self._searched(told, expected, estimate)
+        shared, expected = self._intrinsics.applied_to(query), self._expected(time_s)
+        estimate = self._followed(shared, expected) if expected else None
+        if estimate is None or not _is_placed(estimate.verdict):
+            estimate = self._localized(shared, expected, estimate)
         self._renders += estimate.renders
         if estimate.verdict.status is Status.NOT_LOCALIZED or estimate.verdict.reason is Reason.AMBIGUOUS:
             self._past.clear()
@@ -126,40 +149,39 @@ class Tracker:
         )
 
     def _expected(self, time_s: float) -> Pose | None:
-        """Return where the camera should be by now; None while it is lost."""
+        """Return the pose extrapolated to this time; None while the camera is lost."""
         if len(self._past) < 2:
             return self._past[-1][1] if self._past else None
         (before_s, before), (last_s, last) = self._past
         intervals = (time_s - last_s) / max(last_s - before_s, 1e-9)
         motion = se3_log(before.camera_from_world @ last.world_from_camera)
-        return moved(last, motion * float(np.clip(intervals, 0.0, LONGEST_STEP)))
+        return moved(last, motion * float(np.clip(intervals, 0.0, self._config.max_intervals)))
 
     def _followed(self, query: Query, expected: Pose) -> PoseEstimate | None:
-        """Align the photo and judge the answer; None where it can't be aligned."""
+        """Refine from the expected pose and verify the result; None where the photo can't be refined."""
         clock, tally = Clock(), RenderTally()
-        rng = np.random.default_rng(self._request.seed)
         rasterizer = Counted(rasterizer_for(query, self._loaded), tally)
-        tools = Tools(self._loaded.scene, rasterizer, self._loaded.matcher, rng, tally=tally)
-        found = aligned_from(query, expected, self._seen, tools)
+        images = QueryImages(query, self._loaded.matcher)
+        found = refine_from(images, expected, self._rendered, rasterizer, self._config)
         if found is None:
             return None
-        self._seen = found.seen
-        verdict = glance(query, found, tools)
+        self._rendered = found.rendered
+        verdict = verify_tracked(images, found, self._config.verification)
         timings = [StageTiming("track", clock.wall_s, clock.cpu_s)]
         renders = tally.count
         self._unverified += 1
-        if verdict is None or self._unverified >= GATE_EVERY:
-            verdict, self._unverified = verify(query, found.pose, tools), 0
+        if verdict is None or self._unverified >= self._config.verify_every:
+            verdict, self._unverified = render_and_verify(images, found.pose, rasterizer), 0
             timings.append(StageTiming("verify", clock.wall_s - timings[0].wall_s, clock.cpu_s - timings[0].cpu_s))
         step_deg, step_units = pose_distance(self._past[-1][1], found.pose)
-        lens = self._lens.lens
-        record = IterationRecord("track", found.pose, lens, found.loss, step_deg=step_deg, step_units=step_units)
-        if _placed(verdict):
-            self._lens.learn(query, found, tools)
+        correction = self._intrinsics.correction
+        record = IterationRecord("track", found.pose, correction, found.loss, step_deg=step_deg, step_units=step_units)
+        if _is_placed(verdict):
+            self._intrinsics.update(images, found)
         return estimate_of(query, self._loaded, self._request, verdict, [record], timings=timings, renders=renders)
 
-    def _searched(self, query: Query, expected: Pose | None, followed: PoseEstimate | None) -> PoseEstimate:
-        """Localize the photo like a single one, beginning where it was expected; return the better answer."""
+    def _localized(self, query: Query, expected: Pose | None, followed: PoseEstimate | None) -> PoseEstimate:
+        """Localize the photo like a single one, with the expected pose as prior; return the better answer."""
         seconds, renders = self._left()
         request = replace(self._request, budget_s=seconds, budget_renders=renders)
         found = localize(replace(query, prior=expected or query.prior), self._loaded, request)
@@ -168,120 +190,126 @@ class Tracker:
             if followed.verdict.score >= found.verdict.score:
                 return replace(followed, budget_exhausted=found.budget_exhausted, **spent)
             found = replace(found, **spent)
-        self._past.clear()  # it didn't come here at a known velocity
-        self._seen, self._unverified = None, 0
-        records = tuple(replace(record, lens=self._lens.lens.then(record.lens)) for record in found.records)
-        if query.focal_sigma and _placed(found.verdict):
-            self._lens.found(found.pose, records[-1].lens, found.verdict.focal_sigma)
+        self._past.clear()  # the camera didn't come here at a known velocity
+        self._rendered, self._unverified = None, 0
+        shared = self._intrinsics.correction
+        records = tuple(replace(record, correction=shared.then(record.correction)) for record in found.records)
+        if query.focal_sigma and _is_placed(found.verdict):
+            self._intrinsics.set(found.pose, records[-1].correction, found.verdict.focal_sigma)
         return replace(found, records=records)
 
 
-def _placed(verdict: Verdict) -> bool:
-    """Return whether there is nothing to be looked for elsewhere."""
-    return verdict.status is Status.LOCALIZED or verdict.reason in OF_THE_LENS
+def _is_placed(verdict: Verdict) -> bool:
+    """Return whether there is no reason to search for the photo elsewhere."""
+    return verdict.status is Status.LOCALIZED or verdict.reason in INTRINSICS_DOUBTS
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """What the scene looks like from a place."""
+class TrackedPose:
+    """A pose that refinement from an expected one led to."""
 
-    frame: Frame
-    camera: Camera
-
-    @classmethod
-    def of(cls, camera: Camera, tools: Tools) -> _Seen:
-        return cls(tools.rasterizer.render([camera])[0], camera)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.camera.intrinsics.width, self.camera.intrinsics.height
-
-    @property
-    def typical_depth(self) -> float:
-        depth = self.frame.median_depth[::8, ::8]
-        return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Aligned:
     pose: Pose
-    seen: _Seen
+    rendered: RenderedView
     """From nearby."""
     loss: float
     uncertainty: PoseUncertainty
+    """Before its last step, which is in the pose already."""
 
 
-def aligned_from(query: Query, expected: Pose, seen: _Seen | None, tools: Tools) -> _Aligned | None:
-    """Align with what was seen last, then with the scene as it looks from there; None where too little overlaps."""
-    size = sized(query.intrinsics, TRACK_PX)
-    photo = photo_at(query, tools, size)
-    if seen is None or seen.size != (size.width, size.height):
-        seen = _Seen.of(Camera(size, expected), tools)
-    known = known_at(query, tools, size)
-    first = refine_photometric(photo, seen.frame, seen.camera, Camera(size, expected), LEVELS, valid_mask=known)
+def refine_from(
+    images: QueryImages,
+    expected: Pose,
+    rendered: RenderedView | None,
+    rasterizer: Rasterizer,
+    config: TrackingConfig = TRACKING,
+) -> TrackedPose | None:
+    """Refine from the expected pose on the last render, then on new ones there; None where too little overlaps."""
+    query = images.query
+    size = sized(query.intrinsics, config.render_px)
+    photo, valid = images.resized(size), images.valid_mask(size)
+    renderer = ViewRenderer(rasterizer)
+    if rendered is None or _size(rendered) != (size.width, size.height):
+        rendered = renderer.render(Camera(size, expected))
+    first = refine_photometric(
+        photo, rendered.frame, rendered.camera, Camera(size, expected), config.levels, valid_mask=valid
+    )
     if not np.isfinite(first.loss):
         return None
-    pose, weighed = first.pose, None
-    for _ in range(ROUNDS):
-        seen = _Seen.of(Camera(size, pose), tools)
-        weighed = pose_uncertainty(photo, seen.frame, seen.camera, seen.camera, query.focal_sigma, known)
-        if weighed is None:
+    pose, uncertainty = first.pose, None
+    for _ in range(config.max_renders):
+        rendered = renderer.render(Camera(size, pose))
+        camera = rendered.camera
+        uncertainty = pose_uncertainty(photo, rendered.frame, camera, camera, query.focal_sigma, valid)
+        if uncertainty is None:
             return None
-        pose = moved(pose, weighed.last_step)
-        turn, way = np.linalg.norm(weighed.last_step[:3]), np.linalg.norm(weighed.last_step[3:])
-        if size.fx * (turn + way / seen.typical_depth) < SETTLED_PX:
+        pose = moved(pose, uncertainty.last_step)
+        turn, way = np.linalg.norm(uncertainty.last_step[:3]), np.linalg.norm(uncertainty.last_step[3:])
+        if size.fx * (turn + way / _typical_depth(rendered.frame)) < config.settled_px:
             break
-    return None if weighed is None else _Aligned(pose, seen, first.loss, weighed)
+    return None if uncertainty is None else TrackedPose(pose, rendered, first.loss, uncertainty)
 
 
-def glance(query: Query, found: _Aligned, tools: Tools) -> Verdict | None:
-    """Judge a pose as the gate does, by the pixels alone: matches cost most; None where these don't make it clear."""
-    size = found.seen.camera.intrinsics
-    photo, known = photo_at(query, tools, size), known_at(query, tools, size)
-    signals = appearance(photo, found.seen.frame, known) | geometry_signals(found.seen.frame, size, found.uncertainty)
-    if not clear(signals):
+def _size(rendered: RenderedView) -> tuple[int, int]:
+    return rendered.camera.intrinsics.width, rendered.camera.intrinsics.height
+
+
+def _typical_depth(frame: Frame) -> float:
+    depth = frame.median_depth[::8, ::8]
+    return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+
+
+def verify_tracked(
+    images: QueryImages, found: TrackedPose, config: VerificationConfig = VERIFICATION
+) -> Verdict | None:
+    """Return the gate's verdict by the signals of the pixels alone; None where these don't suffice to accept."""
+    frame, size = found.rendered.frame, found.rendered.camera.intrinsics
+    signals = appearance(images.resized(size), frame, images.valid_mask(size))
+    signals |= geometry_signals(frame, size, found.uncertainty)
+    if not photometric_suffices(signals, config):
         return None
-    # The last pull is in the pose already. A shared lens is not one photo's to doubt.
-    focal_step = 0.0 if query.focal_sigma else found.uncertainty.focal_step
-    return judged(signals, replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step), query.focal_sigma)
+    focal_sigma = images.query.focal_sigma
+    # A shared focal length is not for one photo to doubt.
+    focal_step = 0.0 if focal_sigma else found.uncertainty.focal_step
+    uncertainty = replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step)
+    return judge(signals, uncertainty, focal_sigma, config=config)
 
 
 @dataclass(slots=True)
-class _SharedLens:
-    """What the photos have told of their lens so far: each that sees the scene from elsewhere adds to it."""
+class _SharedIntrinsics:
+    """The intrinsics that the photos so far agree on; each that sees the scene from another place adds to them."""
 
-    lens: IntrinsicsCorrection = NO_CORRECTION
-    """Beside the intrinsics that the photos came with."""
+    config: TrackingConfig
+    correction: IntrinsicsCorrection = NO_CORRECTION
+    """Of the intrinsics that the photos came with."""
     sigma: float | None = None
-    """Standard deviation of the focal length's logarithm; None: no photo has told anything."""
+    """Standard deviation of the focal length's logarithm; None: no photo has added anything."""
     photos: int = 0
     seen_from: Pose | None = None
 
-    def told(self, query: Query) -> Query:
-        """Return the photo with what is known of the lens."""
-        return replace(query.corrected(self.lens), told_focal_sigma=self.sigma)
+    def applied_to(self, query: Query) -> Query:
+        """Return the photo with the intrinsics so far."""
+        return replace(query.corrected(self.correction), shared_focal_sigma=self.sigma)
 
-    def found(self, pose: Pose, lens: IntrinsicsCorrection, sigma: float) -> None:
-        """Take over what a photo by itself has told, beginning with what was known."""
-        self.lens, self.sigma, self.photos, self.seen_from = lens, sigma, self.photos + 1, pose
+    def set(self, pose: Pose, correction: IntrinsicsCorrection, sigma: float) -> None:
+        """Take over an estimate that a photo led to, beginning with the one so far."""
+        self.correction, self.sigma, self.photos, self.seen_from = correction, sigma, self.photos + 1, pose
 
-    def learn(self, query: Query, seen: _Aligned, tools: Tools) -> None:
-        """Estimate the lens with the pose, if that is of use and the photo isn't much like the last one."""
-        if query.focal_sigma <= LENS_SETTLED or self.seen_from is None:
+    def update(self, images: QueryImages, found: TrackedPose) -> None:
+        """Estimate the intrinsics with the pose, if they are uncertain and the photo isn't much like the last one."""
+        config, focal_sigma = self.config, images.query.focal_sigma
+        if focal_sigma <= config.settled_focal_sigma or self.seen_from is None:
             return
-        turn_deg, way = pose_distance(self.seen_from, seen.pose)
-        if turn_deg < LENS_TURN_DEG and way < LENS_SHARE * seen.seen.typical_depth:
+        turn_deg, way = pose_distance(self.seen_from, found.pose)
+        frame, camera = found.rendered.frame, found.rendered.camera
+        if turn_deg < config.new_view_deg and way < config.new_view_share * _typical_depth(frame):
             return
-        camera = seen.seen.camera
-        photo = photo_at(query, tools, camera.intrinsics)
-        start = Camera(camera.intrinsics, seen.pose)
-        known = known_at(query, tools, camera.intrinsics)
-        found = refine_photometric(photo, seen.seen.frame, camera, start, 1, NO_CORRECTION, query.focal_sigma, known)
-        if not np.isfinite(found.loss):
+        photo, valid = images.resized(camera.intrinsics), images.valid_mask(camera.intrinsics)
+        start = Camera(camera.intrinsics, found.pose)
+        result = refine_photometric(photo, frame, camera, start, 1, NO_CORRECTION, focal_sigma, valid)
+        if not np.isfinite(result.loss):
             return
         share = 1 / (self.photos + 1)  # of the principal point, whose mean is taken
-        step = IntrinsicsCorrection(
-            found.correction.focal_factor, share * found.correction.shift_x, share * found.correction.shift_y
-        )
-        sigma = float(np.sqrt(seen.uncertainty.covariance[6, 6]))
-        self.found(found.pose, self.lens.then(step), sigma)
+        new = result.correction
+        step = IntrinsicsCorrection(new.focal_factor, share * new.shift_x, share * new.shift_y)
+        sigma = float(np.sqrt(found.uncertainty.covariance[6, 6]))
+        self.set(result.pose, self.correction.then(step), sigma)

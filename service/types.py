@@ -27,27 +27,27 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsCorrection:
-    """How a camera differs from the intrinsics that were assumed for it."""
+    """What turns assumed intrinsics into the camera's own."""
 
     focal_factor: float = 1.0
     shift_x: float = 0.0
-    """Of the principal point, in long sides of the image: the same at every size."""
+    """Of the principal point, as a share of the image's long side: the same at every size."""
     shift_y: float = 0.0
 
     def then(self, other: IntrinsicsCorrection) -> IntrinsicsCorrection:
-        """Return the difference of a lens that differs by `other` from what this one gives."""
+        """Return this correction followed by another one."""
         return IntrinsicsCorrection(
             self.focal_factor * other.focal_factor, self.shift_x + other.shift_x, self.shift_y + other.shift_y
         )
 
 
 NO_CORRECTION = IntrinsicsCorrection()
-"""No difference."""
+"""The intrinsics are as assumed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """A camera without its place. Refers to the upright image (EXIF orientation applied)."""
+    """A camera without its pose. Refers to the upright image (EXIF orientation applied)."""
 
     width: int
     height: int
@@ -62,7 +62,7 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
     """COLMAP's parameters after the focal lengths and the principal point."""
     trust: Literal["exact", "approximate"] = "exact"
-    """Approximate: the focal length is where the search begins, and is estimated with the pose."""
+    """Approximate: the focal length is an initial value, and is estimated with the pose."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
@@ -94,16 +94,16 @@ class Intrinsics:
             cy=self.cy * sy,
         )
 
-    def corrected(self, lens: IntrinsicsCorrection) -> Intrinsics:
-        """Return the same camera with another focal length and principal point."""
-        if lens == NO_CORRECTION:
+    def corrected(self, correction: IntrinsicsCorrection) -> Intrinsics:
+        """Return the same camera with corrected focal length and principal point."""
+        if correction == NO_CORRECTION:
             return self
         return replace(
             self,
-            fx=self.fx * lens.focal_factor,
-            fy=self.fy * lens.focal_factor,
-            cx=self.cx + lens.shift_x * self.long_side,
-            cy=self.cy + lens.shift_y * self.long_side,
+            fx=self.fx * correction.focal_factor,
+            fy=self.fy * correction.focal_factor,
+            cx=self.cx + correction.shift_x * self.long_side,
+            cy=self.cy + correction.shift_y * self.long_side,
         )
 
     def with_long_side(self, pixels: int) -> Intrinsics:
@@ -114,7 +114,7 @@ class Intrinsics:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where a camera is. World axes are the scene's own; units are scene units."""
+    """The pose of a camera. World axes are the scene's own; units are scene units."""
 
     world_from_camera: Float64[np.ndarray, "4 4"]
 
@@ -283,7 +283,7 @@ class GaussianPosePrior:
 
 
 PriorRegion = BoxPrior | GaussianPosePrior
-"""What is known for certain of where a photo was taken; poses outside are no answers."""
+"""Where the photo was taken for certain; poses outside are refused."""
 
 
 FOCAL_SIGMA = {"given": 0.15, "exif": 0.06, "guessed": 0.5}
@@ -295,42 +295,42 @@ class Query:
     """A photo to localize: upright, undistorted, with a pinhole camera."""
 
     rgb: UInt8[np.ndarray, "h w 3"]
-    """sRGB; decoded no larger than an estimator can use."""
+    """sRGB; decoded no larger than estimators use."""
     intrinsics: Intrinsics
     """Of `rgb`."""
     intrinsics_source: Literal["given", "exif", "guessed"]
     photo_intrinsics: Intrinsics
     """Of the whole upright photo in its own resolution, with its distortion: what results report."""
     prior: Pose | None = None
-    """A guess: one more place to search from, which may be wrong."""
+    """A guess, which may be wrong: one more pose to search from."""
     warnings: tuple[str, ...] = ()
-    known: Bool[np.ndarray, "h w"] | None = None
-    """False where the photo says nothing: transparent, or outside a distorted photo's edge. None: known everywhere."""
-    told_focal_sigma: float | None = None
-    """As `focal_sigma`, where other photos of the camera have told more than the source of the intrinsics does."""
+    valid_mask: Bool[np.ndarray, "h w"] | None = None
+    """False where a pixel shows nothing: transparent, or outside a distorted photo's edge. None: valid everywhere."""
+    shared_focal_sigma: float | None = None
+    """`focal_sigma` after other photos of the same camera were localized; None: there are none."""
     region: PriorRegion | None = None
-    """Where the camera is for certain."""
+    """Poses outside are refused."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
-        if self.known is not None:
-            object.__setattr__(self, "known", frozen(self.known, np.bool_))
+        if self.valid_mask is not None:
+            object.__setattr__(self, "valid_mask", frozen(self.valid_mask, np.bool_))
 
     @property
     def focal_sigma(self) -> float:
-        """Standard deviation of the logarithm of the focal length before the scene was looked at; 0: it is exact."""
+        """Standard deviation of the logarithm of the focal length before localization; 0: it is exact."""
         if self.intrinsics.trust == "exact":
             return 0.0
-        if self.told_focal_sigma is not None:
-            return self.told_focal_sigma
+        if self.shared_focal_sigma is not None:
+            return self.shared_focal_sigma
         return FOCAL_SIGMA[self.intrinsics_source]
 
-    def corrected(self, lens: IntrinsicsCorrection) -> Query:
-        """Return the query with another focal length and principal point."""
-        if lens == NO_CORRECTION:
+    def corrected(self, correction: IntrinsicsCorrection) -> Query:
+        """Return the query with corrected focal length and principal point."""
+        if correction == NO_CORRECTION:
             return self
         return replace(
             self,
-            intrinsics=self.intrinsics.corrected(lens),
-            photo_intrinsics=self.photo_intrinsics.corrected(lens),
+            intrinsics=self.intrinsics.corrected(correction),
+            photo_intrinsics=self.photo_intrinsics.corrected(correction),
         )

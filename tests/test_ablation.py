@@ -1,30 +1,63 @@
-"""The ablation bench: what stands in for a part is there during a run only, and does what its name says."""
+"""The ablation bench: each removal changes the estimator, and leaves the default as it is."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from small_room import write_room
+from test_estimators import LENS_UPRIGHT, photo_at, unseen_pose
 
-from service.bench import ablation
-from service.bench.ablation import CONDITIONS, removals, run, table
+from service.bench.ablation import CONDITIONS, Removal, removals, run, table
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
+from service.localize import LoadedScene, Request, localize
 from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.matching import search_stages as stages
 from service.pose.matching.correspondences import Correspondences
+from service.pose.matching.match_stages import MATCHING, solve_matches_near
+from service.results import PoseEstimate
 from service.types import Intrinsics, Query
 
 LENS = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)
 
 
-@pytest.mark.parametrize("part", removals())
-def test_a_part_is_removed_for_a_run_only(part: str) -> None:
-    patches = removals()[part].patches
-    before = [vars(place)[name] for place, name, _ in patches]
-    with ablation._patched(patches):
-        assert all(vars(place)[name] is stand_in for place, name, stand_in in patches)
-        assert not any(vars(place)[name] is old for (place, name, _), old in zip(patches, before, strict=True))
-    assert all(vars(place)[name] is old for (place, name, _), old in zip(patches, before, strict=True))
+def test_each_part_is_removed_by_another_value() -> None:
+    parts = removals()
+    assert parts.pop("nothing") == Removal()
+    assert all(removal != Removal() for removal in parts.values())
+    assert len({repr(removal) for removal in parts.values()}) == len(parts)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    folder = tmp_path_factory.mktemp("ablation")
+    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+
+
+def without(part: str, room: LoadedScene, query: Query | None = None) -> PoseEstimate:
+    removal = removals()[part]
+    return localize(
+        query or photo_at(room, unseen_pose()), room, Request(options=removal.options, config=removal.config)
+    )
+
+
+def test_what_is_removed_leaves_no_trace(room: LoadedScene) -> None:
+    whole = without("nothing", room)
+    refined = [record.loss for record in whole.records if record.stage == "refine"]
+    assert len(refined) > 1
+    assert None not in refined
+    assert [r.loss for r in without("photometric refinement", room).records if r.stage == "refine"] == [None]
+    single = without("second render of the refinement", room)
+    assert sum(record.stage == "refine" for record in single.records) == 1
+    assert without("small first render", room).renders >= 1
+    # With matches verified, too, the verdict counts those with a render at the pose.
+    assert "inliers" in without("verification by pixels after many matches", room).verdict.signals
+    assert "inliers" not in whole.verdict.signals
+    turned = replace(query := photo_at(room, unseen_pose()), rgb=np.rot90(query.rgb).copy(), intrinsics=LENS_UPRIGHT)
+    assert "retrieve_rotated" in {record.stage for record in without("nothing", room, turned).records}
+    assert "retrieve_rotated" not in {record.stage for record in without("in-plane rotation", room, turned).records}
+    assert "sample_poses" not in {r.stage for r in without("sampled poses (effort fast)", room, turned).records}
 
 
 def test_the_decoupled_solver_and_its_stand_in_find_the_planted_pose_among_wrong_matches() -> None:
@@ -38,8 +71,10 @@ def test_the_decoupled_solver_and_its_stand_in_find_the_planted_pose_among_wrong
     query = Query(
         rgb=np.zeros((384, 512, 3), np.uint8), intrinsics=LENS, photo_intrinsics=LENS, intrinsics_source="given"
     )
-    for solve in (stages.solved_near, ablation._resected_again):
-        found = solve(near, matches, query)
+    without = removals()["decoupled solver (PnP instead)"].config.matching
+    assert without.solver != MATCHING.solver
+    for config in (MATCHING, without):
+        found = solve_matches_near(near, matches, query, config)
         assert found is not None
         degrees, units = pose_distance(found.pose, truth)
         # float32 pixels; seen 1e-5 and 1e-6
@@ -62,5 +97,5 @@ def test_the_table_has_a_line_a_part_and_counts_what_is_false() -> None:
 
 
 def test_an_unknown_part_is_named() -> None:
-    with pytest.raises(UnknownName, match="photo turned"):
+    with pytest.raises(UnknownName, match="in-plane rotation"):
         run([], parts=["wheels"])

@@ -23,7 +23,7 @@ from service.geometry import look_at, moved, pose_distance, project, rotation_fr
 from service.interfaces import Frame
 from service.localize import LoadedScene
 from service.photos.images import encode_image, read_query, with_palette
-from service.pose.retrieval.scene_focus import centre_depth
+from service.pose.features.scene_focus import centre_depth
 from service.results import PoseEstimate, Reason, Status, Verdict
 from service.types import Camera, Intrinsics, Pose
 

@@ -154,7 +154,7 @@ def test_background(background: str, expected: tuple, tmp_path: Path) -> None:
     (trial,) = bench.trials_of(one, "none", 1, 0)
     query = read_query(trial.data, intrinsics=trial.told, background_rgb=one.background_rgb)
     assert np.all(query.rgb == np.array(expected) * 255)  # the pictures are transparent all over
-    assert query.known is None  # that there is nothing is known
+    assert query.valid_mask is None  # that there is nothing is known
 
 
 def test_photos_of_the_size_that_is_used_in_training(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from service.pose.descent.contribution_pruning import contributions, prune
 from service.pose.descent.decoupled_gradient import angle_loss, gradient_solve, length_loss
 from service.pose.descent.hypotheses import around, even_points
 from service.pose.descent.losses import LOSSES, loss_against
-from service.pose.retrieval.scene_focus import Focus, focus_of_scene
+from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 

@@ -14,9 +14,9 @@ from service.pose.descent.contribution_pruning import PruningConfig, prune
 from service.pose.descent.gradient_descent import DescentConfig, Se3, So3T3, descend, require_within
 from service.pose.descent.hypotheses import NearViewConfig, around, poses_near_views
 from service.pose.features.rendered_views import View
+from service.pose.features.scene_focus import Focus
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import epipolar_inliers
-from service.pose.retrieval.scene_focus import Focus
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
 LENS = Intrinsics(512, 384, 500.0, 510.0, 256.0, 192.0)

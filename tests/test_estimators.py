@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import weakref
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +14,18 @@ from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
+from service.estimators.search_state import SEARCH
 from service.geometry import moved, pose_distance
-from service.interfaces import Tools
+from service.interfaces import RenderTally, Tools
 from service.localize import LoadedScene, Request, localize
-from service.multi_scene import localize_anywhere
+from service.multi_scene import localize_in_scenes
 from service.pose.descent.gradient_descent import loss_and_gradient
 from service.pose.descent.losses import LOSSES, loss_against
 from service.pose.features.rendered_views import to_uint8
+from service.pose.retrieval.index import prepared_index
+from service.pose.retrieval.view_placement import PlacementConfig
+from service.pose.retrieval.viewpoints import ViewpointConfig
+from service.render.counted import Counted
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.warm_up import warm_up
 from service.types import Camera, Intrinsics, Pose, Query
@@ -146,21 +152,16 @@ def test_can_be_stopped_at_any_record(estimator: str, room: LoadedScene) -> None
 
 
 def test_closed_it_keeps_nothing_of_the_job(estimator: str, room: LoadedScene) -> None:
-    """Also while the closed generator is still there: `memo` holds photos, features and renders."""
-
-    class Held:
-        pass
-
-    held = Held()
+    """Also while the closed generator is still there: its frame held photos, features and renders."""
     query = photo_at(room, unseen_pose(3), prior=unseen_pose(3))
-    tools = Tools(room.scene, room.rasterizer, room.matcher, np.random.default_rng(0), room.prepare(estimator))
-    tools.memo["held"] = held
+    rasterizer = Counted(room.rasterizer, RenderTally())
+    tools = Tools(room.scene, rasterizer, room.matcher, np.random.default_rng(0), room.prepare(estimator))
     steps = ESTIMATORS.load(estimator).run(query, tools, quick(estimator).options)
     for _ in range(3):
         next(steps, None)
     steps.close()
-    alive = weakref.ref(held)
-    del held, tools
+    alive = weakref.ref(rasterizer)
+    del rasterizer, tools
     gc.collect()
     assert alive() is None
     assert steps is not None
@@ -228,14 +229,12 @@ def test_what_a_small_photo_does_not_show_is_looked_for_in_its_full_size(room: L
     assert not stages & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 
 
-def test_an_alignment_that_does_not_settle_is_followed_by_another_match(
-    room: LoadedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_refinement_that_does_not_settle_is_followed_by_another_match(room: LoadedScene) -> None:
     """Of a photo whose lens is free: here it would settle with some more rounds."""
-    monkeypatch.setattr("service.pose.matching.search_stages.ALIGNMENTS", 1)
+    once = replace(SEARCH, refinement=replace(SEARCH.refinement, max_renders=1))
     photo = photo_at(room, unseen_pose(4))
     lens = replace(photo.intrinsics, fx=1.05 * FOCAL, fy=1.05 * FOCAL, trust="approximate")
-    found = localize(replace(photo, intrinsics=lens, photo_intrinsics=lens), room)
+    found = localize(replace(photo, intrinsics=lens, photo_intrinsics=lens), room, Request(config=once))
     stages = [record.stage for record in found.records]
     assert stages[stages.index("refine") + 1] == "rematch"
     assert_near(found.pose, unseen_pose(4))
@@ -275,25 +274,25 @@ def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, t
     told: list[IterationRecord] = []
     for scenes in ([other, room], [room, other]):
         told.clear()
-        found = localize_anywhere(photo, scenes, on_record=told.append)
+        found = localize_in_scenes(photo, scenes, on_record=told.append)
         assert found.loaded is room
         assert found.estimate.verdict.status is Status.LOCALIZED
         assert_near(found.estimate.pose, unseen_pose())
         assert len(found.estimate.considered) == 2
         assert tuple(told) == found.estimate.records
     noise = np.random.default_rng(0).integers(0, 256, photo.rgb.shape).astype(np.uint8)
-    nowhere = localize_anywhere(replace(photo, rgb=noise), [other, room]).estimate
+    nowhere = localize_in_scenes(replace(photo, rgb=noise), [other, room]).estimate
     assert nowhere.verdict.status is Status.NOT_LOCALIZED
     assert nowhere.pose is not None
     turned = replace(photo, rgb=np.rot90(photo.rgb).copy(), intrinsics=LENS_UPRIGHT)
-    assert localize_anywhere(turned, [other, room]).loaded is room
+    assert localize_in_scenes(turned, [other, room]).loaded is room
 
 
 def test_without_training_cameras_the_room_is_found_from_the_inside(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, count in (("SHELL_CANDIDATES", 20), ("VOLUME_CANDIDATES", 80), ("BEST", 20)):
-        monkeypatch.setattr(f"service.pose.retrieval.view_placement.{name}", count)
+    few = ViewpointConfig(placement=PlacementConfig(shell_candidates=20, volume_candidates=80, best=20))
+    monkeypatch.setattr("service.estimators.view_index.prepared_index", partial(prepared_index, viewpoints=few))
     bare = LoadedScene.of(replace(room.scene, cameras=()))
     half = np.array([2.0, 1.5, 1.25])
     views = bare.prepare(DEFAULT).views
@@ -330,7 +329,7 @@ def test_a_cut_out_of_the_photo_is_found(room: LoadedScene) -> None:
     known = np.ones(query.rgb.shape[:2], bool)
     known[:, : WIDTH // 3] = False
     rgb = np.where(known[..., None], query.rgb, np.uint8(255))
-    found = localize(replace(query, rgb=rgb, known=known), room)
+    found = localize(replace(query, rgb=rgb, valid_mask=known), room)
     assert found.verdict.status is Status.LOCALIZED
     assert_near(found.pose, truth)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from service.bench.gate import GARBAGE, Sample, fitted, garbage, probabilities, summary
-from service.pose.verification.gate import LOCALIZED, SCALES
+from service.bench.gate import GARBAGE, garbage
+from service.bench.gate_fit import Sample, fitted, probabilities, summary
+from service.pose.verification.gate import VERIFICATION
+from service.pose.verification.model import SHIPPED_MODEL
 
 
 def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:
@@ -21,7 +23,9 @@ def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:
 
 
 def sample(scene: str, kind: str, right: bool, level: float, doubted: bool = False) -> Sample:
-    signals = {name: scale.hopeless + level * (scale.certain - scale.hopeless) for name, scale in SCALES.items()}
+    signals = {
+        name: scale.at_zero + level * (scale.at_one - scale.at_zero) for name, scale in SHIPPED_MODEL.scales.items()
+    }
     return Sample(scene, kind, "p", right, signals, doubted, None)
 
 
@@ -33,13 +37,13 @@ def test_counts_are_of_scenes_that_were_left_out() -> None:
         samples += [sample(scene, "moved", False, level) for level in rng.uniform(0.0, 0.3, 60)]
         samples += [sample(scene, "foreign", False, 0.0) for _ in range(20)]
         samples += [sample(scene, "garbage", False, 1.0, doubted=True)]  # a doubt keeps it from being called localized
-    found = summary(samples)["with_matches"]
+    found = summary(samples, SHIPPED_MODEL)["with_matches"]
     assert (found["right"], found["wrong"], found["foreign_or_garbage"]) == (180, 180, 63)
     assert (found["wrong_localized"], found["foreign_or_garbage_localized"]) == (0, 0)
     assert found["right_localized"] > 120
     assert sum(row["count"] for row in found["reliability"]) == len(samples)
     top = found["reliability"][-1]
-    assert LOCALIZED < top["said"] <= 1
+    assert VERIFICATION.min_localized < top["said"] <= 1
     assert found["by_kind"]["clean"]["right"] == 180
 
 

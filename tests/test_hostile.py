@@ -90,8 +90,8 @@ def test_a_photo_is_the_same_in_bands(mode, monkeypatch):
     banded = read_query(file.getvalue(), background_rgb=(0.2, 0.4, 0.6))
     assert np.array_equal(banded.rgb, whole.rgb)
     assert banded.warnings == whole.warnings
-    assert (banded.known is None) == (whole.known is None)
-    assert whole.known is None or np.array_equal(banded.known, whole.known)
+    assert (banded.valid_mask is None) == (whole.valid_mask is None)
+    assert whole.valid_mask is None or np.array_equal(banded.valid_mask, whole.valid_mask)
 
 
 # ------------------------------------------------------------------ scenes

@@ -133,7 +133,7 @@ def test_the_lens_of_the_last_record_is_the_answers(monkeypatch: pytest.MonkeyPa
     class Zoomed(Script):
         def run(self, query, tools, options):
             for record in super().run(query, tools, options):
-                yield replace(record, lens=IntrinsicsCorrection(1.25, 0.01, -0.02))
+                yield replace(record, correction=IntrinsicsCorrection(1.25, 0.01, -0.02))
 
     use(monkeypatch, Zoomed(2))
     found, photo = localize(QUERY, loaded).intrinsics, QUERY.photo_intrinsics

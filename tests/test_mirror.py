@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 from small_room import write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
+from service.estimators.search_state import SEARCH
 from service.geometry import project, transformed
-from service.localize import LoadedScene, localize
-from service.pose.verification.gate import FLOORS
-from service.pose.verification.mirror_images import mirrored
+from service.localize import LoadedScene, Request, localize
+from service.pose.features.mirrored_query import mirrored_query
+from service.pose.verification.model import SHIPPED_MODEL
 from service.results import Reason, Status
 from service.types import BoxPrior, Pose, Query
 
@@ -35,19 +36,20 @@ def test_a_mirrored_photo_of_a_symmetric_room_is_not_localized(seed: int, symmet
     found = localize(photo, symmetric)
     assert found.verdict.status is Status.LOCALIZED
     assert_near(found.pose, truth)
-    found = localize(mirrored(photo), symmetric)
+    found = localize(mirrored_query(photo), symmetric)
     assert found.verdict.status is Status.UNCERTAIN
     assert found.verdict.reason is Reason.MIRRORED
     assert "check_mirror" in [record.stage for record in found.records]
 
 
 def test_a_mirrored_photo_is_told_also_where_the_gate_does_not_believe_it_anyway(
-    symmetric: LoadedScene, monkeypatch: pytest.MonkeyPatch
+    symmetric: LoadedScene,
 ) -> None:
-    monkeypatch.setitem(FLOORS, "colours", 0.992)
+    stricter = replace(SHIPPED_MODEL, floors={**SHIPPED_MODEL.floors, "colours": 0.992})
+    config = replace(SEARCH, verification=replace(SEARCH.verification, model=stricter))
     photo = photo_at(symmetric, unseen_pose())
-    assert localize(photo, symmetric).verdict.status is Status.LOCALIZED
-    verdict = localize(mirrored(photo), symmetric).verdict
+    assert localize(photo, symmetric, Request(config=config)).verdict.status is Status.LOCALIZED
+    verdict = localize(mirrored_query(photo), symmetric, Request(config=config)).verdict
     assert verdict.signals["colours"] < 0.992
     assert (verdict.status, verdict.reason) == (Status.UNCERTAIN, Reason.MIRRORED)
 
@@ -66,7 +68,7 @@ def test_a_region_that_excludes_the_mirrored_place_changes_nothing(symmetric: Lo
     """It is of the photo as it was sent."""
     truth = unseen_pose()
     there = (MIRROR @ truth.world_from_camera @ MIRROR)[:3, 3]
-    query = replace(mirrored(photo_at(symmetric, truth)), region=BoxPrior(there - 0.2, there + 0.2))
+    query = replace(mirrored_query(photo_at(symmetric, truth)), region=BoxPrior(there - 0.2, there + 0.2))
     assert localize(query, symmetric).verdict.reason is Reason.MIRRORED
 
 
@@ -87,7 +89,7 @@ def test_mirroring_moves_what_is_seen_to_the_other_side(seed: int, centre: float
     rng = np.random.default_rng(seed)
     lens = replace(LENS, cx=centre * LENS.width)
     photo = Query(rng.integers(0, 255, (LENS.height, LENS.width, 3)).astype(np.uint8), lens, "given", lens)
-    other = mirrored(photo)
+    other = mirrored_query(photo)
     points = rng.uniform([-1, -1, 2], [1, 1, 4], (5, 3))
     camera_from_world = Pose(np.eye(4)).camera_from_world
     seen = project(transformed(camera_from_world, points), lens)
@@ -95,5 +97,5 @@ def test_mirroring_moves_what_is_seen_to_the_other_side(seed: int, centre: float
     assert np.allclose(there[:, 0], lens.width - seen[:, 0])
     assert np.allclose(there[:, 1], seen[:, 1])
     assert np.array_equal(other.rgb[:, 0], photo.rgb[:, -1])
-    assert np.array_equal(mirrored(other).rgb, photo.rgb)
-    assert mirrored(other).intrinsics.cx == pytest.approx(lens.cx)
+    assert np.array_equal(mirrored_query(other).rgb, photo.rgb)
+    assert mirrored_query(other).intrinsics.cx == pytest.approx(lens.cx)

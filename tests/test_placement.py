@@ -13,25 +13,23 @@ from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
 from service.pose.retrieval.free_space import _steps_in_the_clear
 from service.pose.retrieval.index import built_index
-from service.pose.retrieval.lod_proxy import BEHIND, horizon, thinned
-from service.pose.retrieval.view_placement import coverage, find_views, floaters, search_lens, solidity
+from service.pose.retrieval.lod_proxy import LOD, LodConfig, lod_proxy, occlusion_depths
+from service.pose.retrieval.view_placement import (
+    PlacementConfig,
+    coverage,
+    find_views,
+    floaters,
+    search_camera,
+    solidity,
+)
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
 
 COUNT = 6000
 
 
-@pytest.fixture(autouse=True)
-def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many candidates as these small scenes need."""
-    for name, count in (
-        ("SHELL_CANDIDATES", 12),
-        ("VOLUME_CANDIDATES", 60),
-        ("SIZE_CANDIDATES", 60),
-        ("BEST", 20),
-        ("AT_LEAST", 16),
-    ):
-        monkeypatch.setattr(f"service.pose.retrieval.view_placement.{name}", count)
+FEW = PlacementConfig(shell_candidates=12, volume_candidates=60, size_candidates=60, best=20, min_views=16)
+"""As many candidates as these small scenes need."""
 
 
 def test_steps_end_before_what_is_filled_and_nothing_is_outside() -> None:
@@ -74,7 +72,7 @@ def blobs(positions: np.ndarray, size: float) -> GaussianScene:
 
 
 def places(scene: GaussianScene, seed: int = 0) -> tuple[np.ndarray, float, bool]:
-    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(seed))
+    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(seed), FEW)
     positions = np.stack([camera.pose.position_in_world for camera in found.cameras])
     return positions, found.coverage, found.interior
 
@@ -113,7 +111,7 @@ def test_an_object_before_a_far_background_is_looked_at() -> None:
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     scene = joined(blobs(directions[:2700], 0.04), blobs(40 * directions[2700:], 1.6))
     scene = replace(scene, info=replace(scene.info, training_long_side_px=64))
-    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(0))
+    found = find_views(scene, CpuRasterizer(scene), np.random.default_rng(0), FEW)
     views = [c.pose for c in found.cameras]
     near = [v for v in views if np.linalg.norm(v.position_in_world) < 8]
     at_it = [v for v in near if -v.position_in_world @ v.axis_in_world > 0.8 * np.linalg.norm(v.position_in_world)]
@@ -149,18 +147,17 @@ def test_coverage_is_the_share_that_is_seen() -> None:
     wall = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.full((4000, 1), 3.0)], 1)
     scene = joined(blobs(wall, 0.06), blobs(wall - [0, 0, 6], 0.06))
     pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
-    assert coverage(scene, CpuRasterizer(scene), [Camera(search_lens(64), pose)]) == pytest.approx(0.5, abs=0.03)
+    assert coverage(scene, CpuRasterizer(scene), [Camera(search_camera(64), pose)]) == pytest.approx(0.5, abs=0.03)
 
 
-def test_a_thinned_scene_is_as_closed_and_as_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("service.pose.retrieval.lod_proxy.ENOUGH", 8000)
+def test_a_thinned_scene_is_as_closed_and_as_far() -> None:
     scene = closed_room(40_000)
     whole = CpuRasterizer(scene)
-    thin = thinned(scene, whole, np.random.default_rng(0))
+    thin = lod_proxy(scene, whole, np.random.default_rng(0), LodConfig(proxy_gaussians=8000))
     assert isinstance(thin, CpuRasterizer)
     assert thin.scene.count == pytest.approx(8000, rel=0.05)
     up = np.array([0.0, 0.0, 1.0])
-    camera = Camera(search_lens(64), look_at(np.array([0.0, -1.0, 0.0]), np.array([3.0, 1.0, -0.5]), up))
+    camera = Camera(search_camera(64), look_at(np.array([0.0, -1.0, 0.0]), np.array([3.0, 1.0, -0.5]), up))
     a, b = whole.render([camera])[0], thin.render([camera])[0]
     assert b.alpha.mean() > 0.95 * a.alpha.mean()
     assert np.median(np.abs(a.median_depth - b.median_depth) / a.median_depth) < 0.08
@@ -173,11 +170,11 @@ def test_a_horizon_lies_behind_what_hides_and_nowhere_where_one_sees_through() -
     alpha[:, 10] = 0.5
     median = depth.copy()
     depth[:, 14], median[:, 14] = 2.4, 2.0  # two fifths of the light come through the pane
-    found = horizon(Frame(np.zeros((8, 16, 3), np.float32), alpha, depth, median))
-    assert np.allclose(found[:, :3], 2 * BEHIND)
-    assert np.allclose(found[:, [*range(3, 9), 12]], 3 * BEHIND)  # column 3 looks past the board's edge
+    found = occlusion_depths(Frame(np.zeros((8, 16, 3), np.float32), alpha, depth, median))
+    assert np.allclose(found[:, :3], 2 * LOD.behind_factor)
+    assert np.allclose(found[:, [*range(3, 9), 12]], 3 * LOD.behind_factor)  # column 3 looks past the board's edge
     assert np.all(np.isinf(found[:, 9:12]))
-    assert np.all(found[:, 13:] > 3 * BEHIND)
+    assert np.all(found[:, 13:] > 3 * LOD.behind_factor)
 
 
 class Watched(CpuRasterizer):
@@ -197,16 +194,15 @@ class Watched(CpuRasterizer):
         return frames
 
 
-def test_views_of_a_large_scene_show_all_that_is_seen_but_not_what_walls_hide(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_of_a_large_scene_show_all_that_is_seen_but_not_what_walls_hide() -> None:
     """A room with a second one behind its wall, of whose Gaussians not one has to be drawn."""
-    monkeypatch.setattr("service.pose.retrieval.lod_proxy.ENOUGH", 20_000)
-    monkeypatch.setattr("service.pose.retrieval.lod_proxy.LARGE", 30_000)
     room = closed_room(30_000)
     scene = joined(room, changed(room, 1.0, (2.2 * ROOM[0], 0.0, 0.0)))
     eye, up = np.array([-0.5, 0.2, 0.0]), np.array([0.0, 0.0, 1.0])
-    camera = Camera(search_lens(160), look_at(eye, eye + np.array([1.0, 0.1, -0.1]), up))
+    camera = Camera(search_camera(160), look_at(eye, eye + np.array([1.0, 0.1, -0.1]), up))
     watched, alone = Watched(scene), CpuRasterizer(room)
-    built_index([camera], Tools(scene, watched, MATCHERS.load("sift").create(), np.random.default_rng(0)))
+    tools = Tools(scene, watched, MATCHERS.load("sift").create(), np.random.default_rng(0), None)
+    built_index([camera], tools, LodConfig(proxy_gaussians=20_000, min_gaussians=30_000))
     ((rgb, drawn),) = watched.drawn
     truth = alone.render([camera])[0].rgb
     visible = alone._scratch().visible

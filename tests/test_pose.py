@@ -16,20 +16,28 @@ from service.geometry import look_at, moved, pose_distance, project, reprojectio
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import PHOTO_PX, sized
-from service.pose.features.rendered_views import backprojected, to_uint8
-from service.pose.features.views import photo_at, photo_features, rendered_frame, rendered_view
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import ViewRenderer, backprojected, to_uint8
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.index import built_index, prepared_index
-from service.pose.retrieval.scores import top, vote
-from service.pose.retrieval.viewpoints import farthest_points, spread
-from service.pose.verification.appearance import Blocks, Pair, colour_agreement, gradient_agreement, tint_agreement
-from service.pose.verification.gate import SCALES, Scale, clear, probability, verify
-from service.results import Reason, Status
-from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, Query, SceneInfo
+from service.pose.retrieval.scores import retrieval_scores, top
+from service.pose.retrieval.viewpoints import ViewpointConfig, farthest_points, spread
+from service.pose.verification.appearance import (
+    Blocks,
+    Pair,
+    colour_correlation,
+    gradient_correlation,
+    local_colour_correlation,
+)
+from service.pose.verification.gate import photometric_suffices, verify
+from service.pose.verification.model import SHIPPED_MODEL, Scale
+from service.results import Reason, Status, Verdict
+from service.types import Camera, GaussianScene, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, Query, SceneInfo
 
 LENS = Intrinsics(192, 160, 170.0, 168.0, 97.0, 79.0)
 UP = np.array([0.0, 0.0, 1.0])
+SMALL = ViewpointConfig(render_px=96)
 
 
 class PaintedWalls:
@@ -106,7 +114,12 @@ def a_scene(info: SceneInfo | None = None) -> GaussianScene:
 
 
 def tools_for(rasterizer: object = None, scene: GaussianScene | None = None) -> Tools:
-    return Tools(scene or a_scene(), rasterizer or PaintedWalls(), KnownPoints(), np.random.default_rng(0))
+    return Tools(scene or a_scene(), rasterizer or PaintedWalls(), KnownPoints(), np.random.default_rng(0), None)
+
+
+def verdict_on(query: Query, pose: Pose) -> Verdict:
+    rendered = ViewRenderer(PaintedWalls()).at(query, pose)
+    return verify(QueryImages(query, KnownPoints()), pose, rendered)
 
 
 def true_pose(seed: int = 0) -> Pose:
@@ -193,8 +206,7 @@ def test_features_of_the_turned_photo_lie_where_they_are_in_the_photo(eighths: i
     rgb = np.zeros((320, PHOTO_PX, 3), np.uint8)  # as large as it is looked at
     rgb[100, 37] = 255
     lens = Intrinsics(PHOTO_PX, 320, 400.0, 400.0, 208.0, 160.0)
-    tools = Tools(a_scene(), PaintedWalls(), BrightDot(), np.random.default_rng(0))
-    found = photo_features(Query(rgb, lens, "given", lens), tools, eighths=eighths)
+    found = QueryImages(Query(rgb, lens, "given", lens), BrightDot()).features(roll_steps_45deg=eighths)
     # Turned by an odd eighth, the dot is spread over pixels.
     assert found.points_px == pytest.approx(np.array([[37.5, 100.5]]), abs=0.75 if eighths % 2 else 1e-3)
 
@@ -218,15 +230,18 @@ def test_a_job_renders_and_describes_once() -> None:
             return super().render(cameras)
 
     rasterizer = Counting()
-    tools, query, pose = tools_for(rasterizer), photo_from(true_pose()), true_pose()
-    assert photo_features(query, tools) is photo_features(query, tools)
-    assert photo_at(query, tools, LENS) is photo_at(query, tools, LENS)
-    first, _ = rendered_view(pose, query, tools)
+    matcher, query, pose = KnownPoints(), photo_from(true_pose()), true_pose()
+    images, renderer = QueryImages(query, matcher), ViewRenderer(rasterizer)
+    assert images.features() is images.features()
+    assert images.resized(LENS) is images.resized(LENS)
+    corrected = images.corrected(IntrinsicsCorrection(1.1))
+    assert corrected.query.intrinsics.fx == pytest.approx(1.1 * LENS.fx)
+    assert corrected.features() is images.features()
+    first = renderer.at(query, pose).view(matcher)
     near = moved(pose, np.array([1e-4, 0, 0, 0, 0, 0]))
-    assert rendered_view(near, query, tools)[0] is first
+    assert renderer.at(query, near).view(matcher) is first
     assert rasterizer.renders == 1
-    _, camera = rendered_frame(near, query, tools, tolerance_px=1e-3)
-    assert camera.pose is near
+    assert renderer.at(query, near, tolerance_px=1e-3).camera.pose is near
     assert rasterizer.renders == 2
 
 
@@ -244,7 +259,7 @@ def test_a_vote_finds_the_view_that_shares_features_among_clutter() -> None:
     rng = np.random.default_rng(2)
     views = [clustered(rng, 300, 1.0) for _ in range(12)]
     shared, clutter = views[7][:40], clustered(rng, 260, 1.0)
-    scores = vote(np.concatenate([shared, clutter]), views)
+    scores = retrieval_scores(np.concatenate([shared, clutter]), views)
     assert top(scores, 1)[0] == 7
     assert scores[7] > 2 * np.sort(scores)[-2]
 
@@ -257,13 +272,13 @@ def test_what_many_views_show_doesnt_outvote_what_few_do() -> None:
     for i in range(12):
         views[i] = np.concatenate([chairs, views[i][:50]])
     views[40] = np.concatenate([picture, views[40][:120]])
-    assert top(vote(np.concatenate([chairs, picture]), views), 1)[0] == 40
+    assert top(retrieval_scores(np.concatenate([chairs, picture]), views), 1)[0] == 40
 
 
 def test_a_vote_needs_no_features_and_only_one_view() -> None:
     rng = np.random.default_rng(4)
-    assert vote(clustered(rng, 5), [clustered(rng, 9)]).tolist() == [0.0]
-    assert vote(clustered(rng, 0), [clustered(rng, 9), clustered(rng, 0)]).tolist() == [0.0, 0.0]
+    assert retrieval_scores(clustered(rng, 5), [clustered(rng, 9)]).tolist() == [0.0]
+    assert retrieval_scores(clustered(rng, 0), [clustered(rng, 9), clustered(rng, 0)]).tolist() == [0.0, 0.0]
 
 
 # --- alignment
@@ -368,13 +383,13 @@ def test_alignment_without_overlap_has_infinite_loss() -> None:
 def test_the_gate_accepts_the_truth_and_refuses_the_rest() -> None:
     lens = LENS.resized(384, 320)
     query = photo_from(true_pose(), lens, gain=0.8, bias=0.1)
-    verdict = verify(query, true_pose(), tools_for())
+    verdict = verdict_on(query, true_pose())
     assert verdict.status is Status.LOCALIZED
     assert verdict.reason is Reason.AGREES
     assert verdict.score >= 0.8
     assert verdict.coverage > 0.9
     for twist in ([0, 0, 0, 0.5, 0, 0], [0.15, 0, 0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], [0, 3.0, 0, 0, 0, 0]):
-        refused = verify(query, moved(true_pose(), np.array(twist)), tools_for())
+        refused = verdict_on(query, moved(true_pose(), np.array(twist)))
         assert refused.status is not Status.LOCALIZED
         assert refused.score < 0.5
 
@@ -382,9 +397,9 @@ def test_the_gate_accepts_the_truth_and_refuses_the_rest() -> None:
 def test_the_gate_says_why() -> None:
     lens = LENS.resized(384, 320)
     blank = Query(np.full((320, 384, 3), 127, np.uint8), lens, "given", lens)
-    assert verify(blank, true_pose(), tools_for()).reason is Reason.FEW_FEATURES
+    assert verdict_on(blank, true_pose()).reason is Reason.FEW_FEATURES
     away = moved(true_pose(), np.array([0, 3.1, 0, 0, 0, 0]))
-    verdict = verify(photo_from(true_pose(), lens), away, tools_for())
+    verdict = verdict_on(photo_from(true_pose(), lens), away)
     assert verdict.status is Status.NOT_LOCALIZED
     assert verdict.reason is Reason.NO_MATCHING_VIEW
     assert verdict.covariance is None
@@ -405,10 +420,10 @@ def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place()
     known[:, 210:] = False
 
     def gradients(*images: Any) -> tuple[float, float]:
-        return gradient_agreement(Blocks.of(Pair.of(*images)))
+        return gradient_correlation(Blocks.of(Pair.of(*images)))
 
     def colours(*images: Any) -> tuple[float, float]:
-        return colour_agreement(Pair.of(*images))
+        return colour_correlation(Pair.of(*images))
 
     for measure in (gradients, colours):
         assert min(measure(to_uint8(frame.rgb), frame)) > 0.99
@@ -428,11 +443,11 @@ def test_a_half_of_one_colour_tells_nothing_against_a_pose() -> None:
     rgb = frame.rgb.copy()
     rgb[:, :250] = 1.0
     bright = Frame(rgb, frame.alpha, frame.depth, frame.median_depth)
-    most, half = colour_agreement(Pair.of(to_uint8(0.97 * rgb), bright))
+    most, half = colour_correlation(Pair.of(to_uint8(0.97 * rgb), bright))
     assert half >= most > 0.95
 
 
-def test_tints_tell_like_things_of_other_colours_apart_but_forgive_light_and_what_hides_them() -> None:
+def test_local_colours_distinguish_like_things_whatever_the_light_and_with_a_part_occluded() -> None:
     """Nine like balls in a row of rows; the colours of three are exchanged, as if they were seen one further on."""
     rng = np.random.default_rng(0)
     colours = rng.uniform(0.1, 0.9, (9, 3)).astype(np.float32)
@@ -448,33 +463,35 @@ def test_tints_tell_like_things_of_other_colours_apart_but_forgive_light_and_wha
             rgb = np.where(inside, rgb_of * (0.4 + 0.6 * shade[..., None]), rgb)
         return rgb.astype(np.float32)
 
-    def tints(photo: np.ndarray) -> float:
-        return tint_agreement(Blocks.of(Pair.of(to_uint8(photo), frame)))
+    def correlation(photo: np.ndarray) -> float:
+        return local_colour_correlation(Blocks.of(Pair.of(to_uint8(photo), frame)))
 
     flat = np.ones((320, 384), np.float32)
     frame = Frame(balls(colours), flat, flat, flat)
-    assert tints(frame.rgb) > 0.999
-    assert tints(np.clip(0.7 * frame.rgb * np.array([0.9, 1.0, 1.1], np.float32) + 0.05, 0, 1)) > 0.97
-    assert tints(frame.rgb**1.4) > 0.95
+    assert correlation(frame.rgb) > 0.999
+    assert correlation(np.clip(0.7 * frame.rgb * np.array([0.9, 1.0, 1.1], np.float32) + 0.05, 0, 1)) > 0.97
+    assert correlation(frame.rgb**1.4) > 0.95
     gray = np.repeat(frame.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
-    assert tints(gray) > 0.999
-    assert tints(0.5 * gray + 0.5 * frame.rgb) > 0.999
-    assert tints(frame.rgb * np.array([1.2, 1.0, 0.5], np.float32)) > 0.97
+    assert correlation(gray) > 0.999
+    assert correlation(0.5 * gray + 0.5 * frame.rgb) > 0.999
+    assert correlation(frame.rgb * np.array([1.2, 1.0, 0.5], np.float32)) > 0.97
     hidden = frame.rgb.copy()
     hidden[:160, :130] = rng.uniform(0, 1, (160, 130, 3))
-    assert tints(hidden) > 0.95
+    assert correlation(hidden) > 0.95
     exchanged = balls(colours[[1, 2, 0, 3, 4, 5, 6, 7, 8]])
-    assert tints(exchanged) < 0.9
-    assert gradient_agreement(Blocks.of(Pair.of(to_uint8(exchanged), frame)))[0] > 0.9
-    assert tint_agreement(Blocks.of(Pair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0  # nothing agrees
+    assert correlation(exchanged) < 0.9
+    assert gradient_correlation(Blocks.of(Pair.of(to_uint8(exchanged), frame)))[0] > 0.9
+    assert (
+        local_colour_correlation(Blocks.of(Pair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0
+    )  # nothing agrees
 
 
-def test_pixels_are_enough_only_where_tints_agree_too() -> None:
-    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "tints": 0.99}
-    signals["drift_px"] = 0.1
-    assert clear(signals)
-    assert not clear(signals | {"tints": 0.85})  # one sphere of a row too far
-    assert not clear(signals | {"gradients": 0.5, "gradients_half": 0.7})
+def test_pixels_are_enough_only_where_local_colours_agree_too() -> None:
+    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "drift_px": 0.1}
+    signals["local_colour_correlation"] = 0.99
+    assert photometric_suffices(signals)
+    assert not photometric_suffices(signals | {"local_colour_correlation": 0.85})  # one sphere of a row too far
+    assert not photometric_suffices(signals | {"gradients": 0.5, "gradients_half": 0.7})
 
 
 def test_features_of_a_large_render_lie_where_they_are_in_it() -> None:
@@ -495,29 +512,30 @@ def test_features_of_a_large_render_lie_where_they_are_in_it() -> None:
             return Frame(rgb, np.ones_like(frame.alpha), frame.depth, np.full_like(frame.depth, 2.0))
 
     lens = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, trust="approximate")
-    tools = Tools(a_scene(), Block(), BrightBlock(), np.random.default_rng(0))
-    view, _ = rendered_view(true_pose(), Query(np.zeros((480, 640, 3), np.uint8), lens, "given", lens), tools)
+    query = Query(np.zeros((480, 640, 3), np.uint8), lens, "given", lens)
+    view = ViewRenderer(Block()).at(query, true_pose()).view(BrightBlock())
     assert view.camera.intrinsics.width == 640
     assert view.features.points_px == pytest.approx(np.array([[210.0, 110.0]]), abs=0.5)
 
 
 @given(st.floats(-10, 1000), st.floats(-10, 1000))
 def test_scales_are_monotonous_and_meet_their_marks(a: float, b: float) -> None:
-    for scale in (Scale(15.0, 400.0), Scale(15.0, 400.0, ratio=True)):
+    for scale in (Scale(15.0, 400.0), Scale(15.0, 400.0, logarithmic=True)):
         assert (scale(-1.0), scale(15.0), scale(400.0), scale(900.0)) == (0, 0, 1, 1)
         assert (a <= b) <= (scale(a) <= scale(b))
-    assert Scale(1.0, 100.0, ratio=True)(10.0) == pytest.approx(0.5)
-    assert Scale(20.0, 0.2, ratio=True)(2.0) == pytest.approx(0.5)  # less may be better
+    assert Scale(1.0, 100.0, logarithmic=True)(10.0) == pytest.approx(0.5)
+    assert Scale(20.0, 0.2, logarithmic=True)(2.0) == pytest.approx(0.5)  # less may be better
 
 
 def test_every_signal_that_betters_makes_a_pose_more_probable() -> None:
-    signals = {name: 0.5 * (scale.hopeless + scale.certain) for name, scale in SCALES.items()}
+    scales, probability = SHIPPED_MODEL.scales, SHIPPED_MODEL.probability
+    signals = {name: 0.5 * (scale.at_zero + scale.at_one) for name, scale in scales.items()}
     for model in (signals, {name: value for name, value in signals.items() if not name.startswith("inlier")}):
         for name in model:
-            worse, better = ({**model, name: end} for end in (SCALES[name].hopeless, SCALES[name].certain))
+            worse, better = ({**model, name: end} for end in (scales[name].at_zero, scales[name].at_one))
             assert probability(worse) <= probability(model) <= probability(better)
-        assert probability({name: SCALES[name].hopeless for name in model}) < 0.01
-        assert probability({name: SCALES[name].certain for name in model}) > 0.95
+        assert probability({name: scales[name].at_zero for name in model}) < 0.01
+        assert probability({name: scales[name].at_one for name in model}) > 0.95
 
 
 # --- viewpoints and index
@@ -548,8 +566,7 @@ def test_spread_takes_all_of_few_cameras_and_covers_many() -> None:
 
 
 @pytest.fixture
-def walls_with_cameras(monkeypatch: pytest.MonkeyPatch) -> GaussianScene:
-    monkeypatch.setattr("service.pose.retrieval.viewpoints.INDEX_PX", 96)
+def walls_with_cameras() -> GaussianScene:
     return replace(a_scene(), cameras=tuple(NamedCamera(f"{i}.png", Camera(LENS, true_pose(i))) for i in range(3)))
 
 
@@ -558,8 +575,8 @@ def test_the_index_is_the_same_from_the_cache(walls_with_cameras: GaussianScene,
         def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
             raise AssertionError("the cache was not used")
 
-    fresh = prepared_index(tools_for(scene=walls_with_cameras), tmp_path)
-    cached = prepared_index(tools_for(Refusing(), walls_with_cameras), tmp_path)
+    fresh = prepared_index(tools_for(scene=walls_with_cameras), tmp_path, SMALL)
+    cached = prepared_index(tools_for(Refusing(), walls_with_cameras), tmp_path, SMALL)
     assert len(fresh.views) == len(cached.views) == 3
     for a, b in zip(fresh.views, cached.views, strict=True):
         assert a.camera.intrinsics == b.camera.intrinsics
@@ -570,19 +587,19 @@ def test_the_index_is_the_same_from_the_cache(walls_with_cameras: GaussianScene,
 
 
 def test_a_damaged_cache_is_rebuilt(walls_with_cameras: GaussianScene, tmp_path: Path) -> None:
-    prepared_index(tools_for(scene=walls_with_cameras), tmp_path)
+    prepared_index(tools_for(scene=walls_with_cameras), tmp_path, SMALL)
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
     for damaged in (b"", b"not a zip", whole[: len(whole) // 2]):
         path.write_bytes(damaged)
-        assert len(prepared_index(tools_for(scene=walls_with_cameras), tmp_path).views) == 3
+        assert len(prepared_index(tools_for(scene=walls_with_cameras), tmp_path, SMALL).views) == 3
         assert path.read_bytes() == whole
 
 
 def test_another_scene_or_matcher_has_another_cache(walls_with_cameras: GaussianScene, tmp_path: Path) -> None:
-    prepared_index(tools_for(scene=walls_with_cameras), tmp_path)
+    prepared_index(tools_for(scene=walls_with_cameras), tmp_path, SMALL)
     other = replace(walls_with_cameras, info=replace(walls_with_cameras.info, sha256="1" * 64))
-    prepared_index(tools_for(scene=other), tmp_path)
+    prepared_index(tools_for(scene=other), tmp_path, SMALL)
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -594,17 +611,17 @@ def test_an_index_of_a_scene_without_features_is_empty_but_there() -> None:
     index = built_index([Camera(LENS, true_pose())], tools_for(Fog()))
     assert len(index.views) == 1
     assert len(index.views[0].points_in_world) == 0
-    assert index.votes(np.zeros((0, 27), np.float32)).shape == (1,)
+    none = np.zeros((0, 27), np.float32)
+    assert retrieval_scores(none, [view.features.descriptors for view in index.views]).shape == (1,)
 
 
 def test_correspondences_join_photo_pixels_and_scene_points() -> None:
     """Against the geometry: every scene point projects to its photo pixel."""
     truth = true_pose()
     lens = LENS.resized(384, 320)
-    tools = tools_for()
-    query = photo_from(truth, lens)
-    view, _ = rendered_view(truth, query, tools)
-    found = correspondences(photo_features(query, tools), view, tools.matcher)
+    query, matcher = photo_from(truth, lens), KnownPoints()
+    view = ViewRenderer(PaintedWalls()).at(query, truth).view(matcher)
+    found = correspondences(QueryImages(query, matcher).features(), view, matcher)
     assert len(found.photo_px) > 100
     error = reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, truth)
     assert np.median(error) < 4.0  # the grids of photo and render differ: half a step of every other point is 4 px

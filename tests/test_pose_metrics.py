@@ -5,7 +5,7 @@ import pytest
 
 from service.bench.pose_metrics import Outcome, Units, errors, summary, units_of
 from service.geometry import look_at, moved, pose_distance, so3_exp
-from service.pose.retrieval.scene_focus import is_forward_facing
+from service.pose.features.scene_focus import is_forward_facing
 from service.results import Status
 from service.types import Camera, Intrinsics, Pose
 

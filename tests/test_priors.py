@@ -10,6 +10,7 @@ from small_room import HALF_TURN, write_room
 from test_estimators import assert_near, photo_at, unseen_pose
 
 from service.errors import InvalidPrior
+from service.estimators.search_state import SEARCH
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
@@ -90,11 +91,9 @@ def test_a_wrong_guess_costs_nothing_but_time(repeated: LoadedScene) -> None:
     assert min(pose_distance(found.pose, place)[0] for place in (TRUTH, TWIN)) < 0.2
 
 
-def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(
-    repeated: LoadedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("service.pose.verification.gate.MAX_SIGMA_SHARE", 0.0)
-    found = localize(photo_at(repeated, TRUTH), repeated, FAST)
+def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(repeated: LoadedScene) -> None:
+    strict = replace(SEARCH, verification=replace(SEARCH.verification, max_sigma_share=0.0))
+    found = localize(photo_at(repeated, TRUTH), repeated, replace(FAST, config=strict))
     assert found.verdict.reason is Reason.PLACE_UNCERTAIN
     assert not stages(found) & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 

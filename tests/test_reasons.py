@@ -13,11 +13,10 @@ from test_estimators import LENS, photo_at, unseen_pose
 
 from service.estimators.view_index import Options
 from service.geometry import look_at
-from service.interfaces import Tools
-from service.localize import LoadedScene, Request, localize
+from service.localize import LoadedScene, Request, localize, render_and_verify
+from service.pose.features.mirrored_query import mirrored_query
+from service.pose.features.query_images import QueryImages
 from service.pose.refinement.photometric import refine_photometric
-from service.pose.verification.gate import verify
-from service.pose.verification.mirror_images import mirrored
 from service.results import HINTS, Reason, Status, Verdict
 from service.types import BoxPrior, Camera, Pose, Query
 
@@ -38,7 +37,7 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
 
 
 def judged(room: LoadedScene, query: Query, pose: Pose = TRUTH) -> Verdict:
-    return verify(query, pose, Tools(room.scene, room.rasterizer, room.matcher, np.random.default_rng(0)))
+    return render_and_verify(QueryImages(query, room.matcher), pose, room.rasterizer)
 
 
 def blurred(query: Query, sigma_px: float) -> Query:
@@ -62,7 +61,7 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
     Reason.AMBIGUOUS: lambda _, rooms: localize(photo_at(rooms["repeated"], TRUTH), rooms["repeated"], FAST).verdict,
     Reason.MIRRORED: lambda _, rooms: (
-        localize(mirrored(photo_at(rooms["symmetric"], TRUTH)), rooms["symmetric"], FAST).verdict
+        localize(mirrored_query(photo_at(rooms["symmetric"], TRUTH)), rooms["symmetric"], FAST).verdict
     ),
     Reason.BUDGET_EXHAUSTED: lambda room, _: (
         localize(photo_at(room, TRUTH), room, replace(FAST, budget_s=1e-9)).verdict
@@ -95,7 +94,7 @@ def middle_of_a_wall(room: LoadedScene) -> Query:
     known = np.zeros(query.rgb.shape[:2], bool)
     height, width = known.shape
     known[height // 4 : -height // 4, width // 4 : -width // 4] = True
-    return replace(query, known=known)
+    return replace(query, valid_mask=known)
 
 
 @pytest.mark.parametrize("reason", list(Reason))

@@ -16,12 +16,11 @@ from service.bench import track as bench
 from service.bench.pose_metrics import Units
 from service.errors import SceneNotFound
 from service.geometry import moved, pose_distance
-from service.localize import Cancelled, LoadedScene, Request
+from service.localize import Cancelled, LoadedScene, Request, render_and_verify
 from service.photos.images import encode_image, query_of, read_query
 from service.photos.sequence import SequencePhoto
-from service.pose.verification.gate import verify
 from service.results import Status
-from service.tracking import Tracker, localize_sequence
+from service.tracking import Tracker, TrackingConfig, localize_sequence
 from service.types import Camera, Intrinsics, Pose, Query
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -143,13 +142,12 @@ def test_times_scale_the_expected_motion(room):
 
 def test_the_gate_is_asked_in_doubt_and_now_and_then(room, monkeypatch):
     asked = []
-    monkeypatch.setattr(track, "verify", lambda *a: asked.append(1) or verify(*a))
-    monkeypatch.setattr(track, "GATE_EVERY", 3)
-    tracker, truth = Tracker(room), path(7)
+    monkeypatch.setattr(track, "render_and_verify", lambda *a: asked.append(1) or render_and_verify(*a))
+    tracker, truth = Tracker(room, config=TrackingConfig(verify_every=3)), path(7)
     for i, pose in enumerate(truth):
         tracker.track(query(room, pose, i))
     assert len(asked) == 2  # photos 3 and 6 after the first
-    monkeypatch.setattr("service.tracking.clear", lambda signals: False)
+    monkeypatch.setattr(track, "photometric_suffices", lambda signals, config: False)
     asked.clear()
     estimate = tracker.track(query(room, path(8)[7], 7))
     assert asked
@@ -157,12 +155,11 @@ def test_the_gate_is_asked_in_doubt_and_now_and_then(room, monkeypatch):
     assert followed(estimate)
 
 
-def test_photos_tell_their_lens_together(room, monkeypatch):
+def test_photos_tell_their_lens_together(room):
     """The focal length isn't told: it comes to be known better than one photo tells it, and the places with it."""
-    monkeypatch.setattr(track, "LENS_SETTLED", 0.0)
     truth = [place(1.0 + 0.06 * i, 0.3 * np.sin(0.5 * i)) for i in range(10)]
     guess = replace(LENS, fx=1.08 * FOCAL, fy=1.08 * FOCAL, trust="approximate")
-    tracker = Tracker(room)
+    tracker = Tracker(room, config=TrackingConfig(settled_focal_sigma=0.0))
     found = [tracker.track(query(room, pose, i, guess)) for i, pose in enumerate(truth)]
     alone = found[0]
     assert abs(found[-1].intrinsics.fx / FOCAL - 1) < 0.005  # seen: 0.0005

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from service.pose.features.in_plane_rotation import PHOTO_CORNERS, Corners, corners, turns_to_upright
+from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners, rolls_to_upright
 
 PHOTOS = sorted((Path(__file__).parent.parent / "scenes" / "studio" / "photos").glob("*.jpg"))
 
@@ -27,7 +27,7 @@ def picture(number: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def views() -> Corners:
-    return Corners.pooled([corners(np.asarray(upright(k, 350))) for k in range(len(PHOTOS))])
+    return Corners.pooled([detect_corners(np.asarray(upright(k, 350)), CORNERS.of_view) for k in range(len(PHOTOS))])
 
 
 @pytest.mark.parametrize("quarters", range(4))
@@ -35,7 +35,7 @@ def test_a_photo_turned_by_quarters_is_told_how_to_stand(quarters: int, views: C
     """numpy turns counter-clockwise, so the rest of the circle is left."""
     for number in range(len(PHOTOS)):
         turned = np.ascontiguousarray(np.rot90(picture(number), quarters))
-        assert turns_to_upright(corners(turned, PHOTO_CORNERS), views)[0] == -2 * quarters % 8
+        assert rolls_to_upright(detect_corners(turned, CORNERS.of_photo), views)[0] == -2 * quarters % 8
 
 
 @pytest.mark.parametrize("degrees", [45, 135, 200, 330])
@@ -46,11 +46,11 @@ def test_of_a_photo_turned_by_any_angle_the_nearest_eighth_is_told(degrees: int,
         turned = np.asarray(photo.rotate(degrees, Image.Resampling.BICUBIC, expand=True))
         blank = Image.new("L", photo.size, 255).rotate(degrees, expand=True)
         known = np.asarray(blank) > 0
-        assert turns_to_upright(corners(turned, PHOTO_CORNERS, known), views)[0] == round(-degrees / 45) % 8
+        assert rolls_to_upright(detect_corners(turned, CORNERS.of_photo, known), views)[0] == round(-degrees / 45) % 8
 
 
 def test_where_nothing_has_corners_nothing_is_turned(views: Corners) -> None:
-    blank = corners(np.full((312, 416, 3), 128, np.uint8))
+    blank = detect_corners(np.full((312, 416, 3), 128, np.uint8), CORNERS.of_view)
     assert len(blank.directions_deg) == len(blank.descriptors) == 0
-    assert turns_to_upright(blank, views) == [0]
-    assert turns_to_upright(corners(picture(0), PHOTO_CORNERS), Corners.pooled([blank])) == [0]
+    assert rolls_to_upright(blank, views) == [0]
+    assert rolls_to_upright(detect_corners(picture(0), CORNERS.of_photo), Corners.pooled([blank])) == [0]

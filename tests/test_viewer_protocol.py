@@ -248,7 +248,7 @@ def _click(browser: FakeBrowser, origin: np.ndarray, direction: np.ndarray) -> N
 
 def test_a_camera_is_drawn_with_the_lens_that_its_step_found(fake: FakeService, viewer: Viewer) -> None:
     job = fake.job("j", 1)
-    job.add(replace(records(2)[1], lens=IntrinsicsCorrection(focal_factor=2.0)))
+    job.add(replace(records(2)[1], correction=IntrinsicsCorrection(focal_factor=2.0)))
     job.finish()
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: browser.widget("step")["value"] == 1 and "agree" in browser.text(), "the last step")

@@ -99,7 +99,7 @@ class Job:
 
     def camera(self, record: IterationRecord) -> Camera:
         """Return the photo's camera as a record estimates it: its pose, and the intrinsics with its correction."""
-        return Camera(self.photo.corrected(record.lens), record.pose)
+        return Camera(self.photo.corrected(record.correction), record.pose)
 
 
 class ServiceClient:
@@ -240,7 +240,7 @@ def parse_record(raw: dict[str, Any]) -> IterationRecord:
     return IterationRecord(
         stage=raw["stage"],
         pose=_pose(raw),
-        lens=IntrinsicsCorrection(**raw["intrinsics_correction"]),
+        correction=IntrinsicsCorrection(**raw["intrinsics_correction"]),
         matches=matches
         and MatchVectors(
             frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),

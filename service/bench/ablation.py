@@ -1,17 +1,15 @@
 """`splatfix bench ablation`: what each part of the default estimator contributes, each removed in turn.
 
-Every photo of each scene, as it is and spoilt in several ways, and with the scene's cameras ignored; the index of views
-is always the whole estimator's. A part is removed by putting something simpler in its place for the time of a run: the
-estimator has no switches for it.
+Every photo of each scene, unaltered and altered in several ways, and with the scene's cameras ignored; the index of
+views is always the whole estimator's. A part is removed by a value of the estimator's config, options or query.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +19,20 @@ from service.bench.localize import Subject, Trial, answered, subject, trials_of
 from service.bench.pose_metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
+from service.estimators.search_state import SEARCH, SearchConfig
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.matching import search_stages as stages
-from service.pose.matching.correspondences import Correspondences
 from service.pose.refinement.config import REFINEMENT, PyramidConfig
-from service.pose.refinement.photometric import refine_photometric
-from service.pose.refinement.uncertainty import pose_uncertainty
-from service.pose.retrieval import image_variant as sight
-from service.pose.retrieval.index import ViewIndex
-from service.pose.verification import appearance, gate
+from service.pose.retrieval.scores import ScoreConfig
+from service.pose.verification.appearance import LOCAL_COLOUR
+from service.pose.verification.model import SHIPPED_MODEL
 from service.render import cpu
-from service.results import IterationRecord
-from service.types import Query
 
 CONDITIONS = {
     "clean": (), "gain 1.4": ("gain=1.4",), "roll 45": ("roll=45",), "crop 0.5": ("crop=0.5",),
     "occlusion 0.35": ("occlusion=0.35",), "focal 5 % off": ("focal=1.05",), "bare scene": (),
 }  # fmt: skip
 APPROXIMATE, BARE = "focal 5 % off", "bare scene"
-"""The condition whose focal length is told to be approximate, and the one whose scene comes without cameras."""
+"""The condition whose focal length is said to be approximate, and the one whose scene comes without cameras."""
 
 
 DEFAULTS = view_index.Options()
@@ -48,44 +40,74 @@ DEFAULTS = view_index.Options()
 
 @dataclass(frozen=True, slots=True)
 class Removal:
-    """What stands in for a part."""
+    """How the estimator does without a part."""
 
-    patches: tuple[tuple[Any, str, Any], ...] = ()
-    """(module or class, name, stand-in)."""
+    config: SearchConfig = SEARCH
     options: view_index.Options = DEFAULTS
     exact_focal: bool = False
+    """The photo's focal length is said to be exact."""
+    unscaled_dilation: bool = False
+    """Renders are dilated like the training photos, whatever their size."""
 
 
 def removals() -> dict[str, Removal]:
     """Return the parts, and how the estimator does without each."""
-    v, s = view_index, stages
+    refine, matching, mirror, ambiguity = SEARCH.refinement, SEARCH.matching, SEARCH.mirror, SEARCH.ambiguity
+    scores = ScoreConfig(photo_features=0)
     return {
         "nothing": Removal(),
-        "votes for views (random ones)": Removal(((ViewIndex, "votes", _any_views),)),
-        "pixels enough after many matches": Removal(((v, "glance", _no_glance),)),
-        "all views but the likeliest": Removal(options=view_index.Options(candidates=1)),
-        "first look at a smaller photo": Removal(((v, "GLIMPSE_SHARE", 1.0),)),
-        "views' matches pooled": Removal(((Correspondences, "pooled", staticmethod(_first)),)),
-        "photo at the views' scale": Removal(((sight, "SAME_SCALE", np.inf),)),
-        "photo turned": Removal(((v, "turned_sight", _upright),)),
+        "retrieval scores (views in the index's order instead)": _retrieved_with(scores=scores),
+        "verification by pixels after many matches": _searched_with(photometric_min_inliers=np.inf),
+        "all views but the best scored": Removal(options=view_index.Options(candidates=1)),
+        "coarse pass on a small photo": _searched_with(small_photo_factor=1.0),
+        "pooled matches of several views": _searched_with(matching=replace(matching, pool_views=False)),
+        "photo at the views' scale": _retrieved_with(same_scale=np.inf),
+        "in-plane rotation": _retrieved_with(max_rotations=0),
         "sampled poses (effort fast)": Removal(options=view_index.Options(effort="fast")),
-        "rendering and matching again": Removal(((v, "STRONG", 0),)),
-        "alignment": Removal(((v, "aligned", _as_found), (s, "aligned", _as_found))),
-        "second render of the alignment": Removal(((s, "ALIGNMENTS", 1), (s, "FIRST_ALIGNED_PX", None))),
-        "small first render": Removal(((s, "FIRST_ALIGNED_PX", None),)),
-        "larger second look": Removal(((v, "SECOND_LOOK", 1.0),)),
-        "gain, bias, gamma, blur": Removal(_refined_with(estimate_photometric=False)),
-        "L1 weights": Removal(_refined_with(weighting="least_squares")),
-        "cut of large residuals": Removal(_refined_with(cutoff_medians=np.inf)),
-        "cut-off where saturated": Removal(_refined_with(pyramid=PyramidConfig(saturated_share=np.inf))),
-        "depth of the occluder at edges": Removal(_refined_with(pyramid=PyramidConfig(edge_px=0))),
-        "dilation scaled": Removal(((cpu, "dilation_for", _fixed_dilation),)),
-        "focal length estimated": Removal(exact_focal=True),
-        "decoupled solver (PnP again instead)": Removal(((s, "solved_near", _resected_again),)),
-        "tints": Removal(((appearance, "tint_agreement", _alike),)),
-        "look in the mirror": Removal(((v._Hunt, "reflect", _nothing),)),
-        "look elsewhere": Removal(((v._Hunt, "contest", _nothing),)),
+        "render and rematch": _searched_with(rematch_below_inliers=0),
+        "photometric refinement": _searched_with(refinement=replace(refine, max_renders=0)),
+        "second render of the refinement": _searched_with(
+            refinement=replace(refine, max_renders=1, first_render_px=None)
+        ),
+        "small first render": _searched_with(refinement=replace(refine, first_render_px=None)),
+        "larger photo in the last retrieval": _searched_with(large_photo_factor=1.0),
+        "photometric parameters (gain, bias, gamma, blur)": _refined_with(estimate_photometric=False),
+        "L1 weights": _refined_with(weighting="least_squares"),
+        "cut-off of large residuals": _refined_with(cutoff_medians=np.inf),
+        "clipping of the render where the photo is saturated": _refined_with(
+            pyramid=PyramidConfig(saturated_share=np.inf)
+        ),
+        "depth of the occluder at edges": _refined_with(pyramid=PyramidConfig(edge_px=0)),
+        "scaled dilation": Removal(unscaled_dilation=True),
+        "estimation of the focal length": Removal(exact_focal=True),
+        "decoupled solver (PnP instead)": _searched_with(matching=replace(matching, solver="pnp")),
+        "local colour correlation": _without_local_colour(),
+        "search for mirror images": _searched_with(mirror=replace(mirror, beyond_doubt=-np.inf)),
+        "search for ambiguous hypotheses": _searched_with(ambiguity=replace(ambiguity, max_hypotheses=0)),
     }
+
+
+def _searched_with(**changed: Any) -> Removal:
+    return Removal(replace(SEARCH, **changed))
+
+
+def _retrieved_with(**changed: Any) -> Removal:
+    return _searched_with(retrieval=replace(SEARCH.retrieval, **changed))
+
+
+def _refined_with(**changed: Any) -> Removal:
+    """Return the removal that refines, and estimates the uncertainty, with a changed config."""
+    config = replace(REFINEMENT, **changed)
+    return _searched_with(
+        refinement=replace(SEARCH.refinement, photometric=config),
+        verification=replace(SEARCH.verification, refinement=config),
+    )
+
+
+def _without_local_colour() -> Removal:
+    """Return the removal whose gate has no floor for the local colour correlation, which has no weight anyway."""
+    floors = {name: floor for name, floor in SHIPPED_MODEL.floors.items() if name != LOCAL_COLOUR}
+    return _searched_with(verification=replace(SEARCH.verification, model=replace(SHIPPED_MODEL, floors=floors)))
 
 
 def run(
@@ -133,10 +155,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _outcomes(one: Subject, trials: Sequence[Trial], removal: Removal, condition: str) -> list[Outcome]:
-    request = Request(options=removal.options)
+    request = Request(options=removal.options, config=removal.config)
     trust = "approximate" if condition == APPROXIMATE and not removal.exact_focal else "given"
     outcomes = []
-    with _patched(removal.patches):
+    with _unscaled_dilation() if removal.unscaled_dilation else nullcontext():
         for trial in trials:
             wall, cpu_s = time.perf_counter(), time.process_time()
             estimate = answered(one, trial, request, trust)
@@ -159,65 +181,10 @@ def _row(part: str, condition: str, outcomes: Sequence[Outcome]) -> dict[str, An
 
 
 @contextmanager
-def _patched(patches: Sequence[tuple[Any, str, Any]]) -> Iterator[None]:
-    before = [(place, name, vars(place)[name]) for place, name, _ in patches]
+def _unscaled_dilation() -> Iterator[None]:
+    scaled = cpu.dilation_for
     try:
-        for place, name, stand_in in patches:
-            setattr(place, name, stand_in)
+        cpu.dilation_for = lambda camera, info: cpu.DILATION
         yield
     finally:
-        for place, name, original in before:
-            setattr(place, name, original)
-
-
-# --- what stands in for the parts
-
-_SOLVED_NEAR = stages.solved_near
-
-
-def _refined_with(**changed: Any) -> tuple[tuple[Any, str, Any], ...]:
-    """Return the patches that refine, and estimate the uncertainty, with a changed config."""
-    config = replace(REFINEMENT, **changed)
-    return (
-        (stages, "refine_photometric", partial(refine_photometric, config=config)),
-        (gate, "pose_uncertainty", partial(pose_uncertainty, config=config)),
-    )
-
-
-def _any_views(index: ViewIndex, descriptors: np.ndarray) -> np.ndarray:
-    return np.random.default_rng(0).random(len(index.views))
-
-
-def _first(parts: Sequence[Correspondences]) -> Correspondences:
-    return parts[0]
-
-
-def _upright(upright: Any, query: Any, tools: Any) -> Any:
-    return upright
-
-
-def _as_found(found: AbsolutePose, query: Any, tools: Any) -> Iterator[IterationRecord]:
-    yield IterationRecord("refine", found.pose, found.correction, num_inliers=found.num_inliers)
-
-
-def _fixed_dilation(camera: Any, info: Any) -> float:
-    return cpu.DILATION
-
-
-def _no_glance(*others: Any) -> None:
-    return None
-
-
-def _alike(blocks: appearance.Blocks) -> float:
-    return 1.0
-
-
-def _nothing(*others: Any) -> Iterator[IterationRecord]:
-    return iter(())
-
-
-def _resected_again(near: AbsolutePose, matches: Correspondences, query: Query) -> AbsolutePose | None:
-    """Solve the matches with a render at a pose as if they were with a view, where the lens is known."""
-    if query.focal_sigma:
-        return _SOLVED_NEAR(near, matches, query)
-    return stages.resected(matches, query, stages.REMATCH_ERROR_PX, 500)
+        cpu.dilation_for = scaled

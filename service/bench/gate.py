@@ -1,4 +1,4 @@
-"""`splatfix bench gate`: gather right and wrong poses, fit the verification gate's weights, and test them.
+"""`splatfix bench gate`: gather right and wrong poses, fit the verification gate's model, and test it.
 
 Right poses are the estimator's answers to test photos, as they are and spoilt within reason, that lie within the
 bound. Wrong ones are made by stress:
@@ -8,38 +8,39 @@ bound. Wrong ones are made by stress:
     moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are (by 0.002 to 0.012 units and up
                 to 0.12 degrees they are right: samples of what less exact methods answer: near)
     drifted     the same, aligned from there, where that doesn't lead back
-    followed    the same, as the tracker does it: judged by its glance alone, with the weights that are in use
+    tracked     the same, as the tracker does it: verified by the pixels alone, with the weights that are in use
 
-Weights and floors are fitted on all scenes but one and tested on that one, for each in turn; what is printed as a
-result is of those tests. Those in `service/pose/verification/gate.py` were fitted on all, from such a run. Floors are
-of right poses within reason.
+With a single scene there are no foreign photos, and what occludes is noise and rectangles. `service/bench/gate_fit.py`
+fits and tests.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32
 
 from service.bench.bench_photos import BenchPhoto, sent
+from service.bench.gate_fit import Sample, fit_model, summary
 from service.bench.localize import Subject, subject
 from service.bench.pose_metrics import COARSE, errors, nees
 from service.estimators.view_index import Options
 from service.geometry import moved
-from service.interfaces import Tools
-from service.localize import Request, localize
+from service.localize import Request, localize, render_and_verify
 from service.photos.images import encode_image, read_query, resized
-from service.pose.features.views import photo_at, rendered_frame
-from service.pose.matching.search_stages import GOOD_MATCH
+from service.pose.features.mirrored_query import mirrored_query
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import ViewRenderer
+from service.pose.matching.match_stages import MATCHING
 from service.pose.refinement.photometric import refine_photometric
-from service.pose.verification.gate import BY_PIXELS, DOUBTFUL, LOCALIZED, SCALES, WITH_MATCHES, verify
-from service.pose.verification.mirror_images import mirrored
+from service.pose.verification.gate import verify
+from service.pose.verification.model import SHIPPED_MODEL, model_to_json
 from service.results import Reason, Status, Verdict
-from service.tracking import aligned_from, glance
+from service.tracking import refine_from, verify_tracked
 from service.types import Camera, Intrinsics, Pose, Query
 
 WITHIN_REASON: tuple[tuple[str, ...], ...] = (
@@ -57,13 +58,10 @@ MOVED, NEAR = ((0.06, 1.5), 8.0), ((0.002, 0.012), 0.12)
 FOREIGN = 8
 """Photos of each other scene."""
 GARBAGE = 8
+PATTERNED = (1, 6)
+"""Of these, noise and rectangles occlude where there is no other scene."""
 OCCLUDERS = 2
 """Photos of each other scene that rectangles are cut from."""
-PENALTY = 0.02
-"""On the squared weights, against certainty that few samples don't give."""
-BELOW_FLOOR = 0.003
-"""Share of right poses, for each signal: at most 3 % may be refused, and there are nine floors."""
-BINS = 10
 OTHER_DOUBTS = (
     Reason.FOCAL_UNCERTAIN,
     Reason.INTRINSICS_CONTRADICTED,
@@ -74,22 +72,6 @@ OTHER_DOUBTS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    scene: str
-    kind: str
-    photo: str
-    right: bool
-    signals: Mapping[str, float]
-    doubted: bool
-    """For another reason than the signals: never localized."""
-    nees: float | None
-    glanced: bool | None = None
-    """Whether the tracker's glance takes the pose for right; None: that wasn't asked."""
-    matched: bool = False
-    """Whether many matches with a view led there: then the pixels alone may decide."""
-
-
 def run(
     folders: Sequence[Path],
     *,
@@ -97,7 +79,7 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
 ) -> dict[str, Any]:
-    """Return the object that `--json` writes. Raises SceneError."""
+    """Return the object that `--json` writes; its `model` is what `model.json` holds. Raises SceneError."""
     subjects = [subject(Path(folder), cache_dir=cache_dir) for folder in folders]
     samples: list[Sample] = []
     total = sum(len(one.photos) for one in subjects)
@@ -107,17 +89,28 @@ def run(
         rng = np.random.default_rng(seed)
         others = [other for other in subjects if other is not one]
         cut = [_pixels(photo) for other in others for photo in other.photos[:OCCLUDERS]]
+        cut = cut or [garbage(number) for number in PATTERNED]
         for photo in one.photos:
             samples += _of_photo(one, photo, cut, rng)
             done += 1
             if progress:
                 progress(done, total)
         samples += _foreign(one, others)
-    return summary(samples) | {"samples": [_line(sample) for sample in samples]}
+    data = {"scenes": [_scene_line(one) for one in subjects], "seed": seed}
+    model = fit_model(samples, SHIPPED_MODEL, data)
+    return summary(samples, SHIPPED_MODEL) | {
+        "model": model_to_json(model),
+        "samples": [_line(sample) for sample in samples],
+    }
+
+
+def _scene_line(one: Subject) -> dict[str, Any]:
+    info = one.loaded.scene.info
+    return {"name": info.name, "sha256": info.sha256, "photos": len(one.photos)}
 
 
 def _line(sample: Sample) -> dict[str, Any]:
-    names = ("scene", "kind", "photo", "right", "doubted", "nees", "glanced", "matched")
+    names = ("scene", "kind", "photo", "right", "doubted", "nees", "tracked", "matched")
     return {name: getattr(sample, name) for name in names} | {"signals": dict(sample.signals)}
 
 
@@ -136,33 +129,38 @@ def _of_photo(
         yield _localized(one, kind, photo.name, query, file.truth.pose)
     data = photo.path.read_bytes()
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=one.background_rgb)
-    yield _localized(one, "mirrored", photo.name, mirrored(query), None)
+    yield _localized(one, "mirrored", photo.name, mirrored_query(query), None)
+    images = QueryImages(query, one.loaded.matcher)
     for _ in range(MOVES):
-        pose = _moved(photo.camera.pose, one, *NEAR, rng)
-        yield _sample(one, "near", photo.name, photo.camera.pose, pose, verify(query, pose, _tools(one)))
-        pose = _moved(photo.camera.pose, one, *MOVED, rng)
-        tools = _tools(one)
-        yield _sample(one, "moved", photo.name, photo.camera.pose, pose, verify(query, pose, tools))
-        yield from _followed(one, photo, query, pose)
-        frame, camera = rendered_frame(pose, query, tools)
-        size = camera.intrinsics
-        start = Camera(query.intrinsics.resized(size.width, size.height), pose)
-        found = refine_photometric(photo_at(query, tools, size), frame, camera, start, 2)
-        if np.isfinite(found.loss):
-            verdict = verify(query, found.pose, _tools(one))
-            yield _sample(one, "drifted", photo.name, photo.camera.pose, found.pose, verdict)
+        yield from _of_moved_pose(one, photo, images, rng)
 
 
-def _followed(one: Subject, photo: BenchPhoto, query: Query, expected: Pose) -> Iterator[Sample]:
+def _of_moved_pose(one: Subject, photo: BenchPhoto, images: QueryImages, rng: np.random.Generator) -> Iterator[Sample]:
+    """Yield samples of poses moved from the truth: near, moved, tracked from there, and refined from there."""
+    truth, rasterizer = photo.camera.pose, one.loaded.rasterizer
+    pose = _moved(truth, one, *NEAR, rng)
+    yield _sample(one, "near", photo.name, truth, pose, render_and_verify(images, pose, rasterizer))
+    pose = _moved(truth, one, *MOVED, rng)
+    rendered = ViewRenderer(rasterizer).at(images.query, pose)
+    yield _sample(one, "moved", photo.name, truth, pose, verify(images, pose, rendered))
+    yield from _tracked(one, photo, images, pose)
+    size = rendered.camera.intrinsics
+    start = Camera(images.query.intrinsics.resized(size.width, size.height), pose)
+    found = refine_photometric(images.resized(size), rendered.frame, rendered.camera, start, 2)
+    if np.isfinite(found.loss):
+        verdict = render_and_verify(images, found.pose, rasterizer)
+        yield _sample(one, "drifted", photo.name, truth, found.pose, verdict)
+
+
+def _tracked(one: Subject, photo: BenchPhoto, images: QueryImages, expected: Pose) -> Iterator[Sample]:
     """Yield what the tracker makes of a camera that isn't where it is expected."""
-    tools = _tools(one)
-    found = aligned_from(query, expected, None, tools)
+    found = refine_from(images, expected, None, one.loaded.rasterizer)
     if found is None:
         return
-    seen = glance(query, found, tools)
-    verdict = seen or verify(query, found.pose, tools)
-    sample = _sample(one, "followed", photo.name, photo.camera.pose, found.pose, verdict)
-    yield replace(sample, glanced=seen is not None and seen.status is Status.LOCALIZED)
+    by_pixels = verify_tracked(images, found)
+    verdict = by_pixels or render_and_verify(images, found.pose, one.loaded.rasterizer)
+    sample = _sample(one, "tracked", photo.name, photo.camera.pose, found.pose, verdict)
+    yield replace(sample, tracked=by_pixels is not None and by_pixels.status is Status.LOCALIZED)
 
 
 def _foreign(one: Subject, others: Sequence[Subject]) -> Iterator[Sample]:
@@ -214,17 +212,14 @@ def _moved(pose: Pose, one: Subject, between: tuple[float, float], most_deg: flo
     return moved(pose, np.concatenate([turn, shift]))
 
 
-def _tools(one: Subject) -> Tools:
-    loaded = one.loaded
-    rng = np.random.default_rng(0)
-    return Tools(loaded.scene, loaded.rasterizer, loaded.matcher, rng, loaded.prepare("view_index"))
-
-
 def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | None) -> Sample:
     estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
     weighed = nees(estimate, truth) if truth else None
-    verdict = replace(estimate.verdict, signals=verify(query, estimate.pose, _tools(one)).signals)
-    matched = any(r.stage == "refine" and (r.num_inliers or 0) >= GOOD_MATCH for r in estimate.records)
+    images = QueryImages(query, one.loaded.matcher)
+    signals = render_and_verify(images, estimate.pose, one.loaded.rasterizer).signals
+    verdict = replace(estimate.verdict, signals=signals)
+    sufficient = MATCHING.sufficient_inliers
+    matched = any(r.stage == "refine" and (r.num_inliers or 0) >= sufficient for r in estimate.records)
     return replace(_sample(one, kind, photo, truth, estimate.pose, verdict, weighed), matched=matched)
 
 
@@ -237,135 +232,3 @@ def _sample(
         right = degrees <= COARSE[0] and units <= COARSE[1]
     doubted = verdict.reason in OTHER_DOUBTS
     return Sample(one.loaded.scene.info.name, kind, photo, right, verdict.signals, doubted, weighed)
-
-
-def summary(samples: Sequence[Sample]) -> dict[str, Any]:
-    """Return weights fitted on all samples, and what such weights say of scenes that they were not fitted on."""
-    glanced = [sample for sample in samples if sample.glanced is not None]
-    samples = [sample for sample in samples if sample.glanced is None]
-    right = np.array([sample.right for sample in samples])
-    scenes = np.array([sample.scene for sample in samples])
-    kinds = np.array([sample.kind for sample in samples])
-    doubted = np.array([sample.doubted for sample in samples])
-    usual = right & ~np.char.startswith(kinds, "beyond")
-    matched = np.array([sample.matched for sample in samples])
-    result: dict[str, Any] = {"glance": _glances(glanced)}
-    by_pixels = np.zeros(len(samples))
-    for name, model in (("by_pixels", BY_PIXELS), ("with_matches", WITH_MATCHES)):
-        features = scaled(samples, model)
-        tested = np.zeros(len(samples))
-        for scene in np.unique(scenes):
-            here = scenes == scene
-            elsewhere = ~here & ~doubted  # what is refused for another reason is not for the signals to tell
-            weights, floor = fitted(features[elsewhere], right[elsewhere]), floors(features[~here & usual])
-            doubtful = (features[here] < floor).any(1)
-            tested[here] = probabilities(features[here], weights)
-            tested[here] = np.minimum(tested[here], np.where(doubtful, DOUBTFUL, 1.0))
-        if name == "by_pixels":
-            by_pixels = tested
-        else:  # as the estimator asks: matches only where the pixels don't make it clear
-            tested = np.where(matched & (by_pixels >= LOCALIZED), np.maximum(by_pixels, tested), tested)
-        ends = [SCALES[n].value_at(f) for n, f in zip(list(model)[1:], floors(features[usual])[1:], strict=True)]
-        result[name] = {
-            "weights": dict(zip(model, np.round(fitted(features[~doubted], right[~doubted]), 2).tolist(), strict=True)),
-            "floors": dict(zip(list(model)[1:], np.round(ends, 3).tolist(), strict=True)),
-            **_counts(tested, right, kinds, doubted),
-            "reliability": _reliability(tested, right),
-        }
-    return result
-
-
-def _glances(samples: Sequence[Sample]) -> dict[str, int]:
-    """Return how many right and wrong poses the tracker's glance takes for right."""
-    right, wrong = [s for s in samples if s.right], [s for s in samples if not s.right]
-    return {
-        "right": len(right),
-        "right_localized": sum(bool(s.glanced) for s in right),
-        "wrong": len(wrong),
-        "wrong_localized": sum(bool(s.glanced) for s in wrong),
-    }
-
-
-def scaled(samples: Sequence[Sample], model: Mapping[str, float]) -> Float64[np.ndarray, "n k"]:
-    """Return the samples' scaled signals in the model's order; the bias comes first and is 1."""
-    columns = [np.ones(len(samples))]
-    columns += [SCALES[name](np.array([s.signals[name] for s in samples])) for name in model if name != "bias"]
-    return np.stack(columns, 1)
-
-
-def probabilities(features: Float64[np.ndarray, "n k"], weights: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "n"]:
-    """Return the logistic model's values."""
-    return 1.0 / (1.0 + np.exp(-np.clip(features @ weights, -50, 50)))
-
-
-def fitted(features: Float64[np.ndarray, "n k"], right: Bool[np.ndarray, "n"]) -> Float64[np.ndarray, "k"]:
-    """Return the weights, none negative but the bias', that the samples make likeliest; both classes weigh alike.
-
-    Newton's steps on the free weights; one that would turn negative is fixed at 0.
-    """
-    weights = np.zeros(features.shape[1])
-    each = np.where(right, 0.5 / max(right.sum(), 1), 0.5 / max((~right).sum(), 1)) * len(right)
-    penalty = PENALTY * np.r_[0.0, np.ones(features.shape[1] - 1)] * len(right) / 100
-    free = np.ones(len(weights), bool)
-    for _ in range(100):
-        p = probabilities(features, weights)
-        gradient = features.T @ (each * (right - p)) - penalty * weights
-        hessian = (features * (each * p * (1 - p))[:, None]).T @ features + np.diag(penalty + 1e-9)
-        step = np.zeros_like(weights)
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
-        weights = weights + step * min(1.0, 5.0 / max(np.abs(step).max(), 1e-9))
-        below = np.r_[False, weights[1:] < 0]
-        weights[below], free[below] = 0.0, False
-        if np.abs(step).max() < 1e-6:
-            break
-    return weights
-
-
-def floors(features: Float64[np.ndarray, "n k"]) -> Float64[np.ndarray, "k"]:
-    """Return what nearly all of these right poses' scaled signals stay above."""
-    return np.quantile(features, BELOW_FLOOR, axis=0)
-
-
-def _counts(
-    tested: Float64[np.ndarray, "n"],
-    right: Bool[np.ndarray, "n"],
-    kinds: np.ndarray,
-    doubted: Bool[np.ndarray, "n"],
-) -> dict[str, Any]:
-    """Return how many of each kind are called localized, apart from those that are in doubt for other reasons."""
-    called = (tested >= LOCALIZED) & ~doubted
-    nothing = np.isin(kinds, ["foreign", "garbage"])
-    wrong = ~right & ~nothing
-    return {
-        "foreign_or_garbage": int(nothing.sum()),
-        "foreign_or_garbage_localized": int((called & nothing).sum()),
-        "wrong": int(wrong.sum()),
-        "wrong_localized": int((called & wrong).sum()),
-        "right": int(right.sum()),
-        "right_localized": int((called & right).sum()),
-        "by_kind": {
-            str(kind): {
-                "right": int((right & (kinds == kind)).sum()),
-                "right_localized": int((called & right & (kinds == kind)).sum()),
-                "wrong": int((~right & (kinds == kind)).sum()),
-                "wrong_localized": int((called & ~right & (kinds == kind)).sum()),
-            }
-            for kind in np.unique(kinds)
-        },
-    }
-
-
-def _reliability(tested: Float64[np.ndarray, "n"], right: Bool[np.ndarray, "n"]) -> list[dict[str, float]]:
-    """Return, for equal intervals of the probability, what was said and what came true."""
-    bins = np.minimum((tested * BINS).astype(int), BINS - 1)
-    return [
-        {
-            "from": k / BINS,
-            "to": (k + 1) / BINS,
-            "count": int((bins == k).sum()),
-            "said": float(tested[bins == k].mean()),
-            "true": float(right[bins == k].mean()),
-        }
-        for k in range(BINS)
-        if (bins == k).any()
-    ]

@@ -26,7 +26,7 @@ from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
 from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.photos.images import read_query
-from service.pose.retrieval.scene_focus import centre_depth
+from service.pose.features.scene_focus import centre_depth
 from service.results import PoseEstimate
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest

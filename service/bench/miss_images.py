@@ -48,8 +48,8 @@ def drawn(one: Subject, trial: Trial, estimate: PoseEstimate) -> tuple[bytes, fl
     size = lens.width, lens.height
     photo = resized(query.rgb.astype(np.float32) / 255, *size)
     known = np.ones(photo.shape[:2], bool)
-    if query.known is not None:
-        known = resized(np.repeat(query.known[:, :, None], 3, 2).astype(np.float32), *size)[:, :, 0] > 0.99
+    if query.valid_mask is not None:
+        known = resized(np.repeat(query.valid_mask[:, :, None], 3, 2).astype(np.float32), *size)[:, :, 0] > 0.99
     # Undistorted, the photo is a pinhole's of the same focal length.
     answer = Camera(replace(estimate.intrinsics.resized(*size), model="PINHOLE", distortion=()), estimate.pose)
     truth = Camera(replace(trial.truth.intrinsics.resized(*size), model="PINHOLE", distortion=()), trial.truth.pose)

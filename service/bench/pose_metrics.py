@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.geometry import pose_distance, se3_log
-from service.pose.retrieval.scene_focus import focus_of
+from service.pose.features.scene_focus import focus_of
 from service.results import PoseEstimate, Status
 from service.types import Camera, Pose
 

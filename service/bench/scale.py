@@ -24,7 +24,7 @@ from service.bench.pose_metrics import COARSE, FINE, Outcome, errors, units_of
 from service.errors import BackendMissing, InvalidRequest
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
 from service.photos.images import read_query
-from service.pose.retrieval.scene_focus import centre_depth
+from service.pose.features.scene_focus import centre_depth
 from service.scene_formats import load_scene
 from service.types import Camera, GaussianScene
 

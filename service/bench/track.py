@@ -25,7 +25,7 @@ from service.interfaces import Rasterizer
 from service.localize import LoadedScene, Request
 from service.photos.images import encode_image, read_query
 from service.photos.sequence import PHOTO_LONG_SIDE
-from service.pose.retrieval.scene_focus import centre_depth
+from service.pose.features.scene_focus import centre_depth
 from service.results import PoseEstimate, Status
 from service.scene_formats import load_scene
 from service.tracking import Tracker

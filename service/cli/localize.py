@@ -110,7 +110,7 @@ def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[Load
     """Localize every photo by itself, in the one scene or in each of several."""
     from service.cli import result_tables
     from service.localize import localize as run
-    from service.multi_scene import Found, localize_anywhere
+    from service.multi_scene import SceneEstimate, localize_in_scenes
     from service.web.schemas.conversion import result_out, timing_out
     from service.web.schemas.parsing import make_task
     from service.web.schemas.resources import versions
@@ -119,9 +119,9 @@ def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[Load
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         task, query = make_task(body, fields, loaded[0])
         if len(loaded) > 1:
-            found = localize_anywhere(query, loaded, task.request)
+            found = localize_in_scenes(query, loaded, task.request)
         else:
-            found = Found(run(query, loaded[0], task.request), loaded[0])
+            found = SceneEstimate(run(query, loaded[0], task.request), loaded[0])
         anchor = found.loaded.scene.info.geo_anchor
         results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
         if not output.as_json:

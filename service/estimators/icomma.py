@@ -13,7 +13,7 @@ that one epipolar geometry explains are taken.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -29,9 +29,9 @@ from service.pose.descent.gradient_descent import Se3, loss_and_gradient, requir
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
+from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import epipolar_inliers, match_record, render_and_match
-from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -76,12 +76,14 @@ class Options:
         require_loss(self.loss)
 
 
-def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
+def prepare(tools: Tools[None], cache_dir: Path | None) -> Focus:
     """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
 
-def run(query: Query, tools: Tools, options: Options, config: IcommaConfig = ICOMMA) -> Iterator[IterationRecord]:
+def run(
+    query: Query, tools: Tools[Focus], options: Options, config: IcommaConfig = ICOMMA
+) -> Generator[IterationRecord, None, None]:
     """Descend from the prior; the last record's pose is the answer. Raises InvalidPrior without a prior."""
     start = required_prior(query, "icomma")
     intrinsics = sized(query.intrinsics, options.long_side_px)
@@ -116,7 +118,7 @@ def run(query: Query, tools: Tools, options: Options, config: IcommaConfig = ICO
 
 
 def _rematch(
-    camera: Camera, images: QueryImages, tools: Tools, min_matches: int
+    camera: Camera, images: QueryImages, tools: Tools[Focus], min_matches: int
 ) -> tuple[Correspondences | None, IterationRecord]:
     """Match the photo with a render; return the epipolar inliers, None where they are too few, and the record."""
     found, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)

@@ -9,7 +9,7 @@ pixels; a twist in the normalized world instead of a screw axis.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -24,7 +24,7 @@ from service.pose.descent.gradient_descent import Se3, loss_and_gradient, requir
 from service.pose.descent.losses import Loss, interest_region, loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
-from service.pose.retrieval.scene_focus import Focus, focus_of_scene
+from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.results import IterationRecord
 from service.types import Pose, Query
 
@@ -61,12 +61,14 @@ class Options:
         require_loss(self.loss)
 
 
-def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
+def prepare(tools: Tools[None], cache_dir: Path | None) -> Focus:
     """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
 
-def run(query: Query, tools: Tools, options: Options, config: InerfConfig = INERF) -> Iterator[IterationRecord]:
+def run(
+    query: Query, tools: Tools[Focus], options: Options, config: InerfConfig = INERF
+) -> Generator[IterationRecord, None, None]:
     """Descend from the prior; the last record's pose is the answer. Raises InvalidPrior without a prior."""
     start = required_prior(query, "inerf")
     intrinsics = sized(query.intrinsics, options.long_side_px)

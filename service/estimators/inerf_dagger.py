@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import asdict, dataclass
 from typing import ClassVar
 
@@ -11,6 +11,7 @@ from service.interfaces import Tools
 from service.pose.descent.gradient_descent import require_within
 from service.pose.descent.losses import require_loss
 from service.pose.features.image_sizes import RENDER_PX
+from service.pose.features.scene_focus import Focus
 from service.results import IterationRecord
 from service.types import Query
 
@@ -34,7 +35,7 @@ class Options:
         require_loss(self.loss)
 
 
-def run(query: Query, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+def run(query: Query, tools: Tools[Focus], options: Options) -> Generator[IterationRecord, None, None]:
     """Run `inerf` on all pixels. Raises InvalidPrior without a prior."""
     inerf.required_prior(query, "inerf_dagger")
     yield from inerf.run(query, tools, inerf.Options(rays=0, **asdict(options)))

@@ -35,9 +35,9 @@ from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import View
+from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import match_record, render_and_match
-from service.pose.retrieval.scene_focus import Focus, focus_of_scene
 from service.pose.retrieval.viewpoints import index_cameras
 from service.render import RASTERIZERS
 from service.render.counted import Counted
@@ -128,7 +128,7 @@ class Prepared:
     viewpoints: tuple[Pose, ...]
 
 
-def prepare(tools: Tools, cache_dir: Path | None) -> Prepared:
+def prepare(tools: Tools[None], cache_dir: Path | None) -> Prepared:
     """Return the scene's focus and viewpoints, and a renderer of the pruned scene: takes a second, once a scene."""
     cameras = index_cameras(tools.scene, tools.rasterizer, tools.rng)
     # Evenly spread: neighbouring viewpoints see the same Gaussians.
@@ -140,11 +140,10 @@ def prepare(tools: Tools, cache_dir: Path | None) -> Prepared:
 
 
 def run(
-    query: Query, tools: Tools, options: Options, config: MonteCarloConfig = MONTE_CARLO
-) -> Iterator[IterationRecord]:
+    query: Query, tools: Tools[Prepared], options: Options, config: MonteCarloConfig = MONTE_CARLO
+) -> Generator[IterationRecord, None, None]:
     """Run the stages that the options leave in; see the module. A record's pose is the best one so far."""
-    prepared: Prepared = tools.prepared
-    pose = query.prior or prepared.viewpoints[0]
+    pose = query.prior or tools.prepared.viewpoints[0]
     images = QueryImages(query, tools.matcher)
     yield IterationRecord("start", pose)
     if options.hypotheses:
@@ -166,7 +165,7 @@ class _Hypothesis:
 
 
 def _sample(
-    start: Pose, images: QueryImages, tools: Tools, options: Options, config: MonteCarloConfig
+    start: Pose, images: QueryImages, tools: Tools[Prepared], options: Options, config: MonteCarloConfig
 ) -> Generator[IterationRecord, None, Pose]:
     """Draw hypotheses, score them, resample around the best; return the best."""
     focus = tools.prepared.focus
@@ -201,7 +200,7 @@ def _sample(
 
 
 def _score(
-    pose: Pose, images: QueryImages, tools: Tools, options: Options, scored: list[_Hypothesis]
+    pose: Pose, images: QueryImages, tools: Tools[Prepared], options: Options, scored: list[_Hypothesis]
 ) -> IterationRecord:
     """Render a hypothesis from the pruned scene, match, solve, and append it to those scored."""
     camera = Camera(sized(images.query.intrinsics, options.hypothesis_px), pose)
@@ -214,7 +213,7 @@ def _score(
 
 
 def _optimize_decoupled(
-    start: Pose, images: QueryImages, tools: Tools, options: Options
+    start: Pose, images: QueryImages, tools: Tools[Prepared], options: Options
 ) -> Generator[IterationRecord, None, Pose]:
     """Render, match and solve, `iterations` times; return the solution with the most support."""
     pose, best, most = start, start, -1.0
@@ -234,7 +233,7 @@ def _optimize_decoupled(
     return best
 
 
-def _descend(start: Pose, images: QueryImages, tools: Tools, options: Options) -> Iterator[IterationRecord]:
+def _descend(start: Pose, images: QueryImages, tools: Tools[Prepared], options: Options) -> Iterator[IterationRecord]:
     """Descend the photometric loss from `start`; each record has the pose of the least loss so far."""
     intrinsics = sized(images.query.intrinsics, options.render_px)
     loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
@@ -247,7 +246,7 @@ def _descend(start: Pose, images: QueryImages, tools: Tools, options: Options) -
 
 
 def _solve(
-    matches: Correspondences, pose: Pose, query: Query, tools: Tools, gradient_round: int | None
+    matches: Correspondences, pose: Pose, query: Query, tools: Tools[Prepared], gradient_round: int | None
 ) -> DecoupledSolution | None:
     """Solve one render's matches for the pose; None where they are too few.
 

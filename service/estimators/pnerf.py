@@ -13,7 +13,7 @@ Deviation: the scene is one of Gaussians, not an Instant-NGP. Renders of 100 px 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -28,7 +28,7 @@ from service.pose.descent.gradient_descent import So3T3, loss_and_gradient, requ
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import sized
 from service.pose.features.query_images import QueryImages
-from service.pose.retrieval.scene_focus import Focus, focus_of_scene
+from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.results import Candidates, IterationRecord
 from service.types import Pose, Query
 
@@ -80,7 +80,7 @@ class Options:
         require_loss(self.loss)
 
 
-def prepare(tools: Tools, cache_dir: Path | None) -> Focus:
+def prepare(tools: Tools[None], cache_dir: Path | None) -> Focus:
     """Return the scene's focus, which defines the normalized units."""
     return focus_of_scene(tools.scene, tools.rasterizer)
 
@@ -103,7 +103,9 @@ class _Hypothesis:
         self._numbers = self._numbers - rates * self._adam.step(self._of.gradient(self._numbers, by_twist))
 
 
-def run(query: Query, tools: Tools, options: Options, config: PnerfConfig = PNERF) -> Iterator[IterationRecord]:
+def run(
+    query: Query, tools: Tools[Focus], options: Options, config: PnerfConfig = PNERF
+) -> Generator[IterationRecord, None, None]:
     """Descend from poses around the prior. A record's pose is that of the least loss in its step.
 
     Raises InvalidPrior without a prior.
@@ -132,7 +134,7 @@ def run(query: Query, tools: Tools, options: Options, config: PnerfConfig = PNER
 
 
 def _resampled(
-    hypotheses: list[_Hypothesis], round_number: int, tools: Tools, config: PnerfConfig
+    hypotheses: list[_Hypothesis], round_number: int, tools: Tools[Focus], config: PnerfConfig
 ) -> list[_Hypothesis]:
     """Keep the best, and replace the others by hypotheses drawn around them in turn; rounds count from 1."""
     # Stable sort: with equal losses the result doesn't depend on chance.
@@ -146,9 +148,9 @@ def _resampled(
     return parents + children
 
 
-def _drawn(pose: Pose, degrees: float, units: float, tools: Tools) -> _Hypothesis:
+def _drawn(pose: Pose, degrees: float, units: float, tools: Tools[Focus]) -> _Hypothesis:
     """Draw a hypothesis, uniformly: rotation vector within +-degrees an axis, translation within +-units."""
-    focus: Focus = tools.prepared
+    focus = tools.prepared
     turn = np.radians(degrees) * tools.rng.uniform(-1, 1, 3)
     numbers = np.concatenate([turn, units * tools.rng.uniform(-1, 1, 3)])
     return _Hypothesis(So3T3(pose, focus).pose(numbers), focus)

@@ -47,7 +47,7 @@ class Trajectory:
             last,
             stage="track" if frame.tracked else "localize",
             pose=shown.pose,
-            lens=shown.lens,
+            correction=shown.correction,
             index=frame.index,
             elapsed_s=self._clock.wall_s,
             cpu_s=self._clock.cpu_s,

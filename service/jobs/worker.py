@@ -15,7 +15,7 @@ from service.jobs.sqlite_store import Batch, Ending, StoredJob
 from service.jobs.trajectory import Trajectory
 from service.localize import Cancelled, LoadedScene, Request, localize
 from service.logs import bound
-from service.multi_scene import Found, localize_anywhere
+from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import Reading, read_sequence
 from service.results import IterationRecord
 from service.scene_manager.manager import several
@@ -100,13 +100,13 @@ class Attempts:
             _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
             return ending("interrupted" if isinstance(error, SceneError) else "failed", error)
 
-    def _found(self, live: LiveJob, query: Query, request: Request, sent: _Sent) -> Found:
+    def _found(self, live: LiveJob, query: Query, request: Request, sent: _Sent) -> SceneEstimate:
         """Localize one photo in the job's scene, or in the one of several that it shows."""
         told = partial(self._tell_step, live, sent)
         loaded, *others = live.held
         if others:
-            return localize_anywhere(query, live.held, request, told)
-        return Found(localize(query, loaded, request, told), loaded)
+            return localize_in_scenes(query, live.held, request, told)
+        return SceneEstimate(localize(query, loaded, request, told), loaded)
 
     def _sequence(
         self, live: LiveJob, reading: Reading, request: Request, loaded: LoadedScene, sent: _Sent

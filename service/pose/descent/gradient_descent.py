@@ -25,7 +25,7 @@ from service.interfaces import Rasterizer
 from service.pose.absolute_pose.decoupled import rotate_about, translate_in_camera
 from service.pose.descent.adam import Adam
 from service.pose.descent.losses import Loss
-from service.pose.retrieval.scene_focus import Focus
+from service.pose.features.scene_focus import Focus
 from service.types import Camera, Intrinsics, Pose
 
 NORMAL_DISTANCE = 4.0

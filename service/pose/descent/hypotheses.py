@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from service.geometry import look_at, so3_exp
 from service.pose.features.rendered_views import View
-from service.pose.retrieval.scene_focus import Focus
+from service.pose.features.scene_focus import Focus
 from service.types import Pose
 
 

@@ -15,15 +15,22 @@ from jaxtyping import Bool, Float64, UInt8
 
 from service.interfaces import Features, Matcher
 from service.pose.features.image_sizes import PHOTO_PX, SIZE_MULTIPLE_PX, sized
-from service.pose.features.in_plane_rotation import PHOTO_CORNERS, Corners, corners
+from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.types import Intrinsics, IntrinsicsCorrection, Query
 
-PHOTO_FEATURES = 2048
-"""Features of a photo, at most."""
-MARGIN_PX = 6
-"""Least distance of a feature from an invalid pixel: nearer ones describe the mask's edge."""
-MIN_VALID_SHARE = 0.99
-"""Share of valid photo pixels in a pixel of a resized copy from which on that counts as valid."""
+
+@dataclass(frozen=True, slots=True)
+class PhotoConfig:
+    """What is taken from a photo."""
+
+    max_features: int = 2048
+    margin_px: int = 6
+    """Least distance of a feature from an invalid pixel: nearer ones describe the mask's edge."""
+    min_valid_share: float = 0.99
+    """Share of valid photo pixels in a pixel of a resized copy from which on that counts as valid."""
+
+
+PHOTOS = PhotoConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +58,12 @@ class QueryImages:
 
     def valid_mask(self, size: Intrinsics) -> Bool[np.ndarray, "h w"] | None:
         """Return which pixels of `resized(size)` are of valid photo pixels alone; None: all."""
-        if self.query.known is None:
+        if self.query.valid_mask is None:
             return None
         key = size.width, size.height
         if key not in self._masks:
-            share = cv2.resize(self.query.known.astype(np.float32), key, interpolation=cv2.INTER_AREA)
-            self._masks[key] = np.asarray(share) > MIN_VALID_SHARE
+            share = cv2.resize(self.query.valid_mask.astype(np.float32), key, interpolation=cv2.INTER_AREA)
+            self._masks[key] = np.asarray(share) > PHOTOS.min_valid_share
         return self._masks[key]
 
     def features(self, long_side: int = PHOTO_PX, roll_steps_45deg: int = 0) -> Features:
@@ -69,7 +76,7 @@ class QueryImages:
         if key not in self._features:
             size = sized(self.query.intrinsics, long_side)
             rotated, rotated_from_photo = _rotated(self.resized(size), roll_steps_45deg)
-            found = self.matcher.extract(rotated, PHOTO_FEATURES)
+            found = self.matcher.extract(rotated, PHOTOS.max_features)
             points = (found.points_px - rotated_from_photo[:, 2]) @ rotated_from_photo[:, :2]
             keep = _away_from_edges(points, self.valid_mask(size), size, bool(roll_steps_45deg % 2))
             scale = np.array([self.query.rgb.shape[1] / size.width, self.query.rgb.shape[0] / size.height])
@@ -81,7 +88,7 @@ class QueryImages:
     def corners(self) -> Corners:
         """Return the photo's corners at PHOTO_PX, for the estimate of its in-plane rotation."""
         size = sized(self.query.intrinsics, PHOTO_PX)
-        return corners(self.resized(size), PHOTO_CORNERS, self.valid_mask(size))
+        return detect_corners(self.resized(size), CORNERS.of_photo, self.valid_mask(size))
 
 
 def _rotated(
@@ -106,12 +113,12 @@ def _rotated(
 def _away_from_edges(
     points: Float64[np.ndarray, "n 2"], valid: Bool[np.ndarray, "h w"] | None, size: Intrinsics, oblique: bool
 ) -> Bool[np.ndarray, "n"]:
-    """Return which points keep MARGIN_PX from invalid pixels and, if the image was rotated obliquely, its borders."""
-    keep = np.ones(len(points), bool)
+    """Return which points keep the margin from invalid pixels and, after an oblique rotation, from the borders."""
+    keep, margin = np.ones(len(points), bool), PHOTOS.margin_px
     if oblique:  # the borders became lines in the canvas
-        keep &= ((points > MARGIN_PX) & (points < np.array([size.width, size.height]) - MARGIN_PX)).all(1)
+        keep &= ((points > margin) & (points < np.array([size.width, size.height]) - margin)).all(1)
     if valid is not None:
-        around = np.ones((2 * MARGIN_PX + 1, 2 * MARGIN_PX + 1), np.uint8)
+        around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
         safe = cv2.erode(valid.astype(np.uint8), around, borderType=cv2.BORDER_REPLICATE) > 0
         column, row = np.clip(points.astype(int), 0, [size.width - 1, size.height - 1]).T
         keep &= safe[row, column]

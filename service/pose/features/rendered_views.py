@@ -13,16 +13,23 @@ from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.pose.features.image_sizes import FREE_FOCAL_RENDER_PX, RENDER_PX, sized
 from service.types import Camera, Intrinsics, Pose, Query, frozen
 
-VIEW_FEATURES = 800
-"""Features of a render, at most."""
-MAX_DEPTH_RANGE = 0.06
-"""Relative, over 3x3 pixels: beyond it a feature lies on a depth edge, and its scene point is uncertain."""
-MIN_ALPHA = 0.5
-"""Opacity from which on a pixel counts as surface."""
-GRID_PX = 16
-"""Spacing of the pixels at which two cameras' images are compared."""
-MIN_MATCHING_SHARE = 0.9
-"""Share of those pixels that may move by no more than the tolerance."""
+
+@dataclass(frozen=True, slots=True)
+class ViewConfig:
+    """What is taken from a render."""
+
+    max_features: int = 800
+    max_depth_range: float = 0.06
+    """Relative, over 3x3 pixels: beyond it a feature lies on a depth edge, and its scene point is uncertain."""
+    min_alpha: float = 0.5
+    """Opacity from which on a pixel counts as surface."""
+    grid_px: int = 16
+    """Spacing of the pixels at which two cameras' images are compared."""
+    min_unmoved_share: float = 0.9
+    """Share of those pixels that move by less than the tolerance if the images are the same."""
+
+
+VIEWS = ViewConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,14 +64,14 @@ class RenderedView:
         height, width = self.frame.alpha.shape
         if (width, height) != (size.width, size.height):
             return False
-        row, column = (grid.ravel() for grid in np.mgrid[4:height:GRID_PX, 4:width:GRID_PX])
+        row, column = (grid.ravel() for grid in np.mgrid[4 : height : VIEWS.grid_px, 4 : width : VIEWS.grid_px])
         depth = self.frame.median_depth[row, column]
         px = np.stack([column, row], 1)[depth > 0] + 0.5
         if len(px) == 0:
             return False
         points = transformed(own.pose.world_from_camera, unproject(px, depth[depth > 0], own.intrinsics))
         error = reprojection_error_px(px, points, size, camera.pose)
-        return bool((error < tolerance_px).mean() > MIN_MATCHING_SHARE)
+        return bool((error < tolerance_px).mean() > VIEWS.min_unmoved_share)
 
 
 @dataclass(slots=True)
@@ -96,16 +103,16 @@ def camera_of(query: Query, pose: Pose, long_side: int | None = None) -> Camera:
 def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
     """Render, extract features at the render's own size, and backproject them."""
     (frame,) = rasterizer.render([camera])
-    return backprojected(matcher.extract(to_uint8(frame.rgb), VIEW_FEATURES), frame, camera)
+    return backprojected(matcher.extract(to_uint8(frame.rgb), VIEWS.max_features), frame, camera)
 
 
 def _features_of(frame: Frame, size: Intrinsics, matcher: Matcher) -> Features:
     """Return a render's features, extracted at RENDER_PX: from a larger one they would be finer than the photo's."""
     rgb, small = to_uint8(frame.rgb), sized(size, RENDER_PX)
     if small.width * small.height >= size.width * size.height:
-        return matcher.extract(rgb, VIEW_FEATURES)
+        return matcher.extract(rgb, VIEWS.max_features)
     found = matcher.extract(
-        np.asarray(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)), VIEW_FEATURES
+        np.asarray(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)), VIEWS.max_features
     )
     scale = np.array([size.width / small.width, size.height / small.height], np.float32)
     return replace(found, points_px=found.points_px * scale)
@@ -118,8 +125,8 @@ def backprojected(features: Features, frame: Frame, camera: Camera) -> View:
     row = np.clip(features.points_px[:, 1].astype(int), 1, height - 2)
     around = np.stack([frame.median_depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], 1)
     nearest, farthest = around.min(1, initial=np.inf), around.max(1, initial=0.0)
-    smooth = (nearest > 0) & (farthest - nearest < MAX_DEPTH_RANGE * nearest)
-    keep = np.flatnonzero(smooth & (frame.alpha[row, column] > MIN_ALPHA))
+    smooth = (nearest > 0) & (farthest - nearest < VIEWS.max_depth_range * nearest)
+    keep = np.flatnonzero(smooth & (frame.alpha[row, column] > VIEWS.min_alpha))
     points = unproject(features.points_px[keep], np.median(around[keep], axis=1), camera.intrinsics)
     return View(
         camera,

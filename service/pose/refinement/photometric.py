@@ -36,7 +36,6 @@ from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose
 class FinalLevel:
     """The finest level of a refinement, and where it ended there: enough to estimate the uncertainty."""
 
-    frame: Frame
     level: PyramidLevel
     photometric: Float64[np.ndarray, "4"]
     """Gain, bias, gamma, blur."""
@@ -89,4 +88,4 @@ def refine_photometric(
     assert level is not None
     # The unknown is photo_from_render; the photo's camera is at its inverse from the render's.
     pose = moved(camera.pose, se3_log(np.linalg.inv(state.photo_from_render)))
-    return RefinementResult(pose, state.correction, loss, FinalLevel(frame, level, state.photometric))
+    return RefinementResult(pose, state.correction, loss, FinalLevel(level, state.photometric))

@@ -56,8 +56,8 @@ def pose_uncertainty(
     linearized anew unless `result` is the refinement on this very frame that led to the answer. None where the pixels
     don't determine the pose.
     """
-    final = result.final_level if result and result.pose is answer.pose else None
-    if final and final.frame is frame:
+    final = result.final_level if result else None
+    if final:
         level, photometric = replace(final.level, photo_intrinsics=answer.intrinsics), final.photometric
     else:
         (level,) = linearized_levels(

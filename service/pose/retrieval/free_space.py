@@ -10,27 +10,40 @@ from jaxtyping import Bool, Float64
 from service.jit import kernel
 from service.types import GaussianScene
 
-MIN_OPACITY = 0.3
-MAX_POINTS = 400_000
-CELLS = 400_000
-"""Of the grid, at most, in the middle 98 % of the volume."""
-POINTS_PER_CELL = 4
-"""On the six sides of a cube of cells: fewer cells, if there are not enough points to close a wall."""
-GAUSSIAN_PX = 1.2
-"""Middle one of the median Gaussian's three sizes in its training photos; 0.5 to 2.4 in seven scenes."""
-ASSUMED_FOCAL_PX = 1000.0
-COARSE_RADII = (2.0, 5.0)
-"""Radii of the scene that the typical distance, and any, is at most: scenes of few, large Gaussians look far away."""
-ENOUGH_GOOD, GOOD_PER_AREA = (200, 1200), 40
-"""Good views to look for: so many for each square of the typical distance that the surfaces have."""
-RAYS = 32
-LEAVING = 2.0
-"""Cells next to where a march begins that are not looked at: they may be of the surface that it leaves."""
+
+@dataclass(frozen=True, slots=True)
+class SpaceConfig:
+    """How a scene's free space is gridded, and how distances are inferred from the Gaussians' sizes."""
+
+    min_opacity: float = 0.3
+    """Of the Gaussians that count as surface."""
+    max_points: int = 400_000
+    max_cells: int = 400_000
+    """Of the grid over the middle 98 % of the volume."""
+    points_per_cell: int = 4
+    """On the six sides of a cube of cells: fewer cells, if there are not enough points to close a wall."""
+    gaussian_px: float = 1.2
+    """Middle one of the median Gaussian's three sizes in its training photos; 0.5 to 2.4 in seven scenes."""
+    assumed_focal_px: float = 1000.0
+    """Of training photos of which nothing is known."""
+    max_typical_radii: float = 2.0
+    max_radii: float = 5.0
+    """Radii of the scene that the typical distance, and any, is at most: few, large Gaussians seem to be far away."""
+    min_good_views: int = 200
+    max_good_views: int = 1200
+    good_views_per_area: int = 40
+    """Good views to search: so many for each square of the typical distance that the surfaces have, within bounds."""
+    enclosure_rays: int = 32
+    skipped_cells: float = 2.0
+    """Cells at the start of a ray that are not examined: they may be of the surface that it leaves."""
+
+
+SPACE = SpaceConfig()
 
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """The opaque Gaussians, at most MAX_POINTS, and a grid over the middle 98 % of them."""
+    """The opaque Gaussians, at most `SpaceConfig.max_points`, and a grid over the middle 98 % of them."""
 
     points: Float64[np.ndarray, "n 3"]
     distances: Float64[np.ndarray, "n"]
@@ -49,7 +62,9 @@ class Space:
     def enough(self) -> float:
         """How many good views are looked for."""
         area = self.filled.sum() * self.cell**2
-        return float(np.clip(GOOD_PER_AREA * area / self.distance**2, *ENOUGH_GOOD))
+        return float(
+            np.clip(SPACE.good_views_per_area * area / self.distance**2, SPACE.min_good_views, SPACE.max_good_views)
+        )
 
     def occupied(self, positions: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether Gaussians are there; outside the grid there are none."""
@@ -63,16 +78,18 @@ class Space:
     ) -> Float64[np.ndarray, "n"]:
         """Return how far one gets from points of surfaces before Gaussians are in the way, at most `reach`."""
         starts = (points - self.low) / self.cell
-        steps = _steps_in_the_clear(self.filled, starts, directions, LEAVING, max(0, round(reach / self.cell)))
-        return np.minimum((LEAVING + steps) * self.cell, reach)
+        steps = _steps_in_the_clear(
+            self.filled, starts, directions, SPACE.skipped_cells, max(0, round(reach / self.cell))
+        )
+        return np.minimum((SPACE.skipped_cells + steps) * self.cell, reach)
 
     def enclosures(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Return for each place the share of all directions in which something is met within the grid."""
-        starts = np.repeat((positions - self.low) / self.cell, RAYS, axis=0)
-        directions = np.tile(lattice(RAYS), (len(positions), 1))
+        starts = np.repeat((positions - self.low) / self.cell, SPACE.enclosure_rays, axis=0)
+        directions = np.tile(lattice(SPACE.enclosure_rays), (len(positions), 1))
         most = int(np.linalg.norm(self.filled.shape))
-        met = _steps_in_the_clear(self.filled, starts, directions, LEAVING, most) < most
-        return met.reshape(-1, RAYS).mean(1)
+        met = _steps_in_the_clear(self.filled, starts, directions, SPACE.skipped_cells, most) < most
+        return met.reshape(-1, SPACE.enclosure_rays).mean(1)
 
 
 @kernel
@@ -95,17 +112,17 @@ def _steps_in_the_clear(filled, starts, directions, first, most):
 
 def survey(scene: GaussianScene) -> Space:
     """Return the space of a scene."""
-    opaque = np.flatnonzero(scene.opacities > MIN_OPACITY)
+    opaque = np.flatnonzero(scene.opacities > SPACE.min_opacity)
     opaque = opaque if len(opaque) else np.arange(scene.count)
-    opaque = opaque[:: -(-len(opaque) // MAX_POINTS)]
+    opaque = opaque[:: -(-len(opaque) // SPACE.max_points)]
     points = scene.means[opaque].astype(np.float64)
     sizes = np.sort(scene.scales[opaque].astype(np.float64), axis=1)[:, 1]  # long and thin ones: how fine they are
     sizes = np.clip(sizes, *np.quantile(sizes, [0.1, 0.9]))
     info = scene.info
-    focal = info.training_focal_px or info.training_long_side_px or ASSUMED_FOCAL_PX
+    focal = info.training_focal_px or info.training_long_side_px or SPACE.assumed_focal_px
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
-    cells = min(CELLS, (len(points) / (6 * POINTS_PER_CELL)) ** 1.5)
+    cells = min(SPACE.max_cells, (len(points) / (6 * SPACE.points_per_cell)) ** 1.5)
     cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / cells)), 1e-9)
     shape = np.floor((high - low) / cell).astype(int) + 1
     index = np.floor((points - low) / cell).astype(int)
@@ -114,7 +131,7 @@ def survey(scene: GaussianScene) -> Space:
     middle = np.median(points, axis=0)
     radius = float(np.median(np.linalg.norm(points - middle, axis=1)))
     up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
-    distances = np.clip(sizes * focal / GAUSSIAN_PX, 1e-9, max(COARSE_RADII[1] * radius, 1e-9))
+    distances = np.clip(sizes * focal / SPACE.gaussian_px, 1e-9, max(SPACE.max_radii * radius, 1e-9))
     return Space(
         points,
         distances,
@@ -124,7 +141,7 @@ def survey(scene: GaussianScene) -> Space:
         middle,
         radius,
         up,
-        float(min(np.median(distances), COARSE_RADII[0] * radius)),
+        float(min(np.median(distances), SPACE.max_typical_radii * radius)),
     )
 
 

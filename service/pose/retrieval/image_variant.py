@@ -1,104 +1,116 @@
-"""How a photo is looked at in a search: in which size, and turned by how much; and which views look like it then."""
+"""The variants of a photo that a search compares with the index: its sizes and in-plane rotations."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float64
 
-from service.interfaces import Features, Tools
+from service.interfaces import Features
 from service.pose.absolute_pose.prior_region import distance_outside
 from service.pose.features.image_sizes import PHOTO_PX
-from service.pose.features.in_plane_rotation import turns_to_upright
-from service.pose.features.views import images_of, photo_features
+from service.pose.features.in_plane_rotation import rolls_to_upright
+from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.retrieval.index import ViewIndex
-from service.types import Query
-
-GLIMPSE_SHARE = 0.77
-"""Of the photo's size, enough to recognise a whole, sharp one in half the time: each of the 58 clean test photos has 75
-or more matches that agree with its likeliest view, where foreign ones have 12."""
-SECOND_LOOK = 1.25
-"""A photo that isn't found at once is looked at in a size larger by this."""
-SAME_SCALE = 1.4
-"""Features stand this factor between the photo's pixels and the views' (in rad); beyond it the photo is resized."""
-SCALES_PX = (160, 640)
-GLANCE_PX = 256
-"""Of the photo, enough to see whether it could be elsewhere."""
-TURNS = 2
-"""That are looked at, of those that the photo's corners may mean."""
-TURN_BIAS = 0.77
-"""On turned photos the right turn has 1.3 to 6 times the votes of the others, on upright ones at least 0.83."""
-ODD_SHRINK = 0.8
-"""A photo turned by an eighth needs twice the canvas."""
-NEAREST = 16
-"""Views that are searched of those outside a prior's region: what is photographed inside may be seen from there."""
+from service.pose.retrieval.scores import SCORES, ScoreConfig, retrieval_scores
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """How the photo is looked at in a search."""
+class RetrievalConfig:
+    """In which variants a photo is compared with the index."""
+
+    scores: ScoreConfig = SCORES
+    same_scale: float = 1.4
+    """Ratio of the angles that a pixel of photo and views covers, which features tolerate; beyond it the photo is
+    resized."""
+    min_photo_px: int = 160
+    max_photo_px: int = 640
+    """Bounds of that size (long side)."""
+    max_rotations: int = 2
+    """In-plane rotations that are compared, of those that the photo's corners suggest."""
+    rotation_bias: float = 0.77
+    """A rotation must have more than 1 / this times the score of the upright photo: rotated photos have 1.3 to 6 times
+    the others' with the right rotation, upright ones at least 0.83."""
+    oblique_shrink: float = 0.8
+    """Size of a photo rotated by an odd multiple of 45 degrees, which needs twice the canvas."""
+    views_outside_prior: int = 16
+    """Views nearest to a prior's region that are searched if fewer lie in it: they may see what is photographed."""
+
+
+RETRIEVAL = RetrievalConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class ImageVariant:
+    """A size of the photo, and a rotation that makes it upright."""
 
     long_side: int
-    eighths: int = 0
-    """Of a turn, counter-clockwise, that make it upright."""
+    """Pixels."""
+    roll_steps_45deg: int = 0
+    """Counter-clockwise."""
 
-    def sized(self, share: float) -> Sight:
+    def scaled(self, factor: float) -> ImageVariant:
         """Return the photo in another size."""
-        return replace(self, long_side=round(share * self.long_side))
-
-    def features(self, query: Query, tools: Tools) -> Features:
-        """Return the photo's features, looked at like this, in pixels of `Query.rgb`."""
-        shrink = ODD_SHRINK if self.eighths % 2 else 1.0
-        return photo_features(query, tools, round(self.long_side * shrink), self.eighths)
-
-    def votes(self, query: Query, tools: Tools) -> Float64[np.ndarray, "views"]:
-        """Return how much each view is like the photo, looked at like this; those far from its region are last."""
-        key = ("votes", self.long_side, self.eighths)
-        if key not in tools.memo:
-            votes = tools.prepared.votes(self.features(query, tools).descriptors)
-            tools.memo[key] = _within_reach(votes, query, tools.prepared)
-        return tools.memo[key]
+        return replace(self, long_side=round(factor * self.long_side))
 
     @property
     def max_error_px(self) -> float:
-        """At PHOTO_PX."""
+        """Reprojection error of an inlier, at PHOTO_PX: a smaller variant's features are less precise."""
         return MATCH_ERROR_PX * max(1.0, PHOTO_PX / self.long_side)
 
 
-def first_sight(query: Query, tools: Tools) -> Sight:
-    """Return the photo upright, in the size in which its details are as large as the views'."""
-    # Views that the scene itself placed stand as near as its detail asks for, whatever their lens.
-    return Sight(_same_scale_px(query, tools.prepared) if tools.scene.cameras else PHOTO_PX)
+@dataclass(frozen=True, slots=True)
+class Retrieval:
+    """Compares the variants of one photo with the views of one index, each variant once."""
 
+    images: QueryImages
+    index: ViewIndex
+    config: RetrievalConfig = RETRIEVAL
+    _scores: dict[ImageVariant, Float64[np.ndarray, "views"]] = field(default_factory=dict, repr=False)
 
-def turned_sight(upright: Sight, query: Query, tools: Tools) -> Sight:
-    """Return the photo upright, or turned as its corners say, if the views' votes agree."""
-    found = images_of(query, tools).corners()
-    best, most = upright, 0.0
-    for eighths in [turn for turn in turns_to_upright(found, tools.prepared.corners) if turn][:TURNS]:
-        turned = replace(upright, eighths=eighths)
-        votes = TURN_BIAS * turned.votes(query, tools).max()
-        if votes > max(most, upright.votes(query, tools).max()):
-            best, most = turned, votes
-    return best
+    def features(self, variant: ImageVariant) -> Features:
+        """Return the variant's features, in pixels of `Query.rgb`."""
+        shrink = self.config.oblique_shrink if variant.roll_steps_45deg % 2 else 1.0
+        return self.images.features(round(variant.long_side * shrink), variant.roll_steps_45deg)
 
+    def scores(self, variant: ImageVariant) -> Float64[np.ndarray, "views"]:
+        """Return how much each view is like the photo; views far from its prior's region are below all others."""
+        if variant not in self._scores:
+            descriptors = [view.features.descriptors for view in self.index.views]
+            scores = retrieval_scores(self.features(variant).descriptors, descriptors, self.config.scores)
+            self._scores[variant] = self._demoted_outside_prior(scores)
+        return self._scores[variant]
 
-def _same_scale_px(query: Query, index: ViewIndex) -> int:
-    """Return the photo's size at which a pixel covers the angle that it covers in the views, if that matters."""
-    lenses = [view.camera.intrinsics for view in index.views]
-    of_views = float(np.median([max(lens.fx, lens.fy) / lens.long_side for lens in lenses]))
-    factor = of_views * query.intrinsics.long_side / max(query.intrinsics.fx, query.intrinsics.fy)
-    if 1 / SAME_SCALE < factor < SAME_SCALE or query.intrinsics_source == "guessed":
-        return PHOTO_PX
-    return int(np.clip(PHOTO_PX * factor, *SCALES_PX))
+    def upright_variant(self) -> ImageVariant:
+        """Return the upright photo in the size at which a pixel covers the angle that it covers in the views.
 
+        PHOTO_PX where the angles differ little, or the focal length is a guess.
+        """
+        query = self.images.query
+        lenses = [view.camera.intrinsics for view in self.index.views]
+        of_views = float(np.median([max(lens.fx, lens.fy) / lens.long_side for lens in lenses]))
+        factor = of_views * query.intrinsics.long_side / max(query.intrinsics.fx, query.intrinsics.fy)
+        if 1 / self.config.same_scale < factor < self.config.same_scale or query.intrinsics_source == "guessed":
+            return ImageVariant(PHOTO_PX)
+        return ImageVariant(int(np.clip(PHOTO_PX * factor, self.config.min_photo_px, self.config.max_photo_px)))
 
-def _within_reach(votes: Float64[np.ndarray, "views"], query: Query, index: ViewIndex) -> Float64[np.ndarray, "views"]:
-    """Return the views' votes, those of views that are far from the photo's region put below all others."""
-    if query.region is None:
-        return votes
-    away = np.array([distance_outside(query.region, view.camera.pose) for view in index.views])
-    reach = np.sort(away)[min(NEAREST, len(away)) - 1]
-    return np.where(away <= reach, votes, min(0.0, float(votes.min())))
+    def rotated_variant(self, upright: ImageVariant) -> ImageVariant:
+        """Return the rotation that the photo's corners suggest, if its scores exceed those of the upright photo."""
+        suggested = rolls_to_upright(self.images.corners(), self.index.corners)
+        best, most = upright, 0.0
+        for steps in [steps for steps in suggested if steps][: self.config.max_rotations]:
+            rotated = replace(upright, roll_steps_45deg=steps)
+            score = self.config.rotation_bias * self.scores(rotated).max()
+            if score > max(most, self.scores(upright).max()):
+                best, most = rotated, score
+        return best
+
+    def _demoted_outside_prior(self, scores: Float64[np.ndarray, "views"]) -> Float64[np.ndarray, "views"]:
+        region = self.images.query.region
+        if region is None:
+            return scores
+        away = np.array([distance_outside(region, view.camera.pose) for view in self.index.views])
+        reach = np.sort(away)[min(self.config.views_outside_prior, len(away)) - 1]
+        return np.where(away <= reach, scores, min(0.0, float(scores.min())))

@@ -1,4 +1,8 @@
-"""The view index: renders of the scene from well spread places, made once, that a photo is recognised in."""
+"""The view index: renders of the scene from well spread places, made once, with which photos are compared.
+
+Each view keeps its local features with their scene points. The index also says whether the scene repeats itself and
+whether it is like its mirror image (`scene_symmetries`).
+"""
 
 from __future__ import annotations
 
@@ -13,16 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Float64
 
 from service.interfaces import Features, Tools
-from service.pose.features.in_plane_rotation import MOST_CORNERS, VIEW_CORNERS, Corners, corners
-from service.pose.features.rendered_views import VIEW_FEATURES, View, backprojected, to_uint8
-from service.pose.retrieval.lod_proxy import Rough
-from service.pose.retrieval.scores import vote
-from service.pose.retrieval.viewpoints import INDEX_PX, index_cameras
-from service.pose.verification.ambiguity import repeats_itself
-from service.pose.verification.mirror_images import like_its_mirror_image
+from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
+from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
+from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
+from service.pose.retrieval.scene_symmetries import like_its_mirror_image, repeats_itself
+from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera, Intrinsics, Pose
 
 VERSION = 8
@@ -32,63 +33,62 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class ViewIndex:
+    """The views of one scene, and what is known of it from them."""
+
     views: tuple[View, ...]
     corners: Corners
-    """Of views from everywhere; see pose/features/in_plane_rotation.py."""
+    """Of some of the views; see pose/features/in_plane_rotation.py."""
     like_its_mirror_image: bool = False
-    """Whether a mirrored photo of the scene may pass for one of the scene; see pose/verification/mirror_images.py."""
+    """Whether a mirrored photo of the scene may pass for one of the scene."""
     repeats_itself: bool = True
-    """Whether a photo that fits one place may fit another one; see pose/verification/ambiguity.py."""
-
-    def votes(self, descriptors: Float32[np.ndarray, "n d"]) -> Float64[np.ndarray, "views"]:
-        """Return how much each view is like a photo with these features."""
-        return vote(descriptors, [view.features.descriptors for view in self.views])
+    """Whether a photo that fits one pose may fit another one."""
 
 
-def prepared_index(tools: Tools, cache_dir: Path | None) -> ViewIndex:
+def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:
     """Read the scene's index from the cache, or build it and store it there."""
-    path = cache_dir / f"view-index-{_key(tools)}.npz" if cache_dir else None
+    path = cache_dir / f"view-index-{_key(tools, viewpoints)}.npz" if cache_dir else None
     if path and path.exists():
         try:
             return _read(path)
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
-    index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng), tools)
+    index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng, viewpoints), tools)
     if path:
         _write(index, path)
     return index
 
 
-def built_index(cameras: Sequence[Camera], tools: Tools) -> ViewIndex:
-    """Render the views and find their features, one camera a core.
+def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = LOD) -> ViewIndex:
+    """Render the views and extract their features, one camera a core, then compute the scene's symmetries.
 
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
-        every = -(-len(cameras) * VIEW_CORNERS // MOST_CORNERS)
-        rough = Rough(tools.scene, tools.rasterizer, tools.rng)
+        every = -(-len(cameras) * CORNERS.of_view // CORNERS.of_all_views)
+        renderer = OccludedRenderer(tools.scene, tools.rasterizer, tools.rng, lod)
 
         def seen(number: int) -> tuple[View, Corners | None]:
-            frame = rough.render(cameras[number])
+            frame = renderer.render(cameras[number])
             rgb = to_uint8(frame.rgb)
-            view = backprojected(tools.matcher.extract(rgb, VIEW_FEATURES), frame, cameras[number])
-            return view, corners(rgb) if number % every == 0 else None
+            view = backprojected(tools.matcher.extract(rgb, VIEWS.max_features), frame, cameras[number])
+            return view, detect_corners(rgb, CORNERS.of_view) if number % every == 0 else None
 
         found = list(pool.map(seen, range(len(cameras))))
         views = tuple(view for view, _ in found)
-        mirrored, repeated = like_its_mirror_image(views, tools, pool), repeats_itself(views, tools.matcher, pool)
+        mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
+        repeated = repeats_itself(views, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
     return ViewIndex(views, Corners.pooled([own for _, own in found if own]), mirrored, repeated)
 
 
-def _key(tools: Tools) -> str:
+def _key(tools: Tools[None], viewpoints: ViewpointConfig) -> str:
     """Everything that the index depends on; the scene's digest covers its training cameras."""
     parts = (
         VERSION,
         tools.scene.info.sha256,
         tools.matcher.name,
-        INDEX_PX,
-        VIEW_FEATURES,
+        viewpoints.render_px,
+        VIEWS.max_features,
         len(tools.scene.cameras),
     )
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]

@@ -1,8 +1,10 @@
-"""A large scene at a glance: fewer Gaussians for small renders, and what those tell about what hides what."""
+"""A level-of-detail proxy of a large scene: fewer Gaussians for small renders, and the depths beyond which these show
+that everything is occluded.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,32 +13,45 @@ from jaxtyping import Float32
 from service.interfaces import Frame, Rasterizer
 from service.types import Camera, GaussianScene
 
-ENOUGH = 200_000
-"""Gaussians: a view of 64 px doesn't show more."""
-LARGE = 500_000
-"""Gaussians from which on a look at fewer of them, which tells what hides what, is worth its time."""
-GLANCE_PX = 64
-OPAQUE, BEHIND = 0.9, 1.2
-"""What is so many times as far as a surface of this alpha is behind it..."""
-LOST = 0.1
-"""...unless more than this share of the light may come from there. In the views of a building of 3 million Gaussians
-one pixel in a hundred differs by more than 0.1 then; with the larger of both depths taken for the surface's, three."""
+
+@dataclass(frozen=True, slots=True)
+class LodConfig:
+    """When and how coarsely a scene is simplified."""
+
+    proxy_gaussians: int = 200_000
+    """A render of 64 px doesn't show more."""
+    min_gaussians: int = 500_000
+    """Gaussians from which on finding out what is occluded saves more time than it takes."""
+    render_px: int = 64
+    """Long side of the renders that say what is occluded."""
+    opaque_alpha: float = 0.9
+    behind_factor: float = 1.2
+    """What is this many times as far as a surface of that opacity is occluded..."""
+    max_lost_share: float = 0.1
+    """...unless more than this share of the light may come from there. In the views of a building of 3 million
+    Gaussians one pixel in a hundred differs by more than 0.1 then; with the larger of both depths taken for the
+    surface's, three."""
 
 
-def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Rasterizer:
-    """Render a choice of the Gaussians: the large ones, and of the small ones some, as large as those that are gone.
+LOD = LodConfig()
 
-    One of area a stays with the probability p = min(1, k a), and its area becomes 2 a / p: what is left to chance
-    leaves holes otherwise.
+
+def lod_proxy(
+    scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator, config: LodConfig = LOD
+) -> Rasterizer:
+    """Return a renderer of a random choice of the Gaussians: the large ones, and some of the small ones, enlarged.
+
+    One of area a is kept with the probability p = min(1, k a), and its area becomes 2 a / p: random choice would leave
+    holes otherwise.
     """
-    if scene.count <= ENOUGH:
+    if scene.count <= config.proxy_gaussians:
         return rasterizer
     least = scene.scales.min(1)
     areas = scene.scales.prod(1, np.float64) / np.maximum(least, 1e-30) * scene.opacities + 1e-30
-    share = ENOUGH * areas / areas.sum()
+    share = config.proxy_gaussians * areas / areas.sum()
     for _ in range(10):  # those that are certain leave room for others
         certain = share >= 1
-        room = ENOUGH - np.count_nonzero(certain)
+        room = config.proxy_gaussians - np.count_nonzero(certain)
         share *= np.where(certain, 1.0, room / share.sum(where=~certain))
     chosen = np.flatnonzero(rng.random(scene.count, np.float32) < share)
     wider = np.sqrt(2.0 / share[chosen], where=share[chosen] < 1, out=np.ones(len(chosen)))
@@ -47,26 +62,31 @@ def thinned(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generat
     return rasterizer.of(replace(scene, **arrays, scales=scales, sh=scene.sh[chosen, :1]))
 
 
-def horizon(frame: Frame) -> Float32[np.ndarray, "h w"]:
-    """Return the z-depth from which on what a pixel shows hides the rest there and beside it; infinite where open.
+def occlusion_depths(frame: Frame, config: LodConfig = LOD) -> Float32[np.ndarray, "h w"]:
+    """Return the z-depth beyond which everything at a pixel and beside it is occluded; infinite where none is.
 
-    Of a mean depth beyond the median's at most LOST comes from beyond there (Markov's inequality).
+    Of a mean depth beyond the median's at most `max_lost_share` comes from beyond there (Markov's inequality).
     """
     surface, beyond = frame.median_depth, frame.depth - frame.median_depth
-    behind = np.maximum(BEHIND * surface, surface + beyond / LOST)
-    return np.asarray(cv2.dilate(np.where(frame.alpha > OPAQUE, behind, np.float32(np.inf)), np.ones((3, 3), np.uint8)))
+    behind = np.maximum(config.behind_factor * surface, surface + beyond / config.max_lost_share)
+    occluded = np.where(frame.alpha > config.opaque_alpha, behind, np.float32(np.inf))
+    return np.asarray(cv2.dilate(occluded, np.ones((3, 3), np.uint8)))
 
 
-class Rough:
-    """Renders a scene without what walls hide."""
+class OccludedRenderer:
+    """Renders a scene; of a large one, without what nearer surfaces occlude."""
 
-    def __init__(self, scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> None:
-        self._rasterizer = rasterizer
-        self._thinned = thinned(scene, rasterizer, rng) if scene.count > LARGE else None
+    def __init__(
+        self, scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator, config: LodConfig = LOD
+    ) -> None:
+        self._rasterizer, self._config = rasterizer, config
+        self._proxy = lod_proxy(scene, rasterizer, rng, config) if scene.count > config.min_gaussians else None
 
     def render(self, camera: Camera) -> Frame:
+        """Render approximately."""
         depths = None
-        if self._thinned:
-            small = Camera(camera.intrinsics.with_long_side(GLANCE_PX), camera.pose)
-            depths = [horizon(frame) for frame in self._thinned.render([small], approximate=True)]
+        if self._proxy:
+            small = Camera(camera.intrinsics.with_long_side(self._config.render_px), camera.pose)
+            coarse = self._proxy.render([small], approximate=True)
+            depths = [occlusion_depths(frame, self._config) for frame in coarse]
         return self._rasterizer.render([camera], approximate=True, occlusion_depths=depths)[0]

@@ -1,32 +1,42 @@
-"""Which views is a photo most like? Its features vote for them."""
+"""Retrieval scores: which of the index's views is a photo most like, by its local features?"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
-VOTERS, CANDIDATES = 150, 150
-"""Of the photo and of each view, the strongest features: four times as many find the right view no more often."""
-USUAL_RANK, USUAL_SHARE = 3, 0.05
-"""What a feature is answered usually: by the view of this rank, or with many views by that of this share of them."""
+
+@dataclass(frozen=True, slots=True)
+class ScoreConfig:
+    """Which features take part, and what a usual similarity is."""
+
+    photo_features: int = 150
+    view_features: int = 150
+    """The strongest features that are compared: four times as many find the right view no more often."""
+    usual_rank: int = 3
+    usual_share: float = 0.05
+    """A feature's usual similarity is that to the view of this rank; of many views, of this share of them."""
 
 
-def vote(
-    descriptors: Float32[np.ndarray, "n d"], views: Sequence[Float32[np.ndarray, "_ d"]]
+SCORES = ScoreConfig()
+
+
+def retrieval_scores(
+    descriptors: Float32[np.ndarray, "n d"], views: Sequence[Float32[np.ndarray, "_ d"]], config: ScoreConfig = SCORES
 ) -> Float64[np.ndarray, "views"]:
     """Return for each view how well the photo's strongest features are found in it; descriptors have unit length.
 
-    Each feature counts by how much a view's best answer to it exceeds the usual one. The usual one is that of the few
-    best views, not of the average view: what is seen in every room tells nothing, nor do things that the scene doesn't
-    have. (3 million Gaussians, 13 like rooms, 374 views: a right view is among the first five for 10 photos of 16,
-    measured by the average for 8, by VLAD with 32 words for 3. In the six test scenes and studio each way finds one
-    for all 58.)
+    A feature adds by how much its best similarity in a view exceeds its usual one: that in the few best views, not in
+    the average view, because neither what every room shows nor what the scene lacks tells places apart. (3 million
+    Gaussians, 13 similar rooms, 374 views: a right view is among the first five for 10 photos of 16; relative to the
+    average for 8, by VLAD with 32 words for 3. In the six test scenes and studio each of them finds one for all 58.)
     """
-    voters = np.ascontiguousarray(descriptors[:VOTERS].T)
-    best = np.stack([(view[:CANDIDATES] @ voters).max(0, initial=0.0) for view in views], 1)
-    rank = min(max(USUAL_RANK, round(USUAL_SHARE * len(views))), len(views) - 1)
+    photo = np.ascontiguousarray(descriptors[: config.photo_features].T)
+    best = np.stack([(view[: config.view_features] @ photo).max(0, initial=0.0) for view in views], 1)
+    rank = min(max(config.usual_rank, round(config.usual_share * len(views))), len(views) - 1)
     usual = -np.partition(-best, rank, axis=1)[:, rank, None]
     return np.maximum(best - usual, 0.0).sum(0, dtype=np.float64)
 

@@ -1,6 +1,6 @@
-"""Where to look at a scene from when nothing tells where its photos were taken.
+"""Where to view a scene from when nothing is known of where its photos were taken.
 
-    opaque Gaussians -> places in free space that look at some of them -> small renders of a thinned scene -> good?
+    opaque Gaussians -> places in free space that look at some of them -> small renders of its LOD proxy -> good?
         ^------------ aim at what no good view has seen yet <------------|
     good views -> the few that together see every surface from every side that any of them sees
 
@@ -25,32 +25,55 @@ from jaxtyping import Bool, Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
-from service.pose.retrieval.free_space import MIN_OPACITY, Space, lattice, survey
-from service.pose.retrieval.lod_proxy import thinned
+from service.pose.retrieval.free_space import SPACE, Space, lattice, survey
+from service.pose.retrieval.lod_proxy import lod_proxy
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
-SEARCH_PX = 64
-SEARCH_FOV_DEG = 60.0
-SHELLS = (1.2, 2.0, 3.4, 5.0)
-"""Radii, in units of the radius that holds half of the opaque Gaussians."""
-SHELL_CANDIDATES, VOLUME_CANDIDATES, SIZE_CANDIDATES = 40, 150, 100
-BEST, OFFSPRING = 50, 4
-NEAREST = 0.06
-"""What is nearer than this share of the typical distance is in the way."""
-ROUNDS, ROUND_CANDIDATES = 24, 150
-WIDE_TURN = 0.8
-ENOUGH_SEEN, LEAST_GAIN = 0.95, 0.005
-"""Of the opaque Gaussians, by any good view: the search ends there, or when a round adds less."""
-LEAST_SEEN = 0.25
-"""The share of them, seen by the fewest good views, that a round aims at."""
-SURROUNDED = 0.7
-AS_SURROUNDED = 0.6
-"""Where one good view in twenty has this share of all directions closed, the others need this share of that."""
-AT_LEAST, AT_MOST, COVERED = 64, 1000, 0.93
-FLOATER_REACH, FLOATER_NEIGHBOURS = 0.05, 8
-"""A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
-SEEN_AGAIN = 0.25
-"""Worth of what another view of the choice shows already."""
+
+@dataclass(frozen=True, slots=True)
+class PlacementConfig:
+    """How views are searched in a scene without cameras. Counts and shares are this search's own choice."""
+
+    render_px: int = 64
+    """Long side of a candidate's render."""
+    fov_deg: float = 60.0
+    """Horizontal field of view."""
+    shell_radii: tuple[float, ...] = (1.2, 2.0, 3.4, 5.0)
+    """In units of the radius that holds half of the opaque Gaussians."""
+    shell_candidates: int = 40
+    volume_candidates: int = 150
+    size_candidates: int = 100
+    """First candidates: on each shell, anywhere in the volume, at the distance that Gaussians' sizes suggest."""
+    best: int = 50
+    offspring: int = 4
+    """The best of them, and how many candidates are drawn near each."""
+    min_distance: float = 0.06
+    """What is nearer than this share of the typical distance blocks the view."""
+    rounds: int = 24
+    round_candidates: int = 150
+    """Further rounds, at most, and the candidates of each."""
+    wide_turn: float = 0.8
+    """Standard deviation of the change of the viewing direction in those rounds (a vector of unit length)."""
+    sufficient_coverage: float = 0.95
+    min_gain: float = 0.005
+    """Share of the opaque Gaussians that any good view sees: the search ends there, or when a round adds less."""
+    least_seen_share: float = 0.25
+    """The share of them, seen by the fewest good views, that a round aims at."""
+    interior_enclosure: float = 0.7
+    relative_enclosure: float = 0.6
+    """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
+    min_views: int = 64
+    max_views: int = 1000
+    covered_share: float = 0.93
+    """The choice ends with `max_views`, or once it has `min_views` and shows this share of what all good views show."""
+    floater_reach: float = 0.05
+    floater_neighbours: int = 8
+    """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
+    seen_again_worth: float = 0.25
+    """Worth of what another view of the choice shows already, relative to what none shows."""
+
+
+PLACEMENT = PlacementConfig()
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,29 +91,31 @@ class Placement:
     """The scene surrounds its views."""
 
 
-def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator) -> Placement:
+def find_views(
+    scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator, config: PlacementConfig = PLACEMENT
+) -> Placement:
     """Find places from which the scene looks as it did to the cameras that it was trained with."""
     space = survey(scene)
-    search = thinned(scene, rasterizer, rng)
-    views = _Views(space, search)
-    views.judge(_shells(space) + _in_volume(space, rng) + _by_size(space, rng, SIZE_CANDIDATES))
-    best = np.argsort(-np.array(views.scores), kind="stable")[:BEST]
-    views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(OFFSPRING)])
+    search = lod_proxy(scene, rasterizer, rng)
+    views = _Views(space, search, config)
+    views.judge(_shells(space, config) + _in_volume(space, rng, config) + _by_size(space, rng, config.size_candidates))
+    best = np.argsort(-np.array(views.scores), kind="stable")[: config.best]
+    views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(config.offspring)])
     good = views.good()
     seen = views.seen(good)
-    for _ in range(ROUNDS):
+    for _ in range(config.rounds):
         before, few = _covered(seen), len(good) < space.enough
-        if before > ENOUGH_SEEN and not few:
+        if before > config.sufficient_coverage and not few:
             break
-        aimed = _by_size(space, rng, ROUND_CANDIDATES // 2, seen <= np.quantile(seen, LEAST_SEEN))
-        near = rng.choice(good, ROUND_CANDIDATES // 2) if len(good) else []
-        views.judge(aimed + [_jittered(views.poses[i], space, rng, WIDE_TURN) for i in near])
+        aimed = _by_size(space, rng, config.round_candidates // 2, seen <= np.quantile(seen, config.least_seen_share))
+        near = rng.choice(good, config.round_candidates // 2) if len(good) else []
+        views.judge(aimed + [_jittered(views.poses[i], space, rng, config.wide_turn) for i in near])
         good = views.good()
         seen = views.seen(good)
-        if _covered(seen) - before < LEAST_GAIN and not few:
+        if _covered(seen) - before < config.min_gain and not few:
             break
-    chosen = good[_choice([views.cells(i) for i in good])]
-    lens = search_lens(SEARCH_PX)
+    chosen = good[_choice([views.cells(i) for i in good], config)]
+    lens = search_camera(config.render_px, config.fov_deg)
     cameras = tuple(Camera(lens, views.poses[i]) for i in chosen)
     coverage = _covered(views.seen(chosen))
     return Placement(cameras, len(views.poses), len(good), coverage, space.distance, views.interior)
@@ -98,8 +123,8 @@ def find_views(scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Gene
 
 def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
     """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
-    views = _Views(survey(scene), thinned(scene, rasterizer, np.random.default_rng(0)))
-    views.add([Camera(camera.intrinsics.with_long_side(SEARCH_PX), camera.pose) for camera in cameras])
+    views = _Views(survey(scene), lod_proxy(scene, rasterizer, np.random.default_rng(0)), PLACEMENT)
+    views.add([Camera(camera.intrinsics.with_long_side(PLACEMENT.render_px), camera.pose) for camera in cameras])
     return _covered(views.seen(np.arange(len(cameras))))
 
 
@@ -111,7 +136,7 @@ def _covered(seen: Int64[np.ndarray, "n"]) -> float:
 def floaters(scene: GaussianScene) -> float:
     """Return the share of the opaque Gaussians that have hardly any others around: no surface, but haze."""
     space = survey(scene)
-    size = FLOATER_REACH * space.distance
+    size = PLACEMENT.floater_reach * space.distance
     cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
     ids = _ids(cells)
     order = np.argsort(ids)
@@ -120,8 +145,8 @@ def floaters(scene: GaussianScene) -> float:
         wanted = _ids(cells + np.array(step) - 1)
         at = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
         around += np.where(ids[at] == wanted, counts[at], 0)
-    opaque = max(int((scene.opacities > MIN_OPACITY).sum()), len(space.points))
-    alone = around <= max(1.0, FLOATER_NEIGHBOURS * len(space.points) / opaque)
+    opaque = max(int((scene.opacities > SPACE.min_opacity).sum()), len(space.points))
+    alone = around <= max(1.0, PLACEMENT.floater_neighbours * len(space.points) / opaque)
     return float(counts[alone].sum() / counts.sum())
 
 
@@ -135,9 +160,9 @@ def _solid(frame: Frame, min_distance: float) -> Bool[np.ndarray, "h w"]:
     return (frame.alpha > 0.9) & (frame.median_depth > min_distance) & (apart < 0.05 * frame.median_depth)
 
 
-def search_lens(long_side: int) -> Intrinsics:
-    """Return the lens of the found views: 4:3, SEARCH_FOV_DEG wide."""
-    focal = 0.5 * long_side / np.tan(np.radians(0.5 * SEARCH_FOV_DEG))
+def search_camera(long_side: int, fov_deg: float = PLACEMENT.fov_deg) -> Intrinsics:
+    """Return the intrinsics of the views that are searched: 4:3, with this horizontal field of view."""
+    focal = 0.5 * long_side / np.tan(np.radians(0.5 * fov_deg))
     height = long_side * 3 // 4
     return Intrinsics(long_side, height, focal, focal, 0.5 * long_side, 0.5 * height)
 
@@ -145,7 +170,7 @@ def search_lens(long_side: int) -> Intrinsics:
 class _Views:
     """Candidates, how solid each is, and what it sees of the scene."""
 
-    def __init__(self, space: Space, rasterizer: Rasterizer) -> None:
+    def __init__(self, space: Space, rasterizer: Rasterizer, config: PlacementConfig) -> None:
         self.poses: list[Pose] = []
         self.scores: list[float] = []
         self._enclosures: list[float] = []
@@ -154,7 +179,7 @@ class _Views:
         self._surfaces: list[Float64[np.ndarray, "n 3"]] = []
         self._surface_ids: list[Int64[np.ndarray, "_"]] = []
         """Of the voxels that each sees."""
-        self._space, self._rasterizer = space, rasterizer
+        self._space, self._rasterizer, self._config = space, rasterizer, config
         self._voxel = 0.25 * space.distance
         points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
         self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
@@ -164,7 +189,7 @@ class _Views:
         positions = np.stack([pose.position_in_world for pose in poses])
         enclosures = self._space.enclosures(positions)
         worth = np.flatnonzero(~self._space.occupied(positions) & (enclosures >= self._least_enclosed))
-        lens = search_lens(SEARCH_PX)
+        lens = search_camera(self._config.render_px, self._config.fov_deg)
         self.add([Camera(lens, poses[i]) for i in worth.tolist()])
         self._enclosures += enclosures[worth].tolist()
 
@@ -173,7 +198,7 @@ class _Views:
         return self._least_enclosed > 0
 
     def add(self, cameras: Sequence[Camera]) -> None:
-        nearest = NEAREST * self._space.distance
+        nearest = self._config.min_distance * self._space.distance
         for camera, frame in zip(cameras, self._rasterizer.render(cameras, approximate=True), strict=True):
             height, width = frame.alpha.shape
             row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
@@ -192,7 +217,9 @@ class _Views:
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
         solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
         limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
-        self._least_enclosed = AS_SURROUNDED * limit if limit >= SURROUNDED else 0.0
+        self._least_enclosed = (
+            self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
+        )
         return solid[enclosures[solid] >= self._least_enclosed]
 
     def seen(self, chosen: Int64[np.ndarray, "k"]) -> Int64[np.ndarray, "n"]:
@@ -221,7 +248,7 @@ def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
     return result.astype(np.int64)
 
 
-def _choice(cells: Sequence[Int64[np.ndarray, "_"]]) -> Int64[np.ndarray, "k"]:
+def _choice(cells: Sequence[Int64[np.ndarray, "_"]], config: PlacementConfig) -> Int64[np.ndarray, "k"]:
     """Take the view that adds most, again and again, until the choice shows what all together show.
 
     What a single candidate sees counts half: it may be an odd place.
@@ -235,29 +262,33 @@ def _choice(cells: Sequence[Int64[np.ndarray, "_"]]) -> Int64[np.ndarray, "k"]:
         row[: len(own)] = own
     left, total, seen = worth.copy(), worth.sum(), 0.0
     chosen: list[int] = []
-    while len(chosen) < min(AT_MOST, len(rows)) and (len(chosen) < AT_LEAST or seen < COVERED * total):
+    while len(chosen) < min(config.max_views, len(rows)) and (
+        len(chosen) < config.min_views or seen < config.covered_share * total
+    ):
         gains = left[table].sum(1)
         gains[chosen] = -1
         taken = int(np.argmax(gains))
         new = np.unique(table[taken])
         seen += float(left[new][left[new] == worth[new]].sum())
-        left[new] *= SEEN_AGAIN
+        left[new] *= config.seen_again_worth
         chosen.append(taken)
     return np.array(chosen, int)
 
 
-def _shells(space: Space) -> list[Pose]:
+def _shells(space: Space, config: PlacementConfig) -> list[Pose]:
     """Look at the middle from all around."""
     middle, radius = space.middle, space.radius
-    directions = lattice(SHELL_CANDIDATES)
-    return [look_at(middle + factor * radius * d, middle, space.up) for factor in SHELLS for d in directions]
+    directions = lattice(config.shell_candidates)
+    return [
+        look_at(middle + factor * radius * d, middle, space.up) for factor in config.shell_radii for d in directions
+    ]
 
 
-def _in_volume(space: Space, rng: np.random.Generator) -> list[Pose]:
+def _in_volume(space: Space, rng: np.random.Generator, config: PlacementConfig) -> list[Pose]:
     """Look from random places in the volume towards random Gaussians."""
     low, high = np.quantile(space.points, [0.05, 0.95], axis=0)
-    positions = rng.uniform(low, high, (VOLUME_CANDIDATES, 3))
-    targets = space.points[rng.integers(len(space.points), size=VOLUME_CANDIDATES)]
+    positions = rng.uniform(low, high, (config.volume_candidates, 3))
+    targets = space.points[rng.integers(len(space.points), size=config.volume_candidates)]
     return _looking(positions, targets, space.up)
 
 

@@ -109,7 +109,7 @@ def record_out(record: IterationRecord) -> Record:
         index=record.index,
         stage=record.stage,
         world_from_camera=rows(record.pose.world_from_camera),
-        intrinsics_correction=IntrinsicsCorrectionOut(**asdict(record.lens)),
+        intrinsics_correction=IntrinsicsCorrectionOut(**asdict(record.correction)),
         elapsed_s=record.elapsed_s,
         cpu_s=record.cpu_s,
         loss=record.loss,

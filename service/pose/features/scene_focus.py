@@ -12,17 +12,29 @@ from service.geometry import nearest_point_to_axes
 from service.interfaces import Rasterizer
 from service.types import Camera, GaussianScene, Pose
 
-FORWARD_FACING_DEG = 15.0
-"""Below this root-mean-square angle between the optical axes and their common direction, the point nearest to all
-of them is not determined. LLFF's fern has 6 degrees; orbits and walks round an object had 33 or more."""
-MIN_OPACITY = 0.3
-BARE_DISTANCE = 2.0
-"""Where no camera tells the distance: in units of the radius that holds half of the opaque Gaussians."""
-CENTRE_PX = 256
+
+@dataclass(frozen=True, slots=True)
+class FocusConfig:
+    """How the focus of a scene is determined."""
+
+    forward_facing_deg: float = 15.0
+    """Below this root-mean-square angle between the optical axes and their common direction, the point nearest to all
+    of them is not determined. LLFF's fern has 6 degrees; orbits of an object, by tripod or on foot, had 33 or more."""
+    min_opacity: float = 0.3
+    """Of the Gaussians that count as surface where there are no cameras."""
+    distance_without_cameras: float = 2.0
+    """In units of the radius that holds half of the opaque Gaussians."""
+    depth_render_px: int = 256
+    """Long side of the renders from which depths are taken."""
+
+
+FOCUS = FocusConfig()
 
 
 @dataclass(frozen=True, slots=True)
 class Focus:
+    """The centre of a scene."""
+
     point_in_world: Float64[np.ndarray, "3"]
     distance: float
     """Median distance of the cameras from it, in scene units."""
@@ -52,16 +64,16 @@ def focus_of_scene(scene: GaussianScene, rasterizer: Rasterizer) -> Focus:
     """Return the focus of the training cameras; without any, the middle of the opaque Gaussians."""
     if scene.cameras:
         return focus_of([named.camera for named in scene.cameras], lambda camera: centre_depth(rasterizer, camera))
-    opaque = scene.means[scene.opacities > MIN_OPACITY].astype(np.float64)
+    opaque = scene.means[scene.opacities > FOCUS.min_opacity].astype(np.float64)
     opaque = opaque if len(opaque) else scene.means.astype(np.float64)
     middle = np.median(opaque, axis=0)
     radius = float(np.median(np.linalg.norm(opaque - middle, axis=1)))
-    return Focus(middle, max(BARE_DISTANCE * radius, 1e-9), False)
+    return Focus(middle, max(FOCUS.distance_without_cameras * radius, 1e-9), False)
 
 
 def centre_depth(rasterizer: Rasterizer, camera: Camera) -> float:
     """Return the median depth rendered in the middle of the image, in scene units; 0 if nothing is there."""
-    small = Camera(camera.intrinsics.with_long_side(CENTRE_PX), camera.pose)
+    small = Camera(camera.intrinsics.with_long_side(FOCUS.depth_render_px), camera.pose)
     (frame,) = rasterizer.render([small])
     height, width = frame.median_depth.shape
     middle = frame.median_depth[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4]
@@ -69,11 +81,11 @@ def centre_depth(rasterizer: Rasterizer, camera: Camera) -> float:
 
 
 def is_forward_facing(poses: Sequence[Pose]) -> bool:
-    """Whether the optical axes are nearly parallel: see FORWARD_FACING_DEG.
+    """Return whether the optical axes are nearly parallel: see `FocusConfig.forward_facing_deg`.
 
     The common direction is the axes' first principal one; 1 - its eigenvalue is the mean squared sine to it.
     """
     axes = np.stack([pose.axis_in_world for pose in poses])
     along = float(np.linalg.eigvalsh(axes.T @ axes / len(axes))[-1])
     opposed = np.any(axes @ axes[0] < 0)  # a room seen both ways is not forward-facing
-    return bool(not opposed and 1.0 - along < np.sin(np.radians(FORWARD_FACING_DEG)) ** 2)
+    return bool(not opposed and 1.0 - along < np.sin(np.radians(FOCUS.forward_facing_deg)) ** 2)

@@ -1,0 +1,316 @@
+"""What the default estimator's search knows, and its checks: verification, mirror image, ambiguity.
+
+`run_stage` runs a stage of the search and verifies its result; `check_mirror` and `check_ambiguity` look for reasons to
+doubt an answer that was found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from service.interfaces import Answer, Tools
+from service.pose.absolute_pose.pnp import AbsolutePose
+from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.mirrored_query import mirrored_query
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import ViewRenderer
+from service.pose.matching.match_stages import MATCHING, MatchingConfig, match_candidates
+from service.pose.refinement.refine_stage import (
+    REFINE_STAGE,
+    RefinedPose,
+    RefineStageConfig,
+    refine_stage,
+    rematch_and_refine,
+)
+from service.pose.retrieval.ambiguous_hypotheses import (
+    AMBIGUITY,
+    AmbiguityConfig,
+    Explanation,
+    ambiguous_hypotheses,
+)
+from service.pose.retrieval.image_variant import RETRIEVAL, ImageVariant, Retrieval, RetrievalConfig
+from service.pose.retrieval.index import ViewIndex
+from service.pose.retrieval.scores import top
+from service.pose.verification.ambiguity import ANSWERS, AnswerConfig, explains_whole_photo, rank_answers
+from service.pose.verification.appearance import appearance
+from service.pose.verification.gate import VERIFICATION, VerificationConfig, verify
+from service.pose.verification.mirror_images import MIRROR, MirrorConfig, may_be_mirrored, unlikeness
+from service.results import Candidates, IterationRecord, Reason, Status, Verdict
+from service.types import Query
+
+StageResult = Generator[IterationRecord, None, RefinedPose | None]
+CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
+"""Doubts about a pose at which photo and render agree: another search would find the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class SearchConfig:
+    """The default estimator's tuning: the search's own values, and those of its steps."""
+
+    retrieval: RetrievalConfig = RETRIEVAL
+    matching: MatchingConfig = MATCHING
+    refinement: RefineStageConfig = REFINE_STAGE
+    verification: VerificationConfig = VERIFICATION
+    ambiguity: AmbiguityConfig = AMBIGUITY
+    answers: AnswerConfig = ANSWERS
+    mirror: MirrorConfig = MIRROR
+    small_photo_factor: float = 0.77
+    """Size of the photo in the first search, relative to the second: a whole, sharp photo is found in half the time.
+    Each of the 58 clean test photos has 75 or more matches that agree with its likeliest view, foreign ones 12."""
+    small_photo_views: int = 2
+    """Views that the small photo is matched with."""
+    large_photo_factor: float = 1.25
+    """Size of the photo in the further searches, relative to the second one."""
+    further_views_divisor: int = 16
+    """One view in so many is matched before the search is given up: in a building the likeliest five may be wrong."""
+    min_inliers: int = 12
+    min_inlier_share: float = 0.055
+    """Inliers, and their share of the matches, from which on a render at the pose is made: of 168 searches with fewer,
+    119 of them for photos of other scenes, none led to an answer; with 12 to 30 those have a median share of 0.04 to
+    0.05."""
+    rematch_below_inliers: int = 80
+    """With fewer inliers a pose is matched with a render before it is refined."""
+    photometric_min_inliers: float = 60
+    """Inliers with a view from which on the pixels alone may decide the verification."""
+    max_prior_loss: float = 0.1
+    """Mean residual (0..1) of a refinement from a prior pose that led nowhere; right ones have 0.005 to 0.06."""
+    sample_render_px: int = 256
+    samples: int = 8
+    """Renders at sampled poses in a round: long side, and how many."""
+    sample_rounds: int = 4
+    max_sample_rounds: int = 100
+    """Rounds with effort `normal`, and with `exhaustive` if there is no budget."""
+    min_sample_inliers: int = 12
+    """Inliers of a sampled pose from which on it is rendered in full size."""
+    ambiguity_photo_px: int = 256
+    """Long side of the photo in which an answer that was expected by a prior is looked for elsewhere."""
+    max_ambiguous_loss_ratio: float = 3.0
+    """Times the answer's mean residual, after one refinement: beyond it an ambiguous hypothesis is none."""
+
+
+SEARCH = SearchConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One stage of a search: its records, which return the pose that it led to."""
+
+    records: StageResult
+    variant: ImageVariant
+    """In which the photo is compared."""
+    tentative: bool = False
+    """Whether a doubt about the answer is no reason to end the search."""
+    expected: bool = False
+    """Whether the answer was expected where it is: then the pixels alone may decide."""
+
+
+@dataclass(frozen=True, slots=True)
+class VerifiedPose:
+    """A pose that a stage led to, and the gate's verdict on it."""
+
+    refined: RefinedPose
+    verdict: Verdict
+    variant: ImageVariant
+    """In which the photo was compared when it was found."""
+
+    @property
+    def loss(self) -> float:
+        """Mean residual after refinement; infinite where there was none."""
+        return np.inf if self.refined.loss is None else self.refined.loss
+
+    def record(self, stage: str) -> IterationRecord:
+        """Return a record of this answer."""
+        found = self.refined
+        return IterationRecord(stage, found.pose, found.correction, found.loss, num_inliers=found.num_inliers)
+
+
+@dataclass(slots=True)
+class SearchState:
+    """What a search works with, and what it has led to."""
+
+    tools: Tools[ViewIndex]
+    images: QueryImages
+    renderer: ViewRenderer
+    retrieval: Retrieval
+    config: SearchConfig = field(default_factory=SearchConfig)
+    best: VerifiedPose | None = None
+    """The answer with the highest score so far."""
+    accepted: bool = False
+    """Whether the last stage's answer ends the search."""
+    recognised: bool = False
+    """Whether a render at some pose had more matches with the photo than chance: photos of other scenes never do."""
+
+    @classmethod
+    def of(cls, query: Query, tools: Tools[ViewIndex], config: SearchConfig) -> SearchState:
+        """Return the state at the start."""
+        images = QueryImages(query, tools.matcher)
+        retrieval = Retrieval(images, tools.prepared, config.retrieval)
+        return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
+
+    def verify(self, found: RefinedPose, supporting_matches: int | None = None) -> Verdict:
+        """Return the gate's verdict on a pose, from the render that refinement ended with if it is near enough."""
+        images = self.images.corrected(found.correction)
+        rendered, refinement = found.view_at_pose(images, self.renderer)
+        return verify(images, found.pose, rendered, refinement, supporting_matches, self.config.verification)
+
+    def with_answer(self, record: IterationRecord) -> IterationRecord:
+        """Return the record with the best answer so far in place of its own pose."""
+        if self.best is None:
+            return record
+        return replace(record, pose=self.best.refined.pose, correction=self.best.refined.correction)
+
+    def noted(self, record: IterationRecord) -> IterationRecord:
+        """Return the record with the best answer so far; note whether a render had enough matches with the photo."""
+        self.recognised |= record.stage == "rematch"
+        return self.with_answer(record)
+
+    def answer(self) -> Answer | None:
+        """Return the best answer; None: no stage led to one."""
+        if self.best is None:
+            return None
+        return Answer(self.best.refined.pose, self.best.refined.correction, self.best.verdict)
+
+
+def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, None, None]:
+    """Yield a stage's records with the best answer so far, and verify what it led to.
+
+    Where the answer was expected, or many matches with a view led to it, the pixels alone may decide; not with an
+    estimated focal length, which makes pixels agree at wrong poses, too.
+    """
+    found = yield from _changed(stage.records, state.noted)
+    if found is None:
+        return
+    agreeing = found.num_inliers or 0
+    focal_sigma = state.images.query.focal_sigma
+    supported = stage.expected or (agreeing >= state.config.photometric_min_inliers and not focal_sigma)
+    verdict = state.verify(found, agreeing if supported else None)
+    if state.best is None or verdict.score > state.best.verdict.score:
+        state.best = VerifiedPose(found, verdict, stage.variant)
+    conclusive = verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative
+    state.accepted = verdict.status is Status.LOCALIZED or conclusive
+    loss = 1.0 - state.best.verdict.score
+    yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))
+
+
+def _changed(records: StageResult, change: Callable[[IterationRecord], IterationRecord]) -> StageResult:
+    """Yield what a function makes of each record; return what the stage returns."""
+    while True:
+        try:
+            record = next(records)
+        except StopIteration as end:
+            return end.value
+        yield change(record)
+
+
+def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
+    """Where the scene is like its mirror image, find out whether the photo's mirror image fits better; return that.
+
+    For an answer that the gate refused the mirror image must be accepted.
+    """
+    best, config = state.best, state.config
+    if best is None or best.verdict.score < config.verification.min_uncertain:
+        return False
+    if not state.tools.prepared.like_its_mirror_image or not may_be_mirrored(best.verdict.signals, config.mirror):
+        return False
+    query = mirrored_query(state.images.query.corrected(best.refined.correction))
+    mirrored = SearchState.of(replace(query, prior=None, region=None), state.tools, config)
+    variant = replace(best.variant, roll_steps_45deg=-best.variant.roll_steps_45deg % 8)
+    search = _search_mirrored(mirrored, variant, config.mirror.max_loss_ratio * best.loss)
+    found = yield from _changed(
+        search, lambda record: state.with_answer(replace(record, stage="check_mirror", matches=None))
+    )
+    if found is None:
+        return False
+    if not state.accepted and mirrored.verify(found).status is not Status.LOCALIZED:
+        return False
+    images = mirrored.images.corrected(found.correction)
+    rendered, _ = found.view_at_pose(images, mirrored.renderer)
+    size = rendered.camera.intrinsics
+    signals = appearance(images.resized(size), rendered.frame, images.valid_mask(size))
+    is_mirrored = unlikeness(signals) < unlikeness(best.verdict.signals)
+    yield replace(best.record("check_mirror"), mirrored=is_mirrored)
+    return is_mirrored
+
+
+def _search_mirrored(state: SearchState, variant: ImageVariant, max_loss: float) -> StageResult:
+    """Match the mirrored photo and refine; end early where the first refinement's residual is greater than this."""
+    config, retrieval = state.config, state.retrieval
+    views = (retrieval.index.views[i] for i in top(retrieval.scores(variant), config.small_photo_views))
+    features = retrieval.features(variant)
+    found = yield from match_candidates(features, views, state.images, variant.max_error_px, config.matching)
+    if found is None or found.num_inliers < config.min_inliers:
+        return None
+    outcome = yield from refine_stage(found, state.images, state.renderer, config.refinement, max_loss)
+    return outcome.refined
+
+
+def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None]:
+    """Look for other poses that the gate accepts; the best becomes the answer, and the last record has all.
+
+    A pose that explains the whole photo has no alternative in a scene that doesn't repeat itself.
+    """
+    answer = state.best
+    assert answer is not None
+    whole = explains_whole_photo(answer.verdict.signals, state.config.answers)
+    if whole and not state.tools.prepared.repeats_itself:
+        return
+    images = state.images.corrected(answer.refined.correction)
+    frame = state.renderer.at(images.query, answer.refined.pose).frame
+    distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
+    answers = [answer]
+    for other in _ambiguous_hypotheses(state, images, Explanation(answer.refined.pose, distance), whole):
+        found = yield from _refine_ambiguous(state, other, answer)
+        ambiguity = state.config.ambiguity
+        if found is None or not all(
+            Explanation(found.pose, distance).differs_from(known.refined.pose, ambiguity) for known in answers
+        ):
+            continue
+        verdict = state.verify(found)
+        if verdict.status is Status.LOCALIZED:
+            answers.append(VerifiedPose(found, verdict, answer.variant))
+    if len(answers) > 1:
+        yield _ranked(state, answers)
+
+
+def _ambiguous_hypotheses(
+    state: SearchState, images: QueryImages, answer: Explanation, whole: bool
+) -> Generator[AbsolutePose, None, None]:
+    """Yield poses that many matches agree on which the answer doesn't explain."""
+    assert state.best is not None
+    config, variant = state.config.ambiguity, state.best.variant
+    yield from ambiguous_hypotheses(
+        state.retrieval.features(variant),
+        images.query.intrinsics,
+        answer,
+        state.retrieval.index.views,
+        state.retrieval.scores(variant),
+        images.matcher,
+        variant.max_error_px * images.query.intrinsics.long_side / PHOTO_PX,
+        config.min_inliers_if_explained if whole else config.min_inliers,
+        config,
+    )
+
+
+def _refine_ambiguous(state: SearchState, other: AbsolutePose, answer: VerifiedPose) -> StageResult:
+    """Refine an ambiguous hypothesis, unless its residual on a first render is much greater than the answer's."""
+    config = state.config
+    other = replace(other, correction=answer.refined.correction)
+    max_loss = config.max_ambiguous_loss_ratio * answer.loss
+    if next(refine_stage(other, state.images, state.renderer, config.refinement, max_loss), None) is None:
+        return None
+    stage = rematch_and_refine(other, state.images, state.renderer, config.matching, config.refinement)
+    return (yield from _changed(stage, state.with_answer))
+
+
+def _ranked(state: SearchState, answers: list[VerifiedPose]) -> IterationRecord:
+    """Make the answer with the least residual the best one; return the record that names the others."""
+    (best, _), *others = rank_answers([answer.loss for answer in answers], state.config.answers)
+    state.best = answers[best]
+    alternatives = None
+    if others:
+        poses = np.stack([answers[i].refined.pose.world_from_camera for i, _ in others])
+        alternatives = Candidates(poses, np.array([probability for _, probability in others]))
+    return replace(state.best.record("check_ambiguity"), alternatives=alternatives)

@@ -1,0 +1,189 @@
+"""The stage of a search that refines: render at the pose, refine photometrically on that render, and render again.
+
+`refine_stage` repeats this until another render would look the same; `rematch_and_refine` matches with a render first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from service.geometry import pose_distance
+from service.pose.absolute_pose.pnp import AbsolutePose
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import RenderedView, ViewRenderer, camera_of
+from service.pose.matching.match_stages import MATCHING, MatchingConfig, render_and_rematch
+from service.pose.refinement.config import REFINEMENT, RefinementConfig
+from service.pose.refinement.photometric import RefinementResult, refine_photometric
+from service.results import IterationRecord
+from service.types import Camera, IntrinsicsCorrection, Pose
+
+
+@dataclass(frozen=True, slots=True)
+class RefineStageConfig:
+    """How rendering and photometric refinement alternate."""
+
+    photometric: RefinementConfig = REFINEMENT
+    max_renders: int = 4
+    """Renders that are refined on, one after the other; 0: the pose of the matches is the answer."""
+    first_render_px: int | None = 256
+    """Long side of the first render, where the focal length is known: a small one brings the pose near as well. None:
+    as large as the others."""
+    settled_px: float = 0.3
+    """Where refinement moved the image by less, another render would be the same."""
+    free_focal_settled_px: float = 0.05
+    """The same where the focal length is estimated: it is confounded with the distance and hardly moves the image."""
+    levels: int = 2
+    first_levels: int = 4
+    """Levels of the image pyramid; the second of the first render, from a pose with fewer than `trusted_inliers`."""
+    trusted_inliers: int = 60
+    """Inliers from which on the pose of the matches is the answer where refinement diverges from it."""
+    max_divergence_deg: float = 10.0
+    """Rotation away from a pose with that many inliers beyond which refinement diverges."""
+
+
+REFINE_STAGE = RefineStageConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedPose:
+    """A pose for verification, with what refinement has computed for that."""
+
+    pose: Pose
+    correction: IntrinsicsCorrection
+    """Of the query's intrinsics."""
+    loss: float | None
+    """Mean absolute residual (0..1); None: refinement diverged, and this is the pose of the matches."""
+    num_inliers: int | None
+    """Matches that agreed with the pose that refinement began with; None: there were none."""
+    rendered: RenderedView | None
+    """The latest render, at the pose or nearby; None: there is none yet."""
+    photometric: RefinementResult | None
+    """The refinement on that render that led to the pose; None: the pose was not refined on it."""
+
+    def view_at_pose(self, images: QueryImages, renderer: ViewRenderer) -> tuple[RenderedView, RefinementResult | None]:
+        """Return a render within a pixel of the pose, and the refinement on it: both at hand, or a new render."""
+        camera = camera_of(images.query, self.pose)
+        if self.rendered is not None and self.rendered.shows_the_same_as(camera, 1.0):
+            return self.rendered, self.photometric
+        return renderer.render(camera), None
+
+
+@dataclass(frozen=True, slots=True)
+class RefineOutcome:
+    """Where `refine_stage` ended."""
+
+    refined: RefinedPose | None
+    """None: not even the first render could be refined on."""
+    restart: AbsolutePose | None = None
+    """Where to match again: the pose did not settle, or refinement diverged from a trusted one."""
+    diverged: bool = False
+    """Whether `restart` is the pose that refinement began with."""
+
+
+def refine_stage(
+    found: AbsolutePose,
+    images: QueryImages,
+    renderer: ViewRenderer,
+    config: RefineStageConfig = REFINE_STAGE,
+    max_loss: float = np.inf,
+) -> Generator[IterationRecord, None, RefineOutcome]:
+    """Render, refine photometrically, render at the result, refine again, until a new render would be the same.
+
+    Ends early where the loss exceeds `max_loss`. Where the focal length is estimated and creeps along with the
+    distance for too long, the outcome says where to match again.
+    """
+    query, trusted = images.query, found.num_inliers >= config.trusted_inliers
+    settled_px = config.free_focal_settled_px if query.focal_sigma else config.settled_px
+    pose, correction = found.pose, found.correction
+    refined: RefinedPose | None = None
+    rendered: RenderedView | None = None
+    if config.max_renders == 0:
+        return RefineOutcome((yield from _as_matched(found, renderer)))
+    for round_number in range(config.max_renders):
+        small_px = None if round_number or query.focal_sigma else config.first_render_px
+        camera = camera_of(query.corrected(correction), pose, small_px)
+        if rendered is None:
+            rendered = renderer.at(query.corrected(correction), pose, long_side=small_px)
+        elif rendered.shows_the_same_as(camera, settled_px):
+            return RefineOutcome(refined)
+        else:
+            rendered = renderer.render(camera)
+        levels = config.levels if round_number or trusted else config.first_levels
+        result = _refined_on(rendered, pose, correction, images, levels, bool(small_px), config)
+        diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
+        if diverged or not np.isfinite(result.loss):
+            refined = refined and replace(refined, rendered=rendered, photometric=None)
+            return RefineOutcome(refined, found if trusted else None, diverged=True)
+        if result.loss > max_loss:
+            return RefineOutcome(refined and replace(refined, rendered=rendered, photometric=None))
+        step_deg, step_units = pose_distance(pose, result.pose)
+        pose, correction = result.pose, result.correction
+        inliers = found.num_inliers or None
+        refined = RefinedPose(pose, correction, result.loss, inliers, rendered, result)
+        yield IterationRecord(
+            "refine", pose, correction, result.loss, num_inliers=inliers, step_deg=step_deg, step_units=step_units
+        )
+    if refined is None or rendered is None or not query.focal_sigma:
+        return RefineOutcome(refined)
+    camera = camera_of(query.corrected(correction), pose)
+    if rendered.shows_the_same_as(camera, settled_px):
+        return RefineOutcome(refined)
+    refined = replace(refined, rendered=renderer.render(camera), photometric=None)
+    return RefineOutcome(refined, replace(found, pose=pose, correction=correction))
+
+
+def _refined_on(
+    rendered: RenderedView,
+    pose: Pose,
+    correction: IntrinsicsCorrection,
+    images: QueryImages,
+    levels: int,
+    coarse: bool,
+    config: RefineStageConfig,
+) -> RefinementResult:
+    """Refine the pose and, with an approximate focal length, the intrinsics on one render."""
+    size = rendered.camera.intrinsics
+    start = Camera(images.query.intrinsics.resized(size.width, size.height), pose)
+    return refine_photometric(
+        images.resized(size),
+        rendered.frame,
+        rendered.camera,
+        start,
+        levels,
+        correction,
+        images.query.focal_sigma,
+        images.valid_mask(size),
+        coarse,
+        config.photometric,
+    )
+
+
+def rematch_and_refine(
+    found: AbsolutePose,
+    images: QueryImages,
+    renderer: ViewRenderer,
+    matching: MatchingConfig = MATCHING,
+    config: RefineStageConfig = REFINE_STAGE,
+    before: RefinedPose | None = None,
+) -> Generator[IterationRecord, None, RefinedPose | None]:
+    """Match with renders at the pose, then refine; where refinement diverges the pose of the matches is the answer.
+
+    `before` is what an earlier refinement led to: the answer if no match with a render succeeds.
+    """
+    rematch = yield from render_and_rematch(found, images, renderer, matching)
+    if rematch.found is None:
+        # A pose that loses its matches after it had some is wrong.
+        return before if rematch.rounds == 0 else None
+    outcome = yield from refine_stage(rematch.found, images, renderer, config)
+    if not outcome.diverged or outcome.restart is None:
+        return outcome.refined
+    return (yield from _as_matched(outcome.restart, renderer))
+
+
+def _as_matched(found: AbsolutePose, renderer: ViewRenderer) -> Generator[IterationRecord, None, RefinedPose]:
+    """Take the pose of the matches for the answer."""
+    yield IterationRecord("refine", found.pose, found.correction, num_inliers=found.num_inliers)
+    return RefinedPose(found.pose, found.correction, None, found.num_inliers, renderer.latest, None)

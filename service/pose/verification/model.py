@@ -1,0 +1,123 @@
+"""The gate's fitted model: how probably a pose is right, from its signals. Its numbers are in `model.json`.
+
+A logistic model without negative weights: each signal is mapped to 0..1 and cut off at both ends. Besides, each signal
+has a floor: below it a pose is in doubt, however good the other signals are, because a sum would compensate for one
+that is bad. `splatfix bench gate` fits weights and floors, and writes the file.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+MODEL_FILE = Path(__file__).with_name("model.json")
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """Maps a signal to 0..1, linearly between two values and cut off there; `at_zero` may be the greater one."""
+
+    at_zero: float
+    at_one: float
+    logarithmic: bool = False
+    """Linear in the logarithm of the signal."""
+
+    def __call__(self, value: Float[np.ndarray, "*n"] | float) -> Float64[np.ndarray, "*n"] | np.float64:
+        ends = np.array([self.at_zero, self.at_one])
+        if self.logarithmic:
+            value, ends = np.log(np.maximum(value, 1e-6)), np.log(ends)
+        return np.clip((np.asarray(value) - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
+
+    def value_at(self, scaled: float) -> float:
+        """Return the signal that is mapped to this number."""
+        if self.logarithmic:
+            return float(self.at_zero * (self.at_one / self.at_zero) ** scaled)
+        return self.at_zero + scaled * (self.at_one - self.at_zero)
+
+
+@dataclass(frozen=True, slots=True)
+class Logistic:
+    """log odds = bias + sum of weight times scaled signal."""
+
+    bias: float
+    weights: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class GateModel:
+    """Weights, floors and scales by the signals' names, and what they were fitted on."""
+
+    scales: Mapping[str, Scale]
+    with_matches: Logistic
+    """For signals of pixels and of matches."""
+    photometric: Logistic
+    """For signals of pixels alone."""
+    floors: Mapping[str, float]
+    """In the signals' units; for a signal whose scale descends, a ceiling."""
+    fitted_on: Mapping[str, Any] = field(default_factory=dict)
+    """Scenes with their hashes and photos, and counts of right and wrong poses."""
+
+    def probability(self, signals: Mapping[str, float]) -> float:
+        """Return how probably a pose with these signals is right, 0..1; without signals of matches by the others."""
+        model = self.with_matches if "inliers" in signals else self.photometric
+        logit = model.bias + sum(weight * self.scales[name](signals[name]) for name, weight in model.weights.items())
+        return float(1.0 / (1.0 + np.exp(-logit)))
+
+    def below_floor(self, signals: Mapping[str, float]) -> list[str]:
+        """Return the names of the signals that are below their floors."""
+        return [
+            name
+            for name, value in signals.items()
+            if name in self.floors and self.scales[name](value) < self.scales[name](self.floors[name])
+        ]
+
+
+def model_from_json(content: Mapping[str, Any]) -> GateModel:
+    """Return the model that a file's content describes. Raises ValueError if it is of another version."""
+    if content["version"] != FORMAT_VERSION:
+        raise ValueError(f"the gate's model has version {content['version']}, this code reads {FORMAT_VERSION}")
+    return GateModel(
+        MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
+        *(
+            Logistic(content[kind]["bias"], MappingProxyType(content[kind]["weights"]))
+            for kind in ("with_matches", "photometric")
+        ),
+        MappingProxyType(content["floors"]),
+        MappingProxyType(content["fitted_on"]),
+    )
+
+
+def model_to_json(model: GateModel) -> dict[str, Any]:
+    """Return the content of a file that describes the model."""
+    return {
+        "version": FORMAT_VERSION,
+        "fitted_on": dict(model.fitted_on),
+        "scales": {
+            name: {"at_zero": scale.at_zero, "at_one": scale.at_one, "logarithmic": scale.logarithmic}
+            for name, scale in model.scales.items()
+        },
+        "with_matches": {"bias": model.with_matches.bias, "weights": dict(model.with_matches.weights)},
+        "photometric": {"bias": model.photometric.bias, "weights": dict(model.photometric.weights)},
+        "floors": dict(model.floors),
+    }
+
+
+def load_model(path: Path = MODEL_FILE) -> GateModel:
+    """Read a model."""
+    return model_from_json(json.loads(path.read_text("utf-8")))
+
+
+def write_model(model: GateModel, path: Path) -> None:
+    """Write a model."""
+    path.write_text(json.dumps(model_to_json(model), indent=2) + "\n", encoding="utf-8")
+
+
+SHIPPED_MODEL = load_model()
