@@ -25,6 +25,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 
 class SplatfixError(Exception):
     """An error with a stable code, the place it concerns and a way to mend it."""
@@ -176,3 +178,21 @@ class BackendMissing(SplatfixError):
 
 class EstimatorFault(SplatfixError):
     code = "estimator_fault"
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """An error as plain data: what a stored job and the status of a scene keep of it."""
+
+    code: str
+    """A SplatfixError's, or `internal_error` for any other exception."""
+    message: str
+    where: str = ""
+    hint: str = ""
+
+    @classmethod
+    def of(cls, error: Exception) -> Failure:
+        """Describe an exception; the message of one that isn't a SplatfixError stays in the log."""
+        if isinstance(error, SplatfixError):
+            return cls(error.code, error.message, error.where, error.hint)
+        return cls("internal_error", "The service failed; the reason is in its log.")

@@ -5,13 +5,15 @@ from __future__ import annotations
 import importlib
 import io
 import json
+import multiprocessing
+import os
 import re
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
 
@@ -21,61 +23,40 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from PIL import Image
+from stand_ins import make_scene, packed, set_up_engine
+from subprocess_engine import SubprocessEngine
 
 import service.estimators
-from service.interfaces import Features, Frame, Matcher, Rasterizer
+import service.web.app
+from service.jobs.embedded_engine import EmbeddedEngine
+from service.jobs.engine import Engine
 from service.localize import LoadedScene
-from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
-from service.web.app import create_app
+from service.web.api_keys import KeyRing
 from service.web.settings import Settings
 
 ROOT = Path(__file__).parents[1]
-PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
-HALF = 0.5**0.5
-TURNED = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
-"""A camera at (1, 2, 3), turned by 90 degrees about z."""
+IN_SUBPROCESS = os.environ.get("SPLATFIX_TEST_ENGINE") == "subprocess"
+"""Run all tests of the API on the engine of `subprocess_engine`; by hand, since each server takes seconds to start."""
+GO_ON = multiprocessing.get_context("spawn").Event()
+"""Held jobs wait for it, in whatever process they run."""
 
 
-class FlatRasterizer(Rasterizer):
-    """Every picture is mid-grey."""
-
-    name = "flat"
-    nbytes = 1000
-
-    def trained_at(self, long_side_px):
-        return self
-
-    def render(self, cameras, **options):
-        sizes = [(c.intrinsics.height, c.intrinsics.width) for c in cameras]
-        flat = [np.full(size, 0.5, np.float32) for size in sizes]
-        return [Frame(np.stack([f, f, f], 2), f, f, f) for f in flat]
-
-
-class BlindMatcher(Matcher):
-    """Sees nothing."""
-
-    name = "blind"
-
-    def extract(self, rgb, limit):
-        return Features(*(np.zeros(s, np.float32) for s in ((0, 2), (0,), (0, 64))))
-
-    def match(self, a, b):
-        return np.zeros((0, 2), np.int32)
-
-
-def make_scene(name: str = "room", count: int = 5) -> LoadedScene:
-    rng = np.random.default_rng(0)
-    camera = Camera(PHOTO, Pose(TURNED))
-    scene = GaussianScene(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=np.tile(np.array([[HALF, 0, 0, HALF]], np.float32), (count, 1)),
-        scales=np.tile(np.array([[0.3, 0.2, 0.1]], np.float32), (count, 1)),
-        opacities=np.linspace(0.1, 1.0, count, dtype=np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-        info=SceneInfo(name, name.title(), "ab" * 32, "ply"),
-        cameras=(NamedCamera("images/a.jpg", camera),),
-    )
-    return LoadedScene(scene, FlatRasterizer(), BlindMatcher())
+def create_app(
+    settings: Settings,
+    scenes: Mapping[str, LoadedScene] | None = None,
+    keys: KeyRing | None = None,
+    *,
+    subprocess: bool = IN_SUBPROCESS,
+) -> FastAPI:
+    """Make the service's app, with scenes that are in memory already."""
+    if subprocess:
+        set_up = partial(set_up_engine, {name: packed(scene) for name, scene in (scenes or {}).items()}, GO_ON)
+        engine: Engine = SubprocessEngine(settings.engine, set_up)
+    else:
+        engine = EmbeddedEngine(settings.engine)
+        for scene_id, loaded in (scenes or {}).items():
+            engine.add_loaded(scene_id, loaded)
+    return service.web.app.create_app(settings, engine, keys)
 
 
 @contextmanager
@@ -111,7 +92,9 @@ def fake_estimators() -> Iterator[ModuleType]:
         folder, paths = str(ROOT / "tests" / "fake_estimators"), list(service.estimators.__path__)
         if folder not in paths:  # fixtures of two modules may hold it at once
             patch.setattr(service.estimators, "__path__", [*paths, folder])
-        yield importlib.import_module("service.estimators.stepping")
+        stepping = importlib.import_module("service.estimators.stepping")
+        patch.setattr(stepping, "GO_ON", GO_ON)
+        yield stepping
 
 
 @contextmanager
@@ -150,7 +133,7 @@ def events(text: str) -> list[tuple[str, str, dict]]:
     for block in text.split("\n\n"):
         fields = dict(line.split(": ", 1) for line in block.splitlines() if not line.startswith(":"))
         if fields:
-            found.append((fields["event"], fields["id"], json.loads(fields["data"])))
+            found.append((fields["event"], fields.get("id", ""), json.loads(fields["data"])))
     return found
 
 

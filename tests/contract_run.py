@@ -96,10 +96,8 @@ def main() -> int:
     parser.add_argument("--scenarios", type=int, default=300, help="sequences of requests")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
-    from api_server import fake_estimators, serving, settings, until
+    from api_server import create_app, fake_estimators, serving, settings, until
     from test_scenes import TRANSFORMS, ply
-
-    from service.web.app import create_app
 
     counts, failures = Counter(), Counter()
     with tempfile.TemporaryDirectory() as name, fake_estimators():

@@ -20,11 +20,21 @@ import numpy as np
 from PIL import Image
 
 from service.geometry import look_at
-from service.results import Candidates, IterationRecord, MatchVectors, PoseEstimate, Reason, Status, Verdict
+from service.jobs.model import JobResult
+from service.results import (
+    Candidates,
+    IterationRecord,
+    MatchVectors,
+    PoseEstimate,
+    Reason,
+    StageTiming,
+    Status,
+    Verdict,
+)
 from service.scene_manager.splat_sample import packed_splats
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web.schemas.conversion import intrinsics_out, named_camera_out, pose_out, record_out, result_out
-from service.web.schemas.job_results import FrameOut, Timing
+from service.web.schemas.job_results import FrameOut
 from service.web.schemas.jobs import JobLinks, JobOut, PhotoOut
 from service.web.schemas.scenes import SceneLinks, SceneOut
 
@@ -118,10 +128,17 @@ class FakeJob:
     """Of several photos, what became of each."""
     created: datetime = field(default_factory=lambda: datetime.now(UTC))
     changed: threading.Condition = field(default_factory=threading.Condition)
+    attempt: int = 1
 
     def add(self, record: IterationRecord) -> None:
         with self.changed:
             self.records.append(replace(record, index=len(self.records)))
+            self.changed.notify_all()
+
+    def restart(self) -> None:
+        """Begin another attempt."""
+        with self.changed:
+            self.attempt, self.records = self.attempt + 1, []
             self.changed.notify_all()
 
     def finish(self, status: Status = Status.LOCALIZED, reason: Reason = Reason.AGREES) -> None:
@@ -148,8 +165,8 @@ class FakeJob:
             self.changed.notify_all()
 
     def out(self) -> JobOut:
-        versions = {"splatfix": "0"}
-        result = self.estimate and result_out(self.estimate, Timing(stage="decode", wall_s=0, cpu_s=0), versions)
+        decode = StageTiming("decode", 0, 0)
+        result = self.estimate and result_out(JobResult(self.estimate, decode, None, {"splatfix": "0"}))
         if result and self.walk:
             frames = [self._frame(k, status) for k, status in enumerate(self.walk)]
             result = result.model_copy(update={"frames": frames})
@@ -195,15 +212,18 @@ class FakeJob:
         )
 
     def events(self) -> Iterator[bytes]:
-        sent = 0
+        sent, attempt = 0, self.attempt
         while True:
             with self.changed:
                 if len(self.records) == sent and self.estimate is None:
                     self.changed.wait(0.2)
                 fresh, done = self.records[sent:], self.estimate is not None
             yield b": ping\n\n"
+            if self.attempt != attempt:
+                sent, attempt = 0, self.attempt
+                yield b"event: restarted\ndata: {}\n\n"
             for record in fresh:
-                yield f"event: record\nid: {sent}\ndata: {record_out(record).model_dump_json()}\n\n".encode()
+                yield f"event: record\nid: {attempt}.{sent}\ndata: {record_out(record).model_dump_json()}\n\n".encode()
                 sent += 1
             if done:
                 yield f"event: result\nid: end\ndata: {self.out().model_dump_json()}\n\n".encode()

@@ -11,10 +11,10 @@ import sys
 from pathlib import Path
 
 import uvicorn
-from api_server import fake_estimators, make_scene, settings
+from api_server import create_app, fake_estimators, settings
+from stand_ins import make_scene
 
 import service.jobs.photo_store
-from service.web.app import create_app
 
 _write = service.jobs.photo_store.write_durably
 

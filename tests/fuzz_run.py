@@ -14,7 +14,6 @@ import json
 import os
 import re
 import resource
-import shutil
 import signal
 import struct
 import subprocess
@@ -184,20 +183,19 @@ def colmap_target(fed: str, seed: bytes, beside: str, twin: bytes) -> Target:
 def archive_target() -> Target:
     """A ZIP of a scene folder, as it is uploaded."""
     from service.errors import BadInput, SceneError, StorageFailed
-    from service.scene_manager.scene_store import Uploads
+    from service.scene_manager.scene_store import FolderSceneStore
 
     folder = Path(tempfile.mkdtemp(dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-    uploads, draft = Uploads(folder, 4 * MB), folder / "draft"
+    store = FolderSceneStore([], folder, 4 * MB)
 
     def run(data: bytes) -> None:
-        draft.mkdir()
-        (draft / "upload").write_bytes(data)
         try:
-            uploads._check(draft, "scene.ply")
+            with store.draft("room") as draft:
+                draft.write(data)
+                draft.commit("scene.ply")
+            store.delete("room")
         except (SceneError, BadInput, StorageFailed):
             pass
-        finally:
-            shutil.rmtree(draft)
         assert {path.name for path in folder.iterdir()} == {".incoming"}
 
     seeds = {}

@@ -14,28 +14,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import yaml
-from api_server import (
-    HALF,
-    PHOTO,
-    ROOT,
-    TURNED,
-    BlindMatcher,
-    assert_problem,
-    events,
-    finished,
-    make_scene,
-    photo,
-    post,
-    serving,
-    settings,
-    until,
-)
+from api_server import ROOT, assert_problem, create_app, events, finished, photo, post, serving, settings, until
 from PIL import Image
+from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 
 import service.estimators
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
-from service.web.app import create_app
 from service.web.schemas import resources as documents
 from service.web.settings import Settings
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from api_server import ROOT, assert_problem, serving, settings, until
+from api_server import ROOT, assert_problem, create_app, serving, settings, until
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 
 from service.geometry import look_at, rotation_from_quat
@@ -23,7 +23,6 @@ from service.localize import LoadedScene
 from service.photos.images import encode_image
 from service.types import Camera, Intrinsics
 from service.web.api_keys import add_key
-from service.web.app import create_app
 
 TRUTH = pose_at(1.23, 0.1)
 DOCUMENT = (ROOT / "docs" / "clients.md").read_text("utf-8")
@@ -185,27 +184,25 @@ def test_a_scene_without_a_place_has_no_geopose(shared, tmp_path):
 
 
 def test_the_nearer_of_two_scenes_is_chosen():
-    from types import SimpleNamespace
-
     from service.errors import NoGeoAnchor
-    from service.types import GeoAnchor
+    from service.scene_manager.status import SceneStatus
+    from service.types import GeoAnchor, SceneInfo
     from service.web.schemas.geopose_protocol import GeoPoseRequest, nearest_scene
 
-    def entry(name: str, latitude: float, longitude: float) -> SimpleNamespace:
+    def scene(name: str, latitude: float, longitude: float) -> SceneStatus:
         anchor = GeoAnchor(latitude, longitude, 0.0, np.eye(4))
-        scene = SimpleNamespace(info=SimpleNamespace(geo_anchor=anchor))
-        return SimpleNamespace(id=name, loaded=SimpleNamespace(scene=scene))
+        return SceneStatus(name, "ready", info=SceneInfo(name, name, "", "ply", geo_anchor=anchor))
 
     def request(*places: tuple[float, float]) -> GeoPoseRequest:
         readings = [{"latitude": lat, "longitude": lon} for lat, lon in places]
         return GeoPoseRequest.model_validate({"sensorReadings": {"geolocationReadings": readings}})
 
     # Across the date line: 179.9 is nearer to -179.9 than to 170.
-    entries = [entry("west", 0, 170), entry("east", 0, -179.9)]
-    assert nearest_scene(entries, request((0, 179.9))) == "east"  # type: ignore[arg-type]
-    assert nearest_scene(entries, request((0, 171))) == "west"  # type: ignore[arg-type]
+    scenes = [scene("west", 0, 170), scene("east", 0, -179.9)]
+    assert nearest_scene(scenes, request((0, 179.9))) == "east"
+    assert nearest_scene(scenes, request((0, 171))) == "west"
     with pytest.raises(NoGeoAnchor, match="several"):
-        nearest_scene(entries, request())  # type: ignore[arg-type]
+        nearest_scene(scenes, request())
 
 
 def test_the_room_lies_where_the_test_believes():

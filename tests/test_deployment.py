@@ -146,8 +146,9 @@ def queries() -> list[str]:
 
 def test_dashboard_and_alerts_ask_for_metrics_that_the_service_has(plugins):
     """Parsed as Prometheus would; names as /metrics has them."""
-    from api_server import create_app, make_scene, serving
+    from api_server import create_app, serving
     from api_server import settings as few
+    from stand_ins import make_scene
 
     with serving(create_app(few(), {"room": make_scene()})) as client:
         told = client.get("/metrics").text

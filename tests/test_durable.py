@@ -11,13 +11,13 @@ from types import ModuleType
 
 import httpx
 import pytest
-from api_server import assert_problem, events, finished, make_scene, photo, post, serving, settings, until
+from api_server import assert_problem, create_app, events, finished, photo, post, serving, settings, until
+from stand_ins import make_scene
 
 import service.jobs.photo_store
 import service.web.app
-from service.errors import IdempotencyConflict, StorageFailed
-from service.jobs.sqlite_store import Batch, Ending, JobFilter, JobStore, NewJob, Retention
-from service.web.app import create_app
+from service.errors import StorageFailed
+from service.jobs.sqlite_store import SqliteJobStore
 
 
 def app(folder: Path, **changes):
@@ -65,7 +65,8 @@ def test_a_stream_goes_on_after_a_restart(crashed):
     with serving(app(folder)) as client:
         finished(client, f"/jobs/{running}")
         resumed = events(client.get(f"/jobs/{running}/events", headers={"Last-Event-ID": "1.0"}).text)
-        assert [number for _, number, _ in resumed] == ["2.0", "2.1", "2.2", "end"]
+        assert [number for _, number, _ in resumed] == ["", "2.0", "2.1", "2.2", "end"]
+        assert (resumed[0][0], resumed[0][2]) == ("restarted", {"attempt": 2})
         resumed = events(client.get(f"/jobs/{running}/events", headers={"Last-Event-ID": "2.1"}).text)
         assert [number for _, number, _ in resumed] == ["2.2", "end"]
 
@@ -241,89 +242,7 @@ def test_a_job_past_its_deadline_does_not_start(client, stepping):
     assert finished(client, in_time)["state"] == "succeeded"
 
 
-# ------------------------------------------------------------------ the store
-
-
-def new_job(name: str, **changes) -> NewJob:
-    values = {
-        **{"id": name, "client": "c", "idempotency_key": None, "digest": "d", "created": time.time()},
-        **{"deadline": None, "scene": "s", "estimator": "e", "fields": "{}", "photo": "{}", "photo_sha256": "0"},
-        **{"photo_bytes": 10, "keep_photo": False},
-    }
-    return NewJob(**(values | changes))
-
-
-NONE = Batch(0, (), None)
-
-
-def test_a_job_is_claimed_once_and_ends_once(tmp_path):
-    store = JobStore(tmp_path / "jobs.sqlite")
-    job = store.accept(new_job("a"))
-    assert store.claim(job) == 1
-    assert store.claim(job) is None
-    assert store.append("a", 1, Batch(0, ["one", "two"], "x"))
-    assert not store.append("a", 2, Batch(2, ["three"], "x"))
-    assert store.finish("a", 1, Batch(2, ["three"], "y"), Ending("succeeded", result="{}"), None)
-    assert not store.finish("a", 1, NONE, Ending("failed"), None)
-    assert not store.requeue("a", 1)
-    ended = store.get("a")
-    assert (ended.state, ended.records, ended.stage) == ("succeeded", 3, "y")
-    assert store.records("a", 1) == ["two", "three"]
-    store.close()
-
-
-def test_many_threads_agree_on_one_winner(tmp_path):
-    store = JobStore(tmp_path / "jobs.sqlite")
-    job = store.accept(new_job("a"))
-    won: list[int] = []
-    barrier = threading.Barrier(8)
-
-    def compete() -> None:
-        barrier.wait()
-        attempt = store.claim(job)
-        if attempt:
-            won.append(attempt)
-
-    threads = [threading.Thread(target=compete) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert won == [1]
-    store.close()
-
-
-def test_keys_belong_to_their_client(tmp_path):
-    store = JobStore(tmp_path / "jobs.sqlite")
-    store.accept(new_job("a", idempotency_key="k"))
-    assert store.accept(new_job("b", idempotency_key="k")).id == "a"
-    assert store.accept(new_job("c", idempotency_key="k", client="other")).id == "c"
-    with pytest.raises(IdempotencyConflict):
-        store.accept(new_job("d", idempotency_key="k", digest="e"))
-    store.close()
-
-
-@pytest.mark.parametrize(
-    ("kept", "left"),
-    [
-        (Retention(2, 1e9, 10**9), ["running", "c", "b"]),
-        (Retention(9, 1e9, 250), ["running", "c", "b"]),
-        (Retention(9, 3600, 10**9), ["running", "c"]),
-    ],
-)
-def test_the_oldest_ended_jobs_are_forgotten(tmp_path, kept, left, monkeypatch):
-    store = JobStore(tmp_path / "jobs.sqlite")
-    now = time.time()
-    for age, name in ((9000, "a"), (8000, "b"), (10, "c")):
-        job = store.accept(new_job(name, photo_bytes=0))
-        store.claim(job)
-        monkeypatch.setattr(time, "time", lambda age=age: now - age)
-        store.finish(name, 1, NONE, Ending("succeeded", result="x" * 100), None)
-        monkeypatch.undo()
-    store.claim(store.accept(new_job("running")))
-    store.forget(kept)
-    assert [job.id for job in store.page(JobFilter(), 9)] == left
-    store.close()
+# ------------------------------------------------------------------ the database
 
 
 def test_a_file_of_a_newer_program_is_refused(tmp_path):
@@ -331,10 +250,10 @@ def test_a_file_of_a_newer_program_is_refused(tmp_path):
         connection.execute("PRAGMA user_version = 99")
     connection.close()
     with pytest.raises(StorageFailed, match="version 99"):
-        JobStore(tmp_path / "jobs.sqlite")
+        SqliteJobStore(tmp_path / "jobs.sqlite")
 
 
 def test_a_file_that_is_no_database_is_told(tmp_path):
     (tmp_path / "jobs.sqlite").write_bytes(b"not a database" * 100)
     with pytest.raises(StorageFailed, match="not a database"):
-        JobStore(tmp_path / "jobs.sqlite")
+        SqliteJobStore(tmp_path / "jobs.sqlite")

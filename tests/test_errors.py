@@ -7,6 +7,7 @@ import json
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,12 +15,11 @@ import httpx
 import pytest
 from api_server import (
     PROBLEM,
-    TURNED,
     assert_problem,
+    create_app,
     documented,
     fake_estimators,
     finished,
-    make_scene,
     operations,
     photo,
     post,
@@ -27,14 +27,16 @@ from api_server import (
     settings,
     until,
 )
+from stand_ins import TURNED, make_scene
 from test_scenes import TRANSFORMS, ply
 
 import service.jobs.photo_store
 import service.scene_manager.scene_store
 from service.errors import BadInput, SceneError, SplatfixError
+from service.jobs.codec import encode
 from service.localize import LoadedScene
+from service.scene_manager.manager import Entry
 from service.web.api_keys import add_key
-from service.web.app import create_app
 from service.web.schemas.error_examples import EXAMPLES
 
 OPERATIONS = {operation["operationId"]: (method, path, operation) for method, path, operation in operations()}
@@ -197,12 +199,11 @@ def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
     from service.errors import Interrupted
 
     with pytest.MonkeyPatch.context() as patch:
-        import service.jobs.worker as attempts
 
         def gone(*_: object) -> None:
             raise Interrupted("told to.")
 
-        patch.setattr(attempts, "localize", gone)
+        patch.setattr(s.app.state.parts.engine, "localize", gone)
         return geopose(s)
 
 
@@ -301,10 +302,10 @@ def recovered(s: SimpleNamespace) -> str:
 
 
 def localized(s: SimpleNamespace) -> str:
-    writer = s.app.state.parts.jobs._store._writer
+    store = s.app.state.parts.jobs._store
+    writer, result = store._writer, store.result(s.done)
     writer.execute("UPDATE jobs SET status = 'localized' WHERE id = ?", (s.done,))
-    result = json.loads(s.client.get(f"/jobs/{s.done}").text)["result"] | {"geopose": None}
-    writer.execute("UPDATE jobs SET result = ? WHERE id = ?", (json.dumps(result), s.done))
+    writer.execute("UPDATE jobs SET result = ? WHERE id = ?", (encode(replace(result, geo_anchor=None)), s.done))
     s.client.event_hooks["response"].append(
         lambda _: writer.execute("UPDATE jobs SET status = 'not_localized' WHERE id = ?", (s.done,))
     )
@@ -312,8 +313,8 @@ def localized(s: SimpleNamespace) -> str:
 
 
 def fileless(s: SimpleNamespace) -> SimpleNamespace:
-    known = s.app.state.parts.scenes
-    known._entries["hall"] = type(known.entry("good"))("hall", None, loaded=make_scene("hall"), state="ready")
+    engine = s.app.state.parts.engine
+    engine._manager.add(Entry("hall", None, loaded=make_scene("hall"), state="ready"))
     return s
 
 

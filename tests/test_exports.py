@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 
 from service.errors import NoGeoAnchor
 from service.geometry import look_at, rotation_from_quat
+from service.jobs.model import JobResult
 from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import GeoAnchor, Intrinsics, Pose
-from service.web.schemas.conversion import geopose_out, result_out, timing_out
+from service.web.schemas.conversion import geopose_out, result_out
 from service.web.schemas.exports import exported
 from service.web.schemas.geodesy import geographic
 from service.web.schemas.job_results import Result
@@ -29,7 +30,7 @@ def result(intrinsics: Intrinsics = WIDE, anchor: GeoAnchor | None = None) -> Re
     estimate = PoseEstimate(
         POSE, verdict, intrinsics, "given", "room", "0" * 64, "e", "r", "m", 0, False, 0, (), (), ()
     )  # fmt: skip
-    return result_out(estimate, timing_out(StageTiming("decode", 0, 0)), {}, anchor)
+    return result_out(JobResult(estimate, StageTiming("decode", 0, 0), anchor, {}))
 
 
 def at(latitude: float, longitude: float, height: float = 0.0, enu_from_world: np.ndarray | None = None) -> GeoAnchor:

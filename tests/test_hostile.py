@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from api_server import ROOT, TURNED, assert_problem, photo, post, ready_service, until
+from api_server import ROOT, assert_problem, photo, post, ready_service, until
 from PIL import Image
+from stand_ins import TURNED
 from test_scenes import TRANSFORMS, ply
 
 from service.errors import CorruptScene, InvalidImage, SceneError, UnsupportedFormat

@@ -10,13 +10,13 @@ from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.geometry import pose_distance
+from service.jobs.model import JobResult
 from service.localize import LoadedScene, Request, localize
 from service.pose.verification.ambiguity import rank_answers
-from service.results import Reason, Status
+from service.results import Reason, StageTiming, Status
 from service.tracking import Tracker
 from service.types import Pose
 from service.web.schemas.conversion import result_out
-from service.web.schemas.job_results import Timing
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_a_room_that_repeats_itself_has_two_answers(seed: int, repeated: LoadedS
     both = sorted((found.pose, other), key=lambda pose: pose_distance(pose, truth)[1])
     assert_near(both[0], truth)
     assert_near(both[1], Pose(HALF_TURN @ truth.world_from_camera))
-    (told,) = result_out(found, Timing(stage="decode", wall_s=0.0, cpu_s=0.0), {}).alternatives
+    (told,) = result_out(JobResult(found, StageTiming("decode", 0.0, 0.0), None, {})).alternatives
     assert told.probability == probability
     assert told.pose.position == other.position_in_world.tolist()
 

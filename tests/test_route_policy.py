@@ -8,15 +8,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from api_server import make_scene, settings
+from api_server import create_app, settings
 from fastapi import APIRouter, FastAPI
 from fastapi.routing import iter_route_contexts
 from fastapi.staticfiles import StaticFiles
+from stand_ins import make_scene
 from starlette.routing import Mount, WebSocketRoute
 
 from service.web import app as web_app
 from service.web.api_keys import ROLES, add_key
-from service.web.app import create_app
 from service.web.middleware.limits import Limits
 from service.web.route_policy import RoutePolicy, declare, declared_policy, require_policies
 from service.web.viewer_relay import Relay

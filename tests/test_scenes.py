@@ -11,16 +11,16 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from api_server import assert_problem, finished, make_scene, post, serving, settings, until
+from api_server import assert_problem, create_app, finished, post, serving, settings, until
+from stand_ins import make_scene
 
 from service.errors import BadInput
 from service.localize import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
-from service.scene_manager.manager import Scenes
+from service.scene_manager.scene_store import named_scenes
 from service.scene_manager.warm_up import overview
 from service.types import GaussianScene, GeoAnchor
-from service.web.app import create_app
 
 
 def write_ply(path: Path, scene: GaussianScene) -> None:
@@ -86,7 +86,7 @@ def test_no_scene_is_called_auto(tmp_path):
     (tmp_path / "auto").mkdir()
     (tmp_path / "auto" / "scene.ply").write_bytes(ply())
     with pytest.raises(BadInput, match="stands for all"):
-        Scenes([tmp_path], "stepping", None)
+        named_scenes([tmp_path])
 
 
 def service_on(folder: Path, **changes):

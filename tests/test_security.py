@@ -17,15 +17,15 @@ from types import SimpleNamespace
 import httpx
 import pytest
 import uvicorn
-from api_server import assert_problem, finished, make_scene, photo, post, serving, settings, until
+from api_server import assert_problem, create_app, finished, photo, post, serving, settings, until
 from rich.console import Console
+from stand_ins import make_scene
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from service.cli.server import run
 from service.errors import InvalidRequest, QueueFull
 from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
-from service.web.app import create_app
 from service.web.metrics import Metrics
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Proxy

@@ -68,7 +68,11 @@ def test_splats_are_read_as_the_service_packs_them() -> None:
 def test_server_sent_events() -> None:
     # Comments, several data lines, an event without data (dropped) and one without a name: as the standard has it.
     text = ": ping\n\nevent: record\nid: 0\ndata: one\ndata: two\n\nevent: empty\n\ndata:  spaced\n\n"
-    assert list(sse_events(iter(text.split("\n")))) == [("", ""), ("record", "one\ntwo"), ("message", " spaced")]
+    assert list(sse_events(iter(text.split("\n")))) == [
+        ("", "", ""),
+        ("record", "0", "one\ntwo"),
+        ("message", "", " spaced"),
+    ]
 
 
 def test_errors_name_the_path_and_the_status() -> None:
@@ -410,6 +414,23 @@ def test_a_click_takes_the_nearest_frustum_on_its_ray() -> None:
 
 
 # ---------------------------------------------------------------- following jobs
+
+
+def test_a_stream_begins_anew_when_the_job_is_tried_again() -> None:
+    fake = FakeService()
+    job = fake.job("a", steps=3)
+    stream = JobStream(ServiceClient("http://fake", fake.transport), "a")
+    stream.start()
+    until(lambda: len(stream.records) == 3, "the first attempt")
+    first = stream.records
+    job.restart()
+    for record in records(2, seed=1):
+        job.add(record)
+    until(lambda: stream.attempt == 2 and len(stream.records) == 2, "the second attempt")
+    job.finish()
+    until(lambda: stream.complete, "the end")
+    assert [record.index for record in stream.records] == [0, 1]
+    assert len(first) == 3  # who reads the old list isn't disturbed
 
 
 def test_a_stream_follows_a_job_to_its_end() -> None:

@@ -27,12 +27,14 @@ Listener = Callable[[], None]
 class JobStream:
     """One job, followed by a background thread until it has ended.
 
-    `records` is only ever appended to and may be read from any thread. Listeners are called on the background thread
-    after each change.
+    `records` is only ever appended to, and replaced by an empty list when the job is tried again, as after a crash of
+    the service; it may be read from any thread. Listeners are called on the background thread after each change.
     """
 
     def __init__(self, client: ServiceClient, job_id: str) -> None:
         self.id = job_id
+        self.attempt = 0
+        """The attempt whose records these are; 0 before the first record."""
         self.records: list[IterationRecord] = []
         self.job: Job | None = None
         """As it was when the stream began, then as it ended; None before the first answer."""
@@ -124,16 +126,26 @@ class JobStream:
                     return
                 self._stop.wait(_RETRY_S)
 
-    def _append(self, event: IterationRecord | Job) -> None:
+    def _append(self, event: tuple[int, IterationRecord] | Job) -> None:
         if isinstance(event, Job):
             self.job, self.complete = event, True
             if event.photo_step is not None:
                 self._photo_requested = False  # while the job ran, the service returned the photo of another step
-        elif event.index == len(self.records):  # a stream that was resumed repeats the records from the first on
-            self.records.append(event)
         else:
-            return
+            attempt, record = event
+            if attempt != self.attempt:
+                self._restart(attempt)
+            if record.index != len(self.records):  # a stream that was resumed repeats the records from the first on
+                return
+            self.records.append(record)
         self._notify()
+
+    def _restart(self, attempt: int) -> None:
+        """Forget the records of the attempt before, and the images that belong to them."""
+        with self._lock:
+            self._renders.clear()
+            self._backprojected.clear()
+        self.attempt, self.records = attempt, []
 
     def _notify(self) -> None:
         for listener in tuple(self.listeners):

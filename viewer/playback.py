@@ -25,6 +25,7 @@ class Playback:
         self.count = count
         if self.live and not self.playing:
             self.index = max(0, count - 1)
+        self.index = min(self.index, max(0, count - 1))  # fewer than before: the job is tried again
 
     def go(self, index: int) -> None:
         """Show record `index`, clamped to those there are; at the newest one playback is live from now on."""

@@ -173,19 +173,22 @@ class ServiceClient:
         except httpx.HTTPError as error:
             raise ServiceError(path, error) from error
 
-    def events(self, job_id: str, stop: threading.Event) -> Iterator[IterationRecord | Job]:
-        """Yield a job's records from the first one on, then the ended job; end early once `stop` is set."""
+    def events(self, job_id: str, stop: threading.Event) -> Iterator[tuple[int, IterationRecord] | Job]:
+        """Yield a job's records from the first one on, then the ended job; end early once `stop` is set.
+
+        A record comes with the number of its attempt: a job that is tried again begins anew at record 0.
+        """
         # The service sends a ping every 15 s; a stream that is silent for three of them is broken.
         timeout, path = httpx.Timeout(10.0, read=45.0), f"/jobs/{job_id}/events"
         try:
             with self._http.stream("GET", path, timeout=timeout) as response:
                 if response.is_error:
                     raise ServiceError(path, "", response.status_code)
-                for event, data in sse_events(response.iter_lines()):
+                for event, event_id, data in sse_events(response.iter_lines()):
                     if stop.is_set():
                         return
                     if event == "record":
-                        yield parse_record(json.loads(data))
+                        yield int(event_id.partition(".")[0]), parse_record(json.loads(data))
                     elif event in ("result", "error"):
                         yield _job(json.loads(data))
                         return
@@ -204,21 +207,23 @@ class ServiceClient:
             raise ServiceError(path, error) from error
 
 
-def sse_events(lines: Iterator[str]) -> Iterator[tuple[str, str]]:
-    """Yield (event, data) of a server-sent event stream; a comment, which is a ping, yields ("", "")."""
-    event, data = "message", []
+def sse_events(lines: Iterator[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield (event, id, data) of a server-sent event stream; a comment, which is a ping, yields ("", "", "")."""
+    event, event_id, data = "message", "", []
     for line in lines:
         field, _, value = line.partition(":")
         if line and not field:
-            yield "", ""
+            yield "", "", ""
         elif field == "event":
             event = value.strip()
+        elif field == "id":
+            event_id = value.strip()
         elif field == "data":
             data.append(value.removeprefix(" "))
         elif not line:
             if data:
-                yield event, "\n".join(data)
-            event, data = "message", []
+                yield event, event_id, "\n".join(data)
+            event, event_id, data = "message", "", []
 
 
 def parse_splats(data: bytes) -> Splats:

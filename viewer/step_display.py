@@ -36,7 +36,7 @@ class StepDisplay:
     def __init__(self, controls: Controls, scene: Scene3D) -> None:
         self._controls, self._scene = controls, scene
         self._images = ComparisonPanel(controls)
-        self._shown: tuple[str, int] | None = None
+        self._shown: tuple[str, int, int] | None = None
         """Ids of the job and record that are shown."""
         self._frustum_image: tuple[str, int | None] | None = None
         """Job, and of several photos the step, whose image is in the current frustum."""
@@ -77,8 +77,8 @@ class StepDisplay:
         self._controls.numbers.content = record_html(record, job.truth)
         self._controls.stages.content = stages_html(stream.records, index)
         self._controls.flush()
-        if self._shown != (stream.id, index):
-            self._shown = stream.id, index
+        if self._shown != (stream.id, stream.attempt, index):
+            self._shown = stream.id, stream.attempt, index
             self.redraw(stream, index)
 
     def redraw(self, stream: JobStream, index: int) -> None:
@@ -88,6 +88,8 @@ class StepDisplay:
         self._queue += [(0.0, partial(self._prepare, stream, stream.records[k])) for k in neighbours]
 
     def _draw_window(self, stream: JobStream, index: int) -> None:
+        if index >= len(stream.records):  # the job has begun anew
+            return
         record, view = stream.records[index], None
         try:
             view = _match_view(stream, record)

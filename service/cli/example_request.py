@@ -4,48 +4,51 @@ from __future__ import annotations
 
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 
 from service.errors import BadInput
 from service.photos.images import read_query
 from service.scene_formats.folder import same_photo
-from service.types import GaussianScene
+from service.types import NamedCamera
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic")
 _AT_MOST = 2000
 """Files to look through."""
 
 
-def curl_line(url: str, scene: GaussianScene, folder: Path | None, *, name_scene: bool, key: str = "") -> str:
-    """Return a command that localizes a photo; `PHOTO.jpg` stands for one where the folder has none."""
-    photo = example_photo(folder, scene) if folder and folder.is_dir() else None
+def curl_line(
+    url: str, folder: Path | None, cameras: Sequence[NamedCamera], *, scene_id: str = "", key: str = ""
+) -> str:
+    """Return a command that localizes a photo; `PHOTO.jpg` stands for one where the scene's folder has none."""
+    photo = example_photo(folder, cameras) if folder and folder.is_dir() else None
     parts = ["curl", "-H", "Prefer: wait=30", "-F", f"photo=@{photo or 'PHOTO.jpg'}"]
     if key:
         parts[1:1] = ["-H", f"Authorization: Bearer {key}"]
-    if name_scene:
-        parts += ["-F", f"scene={scene.info.id}"]
-    intrinsics = _needed_intrinsics(photo, scene) if photo else None
+    if scene_id:
+        parts += ["-F", f"scene={scene_id}"]
+    intrinsics = _needed_intrinsics(photo, cameras) if photo else None
     if intrinsics:
         parts += ["-F", f"intrinsics={json.dumps(intrinsics)}"]
     return shlex.join([*parts, f"{url}/localize"])
 
 
-def example_photo(folder: Path, scene: GaussianScene) -> Path | None:
+def example_photo(folder: Path, cameras: Sequence[NamedCamera]) -> Path | None:
     """Return a photo below the folder, rather one that the scene was not trained with."""
     files = [p for p, _ in zip(sorted(folder.rglob("*")), range(_AT_MOST), strict=False)]
     photos = [p for p in files if p.suffix.lower() in _SUFFIXES and p.is_file()]
-    unseen = [p for p in photos if not any(same_photo(str(p), camera.name) for camera in scene.cameras)]
+    unseen = [p for p in photos if not any(same_photo(str(p), camera.name) for camera in cameras)]
     return next(iter(unseen or photos), None)
 
 
-def _needed_intrinsics(photo: Path, scene: GaussianScene) -> dict[str, float] | None:
+def _needed_intrinsics(photo: Path, cameras: Sequence[NamedCamera]) -> dict[str, float] | None:
     """Return those of a training photo of the same size, if the photo doesn't tell its own."""
     try:
         query = read_query(photo.read_bytes())
     except BadInput:
         return None
     size = (query.photo_intrinsics.width, query.photo_intrinsics.height)
-    fitting = [c.camera.intrinsics for c in scene.cameras]
+    fitting = [c.camera.intrinsics for c in cameras]
     fitting = [i for i in fitting if (i.width, i.height) == size]
     if query.intrinsics_source != "guessed" or not fitting:
         return None

@@ -23,6 +23,7 @@ from service.cli.terminal import (
 from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
+    from service.jobs.model import JobRecord
     from service.localize import LoadedScene
     from service.web.schemas.job_results import Result
     from service.web.schemas.parsing import Body
@@ -109,21 +110,17 @@ def _require_one_scene(paths: list[Path]) -> None:
 def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output) -> None:
     """Localize every photo by itself, in the one scene or in each of several."""
     from service.cli import result_tables
-    from service.localize import localize as run
-    from service.multi_scene import SceneEstimate, localize_in_scenes
-    from service.web.schemas.conversion import result_out, timing_out
-    from service.web.schemas.parsing import make_task
-    from service.web.schemas.resources import versions
+    from service.jobs.embedded_engine import run_task
+    from service.jobs.read_photo import read_photo
+    from service.web.schemas.conversion import result_out
+    from service.web.schemas.parsing import job_spec
 
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
-        task, query = make_task(body, fields, loaded[0])
-        if len(loaded) > 1:
-            found = localize_in_scenes(query, loaded, task.request)
-        else:
-            found = SceneEstimate(run(query, loaded[0], task.request), loaded[0])
-        anchor = found.loaded.scene.info.geo_anchor
-        results.append((body.name, result_out(found.estimate, timing_out(task.decode), versions(), anchor)))
+        spec = job_spec(fields)
+        photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb)
+        result, _ = run_task(photo.task(spec), loaded)
+        results.append((body.name, result_out(result)))
         if not output.as_json:
             say(result_tables.photo_line(*results[-1]))
     if output.as_json:
@@ -135,21 +132,24 @@ def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[Load
 def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, output: _Output) -> None:
     """Track the camera of a video, or of photos in their order, through a scene."""
     from service.cli import result_tables
-    from service.jobs.trajectory import Trajectory
-    from service.photos.sequence import read_sequence
-    from service.tracking import localize_sequence
+    from service.jobs.embedded_engine import run_task
+    from service.jobs.engine import SequenceSource
+    from service.jobs.read_photo import read_photo
+    from service.web.schemas.conversion import frame_out, result_out
     from service.web.schemas.exports import trajectory_of
-    from service.web.schemas.parsing import make_task
+    from service.web.schemas.parsing import job_spec
 
-    task, _ = make_task(body, fields, loaded, max_frames=sys.maxsize)
-    if task.reading is None:
+    spec = job_spec(fields)
+    photo = read_photo(body.photo, spec, loaded.scene.info.background_rgb, max_frames=sys.maxsize)
+    if not isinstance(photo.source, SequenceSource):
         raise InvalidRequest("a sequence has two photos or more, or is a video.", where="photos")
-    trajectory = Trajectory()
-    for found in localize_sequence(read_sequence(body.photo, task.reading), loaded, task.request):
-        frame = trajectory.add(found).frame
-        if frame and not output.as_json:
-            say(result_tables.frame_line(frame))
-    result = trajectory.result(loaded.scene.info.geo_anchor)
+
+    def show(record: JobRecord, _: object) -> None:
+        if record.frame and not output.as_json:
+            say(result_tables.frame_line(frame_out(record.frame)))
+
+    found, _ = run_task(photo.task(spec), [loaded], show)
+    result = result_out(found)
     if output.as_json:
         print_json({"photo": body.name, **result.model_dump(mode="json")})
     if output.csv_file:

@@ -19,8 +19,8 @@ def render(
 ) -> None:
     """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
     from service.scene_manager.scene_images import picture
-    from service.web.schemas.parsing import read_fields
-    from service.web.schemas.requests import RenderIn
+    from service.scene_manager.status import PictureSpec
+    from service.web.schemas.parsing import checked_intrinsics, pose_from, read_fields
 
     fields = read_fields({"truth": parsed_option(pose, "truth")})
     if fields.truth is None:
@@ -28,7 +28,7 @@ def render(
     kind = out_file.suffix.lower().removeprefix(".").replace("jpeg", "jpg")
     if kind not in ("png", "jpg"):
         raise InvalidRequest("must end with .png or .jpg.", where="--out")
-    request = RenderIn(
-        pose=fields.truth, intrinsics=parsed_option(intrinsics, "intrinsics"), format="png" if kind == "png" else "jpeg"
-    )
-    out_file.write_bytes(picture(loaded_scene(scene), request))
+    given = parsed_option(intrinsics, "intrinsics")
+    camera = None if given is None else checked_intrinsics(given)
+    wanted = PictureSpec(pose_from(fields.truth, "pose"), camera, "png" if kind == "png" else "jpeg")
+    out_file.write_bytes(picture(loaded_scene(scene), wanted))

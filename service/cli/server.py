@@ -69,11 +69,11 @@ def _announce(
     with err.status("starting") as status:
         while not server.started:
             time.sleep(0.05)
-        scenes = application.state.parts.scenes
-        while pending := scenes.readiness().pending:
+        parts = application.state.parts
+        while pending := parts.engine.readiness().pending:
             status.update(", ".join(pending))
             time.sleep(0.1)
-    readiness, url = scenes.readiness(), settings.loopback_url
+    readiness, url = parts.engine.readiness(), settings.loopback_url
     entrance = f"?key={key}" if key else ""
     for reason in readiness.failed:
         err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
@@ -83,11 +83,14 @@ def _announce(
         *([f"  viewer      {url}/viewer/{entrance}"] if settings.viewer else []),
         f"  API         {url}/docs",
     ]
-    ready = [entry for entry in scenes.entries() if entry.state == "ready"]
+    scenes = parts.engine.scenes()
+    ready = [scene.id for scene in scenes if scene.state == "ready"]
     if key:
         lines += ["The key was made for this run only; `splatfix keys add NAME` makes lasting ones."]
-    if ready:
-        scene, folder = ready[0].loaded.scene, ready[0].path
-        several = len(scenes.entries()) > 1
-        lines += ["Try it:", f"  {curl_line(url, scene, folder, name_scene=several, key=key)}"]
+    contents = parts.engine.contents(ready[0]) if ready else None
+    if ready and contents:
+        stored = parts.scene_store.find(ready[0])
+        named = ready[0] if len(scenes) > 1 else ""
+        example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=key)
+        lines += ["Try it:", f"  {example}"]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""An unfinished job in memory: what its thread tells, and who listens. The store has the rest."""
+"""An unfinished job in memory: its latest records, and who listens for them. The store has the rest."""
 
 from __future__ import annotations
 
@@ -8,33 +8,28 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 
-from service.localize import LoadedScene
+from service.jobs.engine import HeldScenes
+from service.jobs.model import JobRecord
+from service.jobs.read_photo import DecodedPhoto
 from service.types import Query
-from service.web.schemas.parsing import Task
 
 
 class LiveJob:
     """Changed by its worker's thread, read by any."""
 
     def __init__(
-        self,
-        job_id: str,
-        scene: str,
-        task: Task | None = None,
-        query: Query | None = None,
-        held: tuple[LoadedScene, ...] = (),
+        self, job_id: str, scene: str, photo: DecodedPhoto | None = None, held: HeldScenes | None = None
     ) -> None:
         self.id, self.scene = job_id, scene
-        self.task, self.query = task, query
-        """The decoded request; None after a restart, when it is on disk only."""
+        self.photo = photo
+        """Decoded; None after a restart, when it is on disk only."""
+        self.shown: Query | None = photo and photo.query
+        """What people see as the job's photo: of a sequence, the last that was localized."""
         self.held = held
-        """Scenes that stay in memory for this job; none after a restart."""
-        self.cancel = threading.Event()
-        self.attempt = 0
-        """0: not started."""
-        self.records: list[str] = []
-        """Of this attempt, as JSON."""
-        self.stage: str | None = None
+        """Scenes that stay in memory for this job; None after a restart."""
+        self.cancelled = threading.Event()
+        self.progress: tuple[int, list[JobRecord]] = (0, [])
+        """The attempt, 0 before the first, and its records: one value, so that readers never mix two attempts."""
         self.ended = threading.Event()
         """Its end is on disk, or it is over with this process."""
         self._heard = time.monotonic()
@@ -42,8 +37,26 @@ class LiveJob:
         self._lock = threading.Lock()
 
     @property
+    def attempt(self) -> int:
+        return self.progress[0]
+
+    @property
+    def records(self) -> list[JobRecord]:
+        return self.progress[1]
+
+    @property
+    def stage(self) -> str | None:
+        records = self.records
+        return records[-1].step.stage if records else None
+
+    @property
+    def task_id(self) -> str:
+        """The name of the attempt that runs."""
+        return f"{self.id}.{self.attempt}"
+
+    @property
     def memory_bytes(self) -> int:
-        return self.query.rgb.nbytes if self.query else 0
+        return self.shown.rgb.nbytes if self.shown else 0
 
     def beat(self) -> None:
         """Take note that its thread is at work."""
@@ -52,11 +65,16 @@ class LiveJob:
     def silent_s(self) -> float:
         return time.monotonic() - self._heard
 
-    def tell(self, record: str, stage: str) -> None:
+    def begin(self, attempt: int) -> None:
+        """Begin an attempt, without the records of the one before."""
+        self.beat()
+        self.progress = attempt, []
+        self.announce()
+
+    def add(self, record: JobRecord) -> None:
         """Publish a record."""
         self.beat()
         self.records.append(record)
-        self.stage = stage
         self.announce()
 
     def end(self) -> None:

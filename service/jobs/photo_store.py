@@ -1,7 +1,8 @@
-"""The photos of jobs as files: as sent until the job has ended, then as the upright JPEG that people look at.
+"""The photos of jobs, as a protocol and as the files of one folder.
 
-No name comes from outside: a file is called after its job, whose id we made. What was sent, with its EXIF data, is gone
-when the job has ended.
+A photo is there as it was sent until the job has ended, then as the upright JPEG that people look at. No name comes
+from outside: a file is called after its job, whose id we made. What was sent, with its EXIF data, is gone when the job
+has ended.
 """
 
 from __future__ import annotations
@@ -9,19 +10,52 @@ from __future__ import annotations
 import os
 from contextlib import suppress
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from service.errors import PhotoGone, StorageFailed
 
 
-class Photos:
-    """One folder."""
+@runtime_checkable
+class PhotoStore(Protocol):
+    """The photos of jobs, by the job's id. Safe to call from several threads."""
+
+    def accept(self, job_id: str, data: bytes) -> None:
+        """Keep a photo as it was sent; it survives a power loss when this returns. Raises StorageFailed."""
+        ...
+
+    def original(self, job_id: str) -> bytes:
+        """Return what was sent. Raises PhotoGone."""
+        ...
+
+    def settle(self, job_id: str, jpeg: bytes | None) -> None:
+        """Replace what was sent by a JPEG for looking at, or by nothing; by nothing, too, if there is no space."""
+        ...
+
+    def kept(self, job_id: str) -> bytes:
+        """Return the JPEG. Raises PhotoGone."""
+        ...
+
+    def delete(self, job_id: str) -> None:
+        """Delete all of a job; without effect if there is nothing."""
+        ...
+
+    def unsettled(self) -> set[str]:
+        """Return the ids of the jobs whose photo is there as it was sent."""
+        ...
+
+    def ids(self) -> set[str]:
+        """Return the ids of all jobs with a photo of either form."""
+        ...
+
+
+class FolderPhotoStore:
+    """Two files a job at most, `ID.upload` and `ID.jpg`."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         folder.mkdir(parents=True, exist_ok=True)
 
     def accept(self, job_id: str, data: bytes) -> None:
-        """Write a photo so that it survives a power loss. Raises StorageFailed."""
         path = self._folder / f"{job_id}.upload"
         try:
             write_durably(path, data)
@@ -31,11 +65,9 @@ class Photos:
             raise StorageFailed(f"the service can't write the photo to disk: {error.strerror}.") from error
 
     def original(self, job_id: str) -> bytes:
-        """Return what was sent. Raises PhotoGone."""
         return self._read(f"{job_id}.upload")
 
     def settle(self, job_id: str, jpeg: bytes | None) -> None:
-        """Replace what was sent by a JPEG for looking at, or by nothing."""
         if jpeg is not None:
             path = self._folder / f"{job_id}.jpg"
             try:
@@ -45,7 +77,6 @@ class Photos:
         (self._folder / f"{job_id}.upload").unlink(missing_ok=True)
 
     def kept(self, job_id: str) -> bytes:
-        """Return the JPEG. Raises PhotoGone."""
         return self._read(f"{job_id}.jpg")
 
     def delete(self, job_id: str) -> None:
@@ -53,7 +84,6 @@ class Photos:
             (self._folder / f"{job_id}.{suffix}").unlink(missing_ok=True)
 
     def unsettled(self) -> set[str]:
-        """Return the ids of the jobs whose photo is there as it was sent."""
         return {path.stem for path in self._folder.glob("*.upload")}
 
     def ids(self) -> set[str]:

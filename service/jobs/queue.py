@@ -1,4 +1,4 @@
-"""Where jobs run: a bounded queue and a fixed number of threads, watched over.
+"""A bounded queue of jobs and a fixed number of threads that work it off, watched over.
 
 A thread can't be stopped from outside. One that doesn't come to its next record for too long is abandoned: its job is
 given up, another thread takes its place, and what it may still bring is not wanted any more.
@@ -12,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Protocol, runtime_checkable
 
 from service.errors import QueueFull
 from service.jobs.live_job import LiveJob
@@ -22,45 +21,8 @@ _log = logging.getLogger(__name__)
 _WATCH_S = 0.5
 
 
-@runtime_checkable
-class Executor(Protocol):
-    """Here threads; machines, if one is not enough, fit behind the same calls."""
-
-    def full(self) -> bool:
-        """Return whether another job would be refused."""
-        ...
-
-    def reserve(self) -> None:
-        """Take a place in the queue for a job that is about to come. Raises QueueFull."""
-        ...
-
-    def release(self) -> None:
-        """Give back a place that was reserved for a job that doesn't come."""
-        ...
-
-    def submit(self, job: LiveJob, *, reserved: bool = True) -> None:
-        """Queue the job, on the place that was reserved for it."""
-        ...
-
-    def withdraw(self, job: LiveJob) -> None:
-        """Give back the place of a job that needn't run any more."""
-        ...
-
-    def waiting(self) -> int:
-        """Return how many jobs wait."""
-        ...
-
-    def stuck(self) -> int:
-        """Return how many workers were abandoned."""
-        ...
-
-    def close(self, grace_s: float) -> None:
-        """Take and start no more jobs; return when none is running, or after the grace period."""
-        ...
-
-
-class ThreadExecutor:
-    """Each thread runs one job at a time. `give_up` is told of a job whose thread was abandoned."""
+class JobQueue:
+    """Each thread runs one job at a time. `give_up` is called with a job whose thread was abandoned."""
 
     def __init__(
         self,
@@ -84,6 +46,7 @@ class ThreadExecutor:
         threading.Thread(target=self._watch, name="watch", daemon=True).start()
 
     def full(self) -> bool:
+        """Return whether another job would be refused."""
         with self._changed:
             return self._full()
 
@@ -94,32 +57,39 @@ class ThreadExecutor:
         return self._closed.is_set() or taken >= self._queue_size + idle or held > self._queue_bytes
 
     def reserve(self) -> None:
+        """Take a place in the queue for a job that is about to come. Raises QueueFull."""
         with self._changed:
             if self._full():
                 raise QueueFull(f"{len(self._queue)} jobs are waiting.", hint="Try again later.")
             self._reserved += 1
 
     def release(self) -> None:
+        """Give back a place that was reserved for a job that doesn't come."""
         with self._changed:
             self._reserved -= 1
 
     def submit(self, job: LiveJob, *, reserved: bool = True) -> None:
+        """Queue the job, on the place that was reserved for it."""
         with self._changed:
             self._reserved -= reserved
             self._queue.append(job)
             self._changed.notify()
 
     def withdraw(self, job: LiveJob) -> None:
+        """Give back the place of a job that needn't run any more."""
         with self._changed, suppress(ValueError):
             self._queue.remove(job)
 
     def waiting(self) -> int:
+        """Return how many jobs wait."""
         return len(self._queue)
 
     def stuck(self) -> int:
+        """Return how many threads were abandoned."""
         return self._stuck
 
     def close(self, grace_s: float) -> None:
+        """Take and start no more jobs; return when none is running, or after the grace period."""
         with self._changed:
             self._closed.set()
             self._queue.clear()  # they wait on disk

@@ -1,85 +1,97 @@
-"""Jobs: their life from acceptance to oblivion. Knows `localize`, not HTTP.
+"""Jobs: their life from acceptance until they are forgotten. Knows engines and stores, not HTTP.
 
     accepted (photo and row on disk) -> queued -> running -> succeeded | failed | cancelled | interrupted
 
 The store is the truth; what runs is in memory besides, so that listeners hear of each record at once. An attempt's
-records go to the store in batches, the last ones together with its end.
+records go to the store in batches, the last ones together with its end. A worker renews the leases of its attempts;
+one whose lease ends is made again, and its listeners see another attempt.
 """
 
 from __future__ import annotations
 
-import hashlib
+import logging
+import math
 import secrets
 import threading
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
+from functools import partial
 
-from service.errors import Interrupted, JobNotReady, QueueFull, RecordNotFound, StorageFailed
-from service.jobs.context import Desk, ending
+from service.errors import Failure, Interrupted, JobNotFound, JobNotReady, QueueFull, RecordNotFound, StorageFailed
+from service.jobs.config import JobsConfig, Observer
+from service.jobs.engine import Engine
 from service.jobs.live_job import LiveJob
-from service.jobs.photo_store import Photos
-from service.jobs.queue import Executor, ThreadExecutor
-from service.jobs.sqlite_store import Ending, JobFilter, JobStore, NewJob, Retention, StoredJob
-from service.jobs.worker import Attempts
+from service.jobs.model import (
+    Ending,
+    JobFilter,
+    JobRecord,
+    JobResult,
+    JobSpec,
+    NewJob,
+    PhotoInfo,
+    Retention,
+    StoredJob,
+)
+from service.jobs.photo_store import PhotoStore
+from service.jobs.queue import JobQueue
+from service.jobs.read_photo import DecodedPhoto, read_photo
+from service.jobs.store import JobStore
+from service.jobs.worker import Worker
 from service.photos.images import encode_image
-from service.scene_manager.manager import Scenes
-from service.types import Query
-from service.web.metrics import Metrics
-from service.web.schemas.conversion import intrinsics_out
-from service.web.schemas.jobs import PhotoOut
-from service.web.schemas.parsing import Body, Task, make_task
-from service.web.schemas.requests import LocalizeFields
-from service.web.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 _HOUSEKEEPING_S = 2.0
+_RENEWALS = 3
+"""Of a lease before it ends."""
 _STUCK_LIMIT = 2
 """Abandoned threads keep their memory; so many, and it is time for a new process."""
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
-    """A request to localize, read but not yet judged."""
+class JobOrder:
+    """A photo, or several, and what to do with it; not yet decoded."""
 
-    body: Body
-    fields: LocalizeFields
+    photo: bytes
+    """A photo or a video as it was sent; several photos as `photos.sequence.packed` puts them together."""
+    name: str
+    """Of the file; empty if it has none."""
+    photo_sha256: str
+    spec: JobSpec
     client: str
     """Who asks: the scope of idempotency keys."""
     idempotency_key: str | None
-    photo_sha256: str
-
-    @property
-    def digest(self) -> str:
-        """Of what the request means."""
-        return hashlib.sha256((self.fields.model_dump_json() + self.photo_sha256).encode()).hexdigest()
+    digest: str
+    """Of the request's meaning: the same for the same request."""
 
 
 class Jobs:
     """All jobs of one service."""
 
-    def __init__(self, settings: Settings, scenes: Scenes, folder: Path, metrics: Metrics) -> None:
-        """Open the folder. Raises StorageFailed."""
-        self._settings, self._scenes = settings, scenes
-        self._photos, self._store = Photos(folder / "photos"), JobStore(folder / "jobs.sqlite")
-        self._desk = Desk(settings, scenes, self._store, self._photos, metrics)
-        self._live = self._desk.live
-        attempts = Attempts(self._desk)
-        self._executor: Executor = ThreadExecutor(
-            attempts.run,
-            attempts.give_up,
-            workers=settings.workers,
-            queue_size=settings.queue_size,
-            queue_bytes=settings.queue_bytes,
-            stuck_s=settings.stuck_s,
+    def __init__(
+        self, config: JobsConfig, engine: Engine, store: JobStore, photos: PhotoStore, observer: Observer
+    ) -> None:
+        self._config, self._engine = config, engine
+        self._photos, self._store = photos, store
+        self._worker = Worker(config, engine, store, photos, observer)
+        self._live = self._worker.live
+        self._queue = JobQueue(
+            self._worker.run,
+            self._worker.give_up,
+            workers=config.workers,
+            queue_size=config.queue_size,
+            queue_bytes=config.queue_bytes,
+            stuck_s=config.stuck_s,
         )
+        self._renew_at = 0.0
         self._housekeeper = threading.Thread(target=self._keep_house, name="housekeeper", daemon=True)
 
     def start(self) -> None:
-        """Take up what an ended process left behind."""
-        error = Interrupted(f"the service ended {self._settings.crashes} times while this job ran.")
-        for job in self._store.recover(self._settings.crashes, ending("interrupted", error)):
-            live = self._live[job.id] = LiveJob(job.id, job.scene)
-            self._scenes.when_settled(job.scene, lambda live=live: self._executor.submit(live, reserved=False))
+        """Take up what an ended process left behind: nobody but this service has the store, so all leases are over."""
+        self._reclaim(math.inf)
+        for job in self._store.queued():
+            if job.id not in self._live:
+                self._take_up(job)
         for orphan in self._photos.ids() - self._store.ids():
             self._photos.delete(orphan)
         for job_id in self._photos.unsettled() - self._live.keys():
@@ -88,34 +100,31 @@ class Jobs:
 
     # ------------------------------------------------------------------ from outside
 
-    def accept(self, order: Order) -> StoredJob:
+    def accept(self, order: JobOrder) -> StoredJob:
         """Take a job; it is on disk when this returns.
 
         Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed.
         """
         if known := self._store.repeated(order.client, order.idempotency_key, order.digest):
             return known
-        ids = self._scenes.chosen(order.fields.scene)
-        held = self._scenes.acquire(ids)
+        held = self._engine.hold(order.spec.scene)
         try:
-            task, query = make_task(
-                order.body, order.fields, held[0], self._settings.estimator, self._settings.max_frames
-            )
-            new = _new_job(order, ids[0], task, query)
-            job = self._stored(new, order.body.photo)
+            photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames)
+            new = _new_job(order, held.ids[0], photo)
+            job = self._stored(new, order.photo)
         except BaseException:
-            self._scenes.release(held)
+            self._engine.release(held.token)
             raise
         if job.id != new.id:  # the same key came twice at once
-            self._scenes.release(held)
+            self._engine.release(held.token)
             return job
-        live = self._live[job.id] = LiveJob(job.id, job.scene, task, query, held)
-        self._executor.submit(live)
+        live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
+        self._queue.submit(live)
         return job
 
     def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
         """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
-        self._executor.reserve()
+        self._queue.reserve()
         taken = False
         try:
             self._photos.accept(new.id, photo)
@@ -123,16 +132,25 @@ class Jobs:
             taken = job.id == new.id
             return job
         except StorageFailed as error:
-            self._desk.note_storage(error)
+            self._worker.note_storage(error)
             raise
         finally:
             if not taken:
-                self._executor.release()
+                self._queue.release()
                 self._photos.delete(new.id)
 
     def get(self, job_id: str) -> StoredJob:
-        """Raises JobNotFound."""
+        """Return a job as it stands. Raises JobNotFound."""
         return self._current(self._store.get(job_id))
+
+    def result(self, job: StoredJob) -> JobResult:
+        """Return what a job that succeeded found. Raises JobNotReady; JobNotFound if it was forgotten just now."""
+        if job.state != "succeeded":
+            raise JobNotReady(f"the job is {job.state}.", where="job")
+        result = self._store.result(job.id)
+        if result is None:
+            raise JobNotFound(f"there is no job '{job.id}', or it was forgotten.", where="job")
+        return result
 
     def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:
         """Return the newest jobs that fit, at most `limit`."""
@@ -142,13 +160,13 @@ class Jobs:
         """Return the job if it hasn't ended."""
         return self._live.get(job_id)
 
-    def records(self, job: StoredJob, first: int = 0) -> list[str]:
-        """Return the records of the latest attempt from number `first` on, as JSON."""
+    def records(self, job: StoredJob, first: int = 0) -> list[JobRecord]:
+        """Return the records of the latest attempt from number `first` on."""
         live = self._live.get(job.id)
         return live.records[first:] if live and live.attempt else self._store.records(job.id, first)
 
-    def record(self, job: StoredJob, index: int | None) -> str:
-        """Return a record as JSON; None: the latest. Raises JobNotReady if it may still come, else RecordNotFound."""
+    def record(self, job: StoredJob, index: int | None) -> JobRecord:
+        """Return a record; None: the latest. Raises JobNotReady if it may still come, else RecordNotFound."""
         records = self.records(job)
         if records and (index is None or index < len(records)):
             return records[-1 if index is None else index]
@@ -160,9 +178,9 @@ class Jobs:
         live = self._live.get(job.id)
         if live is None:
             return self._photos.kept(job.id)
-        if live.query is None:
+        if live.shown is None:
             raise JobNotReady("after a restart the photo is read again when the job starts.", where="photo")
-        return encode_image(live.query.rgb)
+        return encode_image(live.shown.rgb)
 
     def waiting(self) -> int:
         return self._store.count("queued")
@@ -172,77 +190,108 @@ class Jobs:
 
     def room(self, client: str, key: str | None) -> None:
         """Raises QueueFull if a new job would be refused; a repeated one never is."""
-        if self._executor.full() and not (key and self._store.knows(client, key)):
-            raise QueueFull(f"{self._executor.waiting()} jobs are waiting.", hint="Try again later.")
+        if self._queue.full() and not (key and self._store.knows(client, key)):
+            raise QueueFull(f"{self._queue.waiting()} jobs are waiting.", hint="Try again later.")
 
     def stuck_workers(self) -> int:
-        return self._executor.stuck()
+        return self._queue.stuck()
 
     def ailments(self) -> list[str]:
         """Say what keeps jobs from being done; a supervisor should restart the process."""
-        stuck = self._executor.stuck()
+        stuck, storage_error = self._queue.stuck(), self._worker.storage_error
         told = [f"{stuck} workers are stuck"] if stuck >= _STUCK_LIMIT else []
-        return [*told, *([self._desk.storage_error] if self._desk.storage_error else [])]
+        return [*told, *([storage_error] if storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended."""
         live = self._live.get(job.id)
         if live is None:
             return
-        self._store.ask_to_cancel(job.id)
-        live.cancel.set()
-        if self._store.end_queued(job, Ending("cancelled"), self._desk.photo_until()):
-            self._executor.withdraw(live)
-            self._desk.retire(live)
+        self._store.request_cancel(job.id)
+        self._stop(live)
+        if self._store.end_queued(job, Ending("cancelled"), self._worker.photo_until()):
+            self._queue.withdraw(live)
+            self._worker.retire(live)
 
     def close(self) -> None:
         """Let what runs finish within the grace period; the rest waits on disk for the next start."""
-        self._desk.closing.set()
-        self._executor.close(self._settings.shutdown_s)
+        self._worker.closing.set()
+        self._queue.close(self._config.shutdown_s)
         for live in tuple(self._live.values()):
-            live.cancel.set()
-        self._executor.close(1.0)
+            self._stop(live)
+        self._queue.close(1.0)
         for live in tuple(self._live.values()):
             live.end()
         self._housekeeper.join(_HOUSEKEEPING_S + 1)
         self._store.close()
 
+    def _stop(self, live: LiveJob) -> None:
+        live.cancelled.set()
+        self._engine.cancel(live.task_id)
+
     def _current(self, job: StoredJob) -> StoredJob:
-        """Return the job with what its thread has told since the last batch."""
+        """Return the job with the records that have come since the last batch."""
         live = self._live.get(job.id)
         if live is None or not live.attempt or job.ended:
             return job
         return replace(job, records=len(live.records), stage=live.stage)
 
+    # ------------------------------------------------------------------ the housekeeper's
+
     def _keep_house(self) -> None:
-        """Delete what is over its time."""
-        kept = Retention(self._settings.keep_jobs, self._settings.keep_days * 86_400, self._settings.keep_bytes)
-        while not self._desk.closing.wait(_HOUSEKEEPING_S):
+        """Renew leases, make lost attempts again, delete what is over its time."""
+        kept = Retention(self._config.keep_jobs, self._config.keep_days * 86_400, self._config.keep_bytes)
+        closing = self._worker.closing
+        while not closing.wait(min(_HOUSEKEEPING_S, self._config.lease_s / _RENEWALS)):
             try:
+                self._renew()
+                self._reclaim(time.time())
                 for job_id in [*self._store.stale_photos(), *self._store.forget(kept)]:
                     self._photos.delete(job_id)
-                if self._desk.storage_error:
+                if self._worker.storage_error:
                     self._store.probe()
-                    self._desk.storage_error = ""
+                    self._worker.storage_error = ""
             except StorageFailed as error:
-                self._desk.note_storage(error)
+                self._worker.note_storage(error)
+
+    def _renew(self) -> None:
+        """Keep the attempts of this process; the queue gives up those that are stuck."""
+        if time.monotonic() < self._renew_at:
+            return
+        if running := tuple(self._worker.running):
+            self._store.renew(running, time.time() + self._config.lease_s)
+        self._renew_at = time.monotonic() + self._config.lease_s / _RENEWALS
+
+    def _reclaim(self, before: float) -> None:
+        most = self._config.max_lost
+        failure = Failure.of(Interrupted(f"the service ended {most} times while this job ran."))
+        for job in self._store.reclaim(before, most, failure):
+            _log.warning("job %s: attempt %d was lost; it is %s", job.id, job.attempt, job.state)
+            if not job.ended:
+                self._take_up(job)
+            elif live := self._live.get(job.id):
+                self._worker.retire(live)
+
+    def _take_up(self, job: StoredJob) -> None:
+        """Queue a stored job as soon as its scene can be used; those who listen to it already go on listening."""
+        live = self._live.setdefault(job.id, LiveJob(job.id, job.scene))
+        self._engine.when_settled(job.scene, partial(self._queue.submit, live, reserved=False))
 
 
-def _new_job(order: Order, scene: str, task: Task, query: Query) -> NewJob:
-    fields, now = order.fields, time.time()
-    photo = PhotoOut(name=order.body.name, sha256=order.photo_sha256, intrinsics=intrinsics_out(query.intrinsics))
+def _new_job(order: JobOrder, scene: str, photo: DecodedPhoto) -> NewJob:
+    spec, now = order.spec, time.time()
     return NewJob(
         id=secrets.token_hex(8),
         client=order.client,
         idempotency_key=order.idempotency_key,
         digest=order.digest,
         created=now,
-        deadline=fields.deadline_s and now + fields.deadline_s,
+        deadline=spec.deadline_s and now + spec.deadline_s,
         scene=scene,
-        estimator=task.request.estimator,
-        fields=fields.model_dump_json(),
-        photo=photo.model_dump_json(),
+        estimator=spec.estimator,
+        spec=spec,
+        photo=PhotoInfo(order.name, order.photo_sha256, photo.query.intrinsics),
         photo_sha256=order.photo_sha256,
-        photo_bytes=len(order.body.photo),
-        keep_photo=fields.keep_photo,
+        photo_bytes=len(order.photo),
+        keep_photo=spec.keep_photo,
     )

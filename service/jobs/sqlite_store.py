@@ -1,7 +1,8 @@
 """Jobs on disk (SQLite, WAL): what is accepted here survives a crash. The only file with sqlite3.
 
 Every change of state is a compare-and-set on (state, attempt), so a job can't end twice, whatever threads or
-processes believe. Commits are `synchronous=FULL`: when a method returns, its change is on disk.
+processes believe. Commits are `synchronous=FULL`: when a method returns, its change is on disk. Specs, photos' data,
+records and results are JSON text of `codec`.
 """
 
 from __future__ import annotations
@@ -12,14 +13,30 @@ import time
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
-from service.errors import IdempotencyConflict, JobNotFound, StorageFailed
+from service.errors import Failure, IdempotencyConflict, JobNotFound, StorageFailed
+from service.jobs.codec import decode, encode
+from service.jobs.model import (
+    ENDED,
+    Batch,
+    Ending,
+    JobFilter,
+    JobRecord,
+    JobResult,
+    JobSpec,
+    JobState,
+    NewJob,
+    PhotoInfo,
+    Retention,
+    StoredJob,
+)
+from service.jobs.release_0_1 import old_failure, old_photo, old_result, old_spec
+from service.results import Status
 
-# One entry takes the file one version up; an entry that was released is never changed.
-_MIGRATIONS = (
-    """
+_VERSION_1 = """
     CREATE TABLE jobs (
         number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, client TEXT NOT NULL,
         idempotency_key TEXT, digest TEXT NOT NULL, state TEXT NOT NULL, attempt INTEGER NOT NULL DEFAULT 0,
@@ -37,111 +54,45 @@ _MIGRATIONS = (
         job TEXT NOT NULL, attempt INTEGER NOT NULL, seq INTEGER NOT NULL, record BLOB NOT NULL,
         UNIQUE (job, attempt, seq)
     );
-    """,
-)
-_ENDED = ("succeeded", "failed", "cancelled", "interrupted")
-_ENDED_SQL = ", ".join(f"'{state}'" for state in _ENDED)
+"""
+_ENDED_SQL = ", ".join(f"'{state}'" for state in ENDED)
+_CODED = {"spec": JobSpec, "photo": PhotoInfo, "failure": Failure}
+"""Columns of JSON text."""
+_JOB_COLUMNS = tuple(field.name for field in fields(StoredJob))
+_NEW_COLUMNS = tuple(field.name for field in fields(NewJob))
 
 
-@dataclass(frozen=True, slots=True)
-class NewJob:
-    """A job as it is accepted. Nested values are JSON text."""
-
-    id: str
-    client: str
-    """Whose it is: the scope of idempotency keys."""
-    idempotency_key: str | None
-    digest: str
-    """Of the request's meaning: tells whether a repeated key means the same."""
-    created: float
-    """Seconds since 1970, like all times here."""
-    deadline: float | None
-    """After that the job needn't start."""
-    scene: str
-    estimator: str
-    fields: str
-    photo: str
-    photo_sha256: str
-    photo_bytes: int
-    keep_photo: bool
+def _make_version_1(writer: sqlite3.Connection) -> None:
+    for statement in _VERSION_1.split(";"):
+        writer.execute(statement)
 
 
-@dataclass(frozen=True, slots=True)
-class StoredJob(NewJob):
-    number: int
-    """In the order of acceptance."""
-    state: str
-    attempt: int
-    """How often it was started."""
-    cancelled: bool
-    """Somebody wants it to end."""
-    started: float | None
-    finished: float | None
-    photo_until: float | None
-    """When the photo of an ended job is deleted; None: with the job."""
-    records: int
-    stage: str | None
-    status: str | None
-    score: float | None
-    result: str | None
-    error: str | None
-
-    @property
-    def ended(self) -> bool:
-        return self.state in _ENDED
+def _make_version_2(writer: sqlite3.Connection) -> None:
+    """From release 0.1.0: values instead of the API's JSON, and leases. Its records go."""
+    writer.execute("ALTER TABLE jobs RENAME COLUMN fields TO spec")
+    writer.execute("ALTER TABLE jobs RENAME COLUMN error TO failure")
+    writer.execute("ALTER TABLE jobs RENAME COLUMN crashes TO lost")
+    writer.execute("ALTER TABLE jobs ADD COLUMN lease_until REAL NOT NULL DEFAULT 0")
+    writer.execute("DELETE FROM events")
+    writer.execute("UPDATE jobs SET records = 0, stage = NULL")
+    rows = writer.execute("SELECT id, estimator, spec, photo, result, failure FROM jobs").fetchall()
+    for job_id, estimator, spec, photo, result, failure in rows:
+        writer.execute(
+            "UPDATE jobs SET spec = ?, photo = ?, result = ?, failure = ? WHERE id = ?",
+            (
+                *(encode(old_spec(spec, estimator)), encode(old_photo(photo))),
+                *(result and encode(old_result(result)), failure and encode(old_failure(failure)), job_id),
+            ),
+        )
+    sizes = "photo_bytes + coalesce(length(result), 0) + coalesce(length(failure), 0)"
+    writer.execute(f"UPDATE jobs SET bytes = {sizes} WHERE state IN ({_ENDED_SQL})")
 
 
-@dataclass(frozen=True, slots=True)
-class JobFilter:
-    """Which jobs to list; None: any."""
-
-    scene: str | None = None
-    estimator: str | None = None
-    state: str | None = None
-    status: str | None = None
-    """Of the result."""
-    photo_sha256: str | None = None
-    before: int | None = None
-    """Only jobs accepted before the one with that number."""
+# One entry takes the file one version up; an entry that was released is never changed.
+_MIGRATIONS = (_make_version_1, _make_version_2)
 
 
-@dataclass(frozen=True, slots=True)
-class Batch:
-    """Successive records of an attempt, as JSON."""
-
-    first: int
-    """The first one's number."""
-    records: Sequence[str]
-    stage: str | None
-    """Of the last record."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """How an attempt ended. Nested values are JSON text."""
-
-    state: str
-    status: str | None = None
-    score: float | None = None
-    result: str | None = None
-    error: str | None = None
-    scene: str | None = None
-    """The one that the photo shows, where it was looked for in several."""
-
-
-@dataclass(frozen=True, slots=True)
-class Retention:
-    """How much is kept of what has ended; whatever is reached first counts."""
-
-    jobs: int
-    seconds: float
-    bytes: int
-
-
-_JOB_COLUMNS = ", ".join(field.name for field in fields(StoredJob))
-
-
-class JobStore:
+class SqliteJobStore:
     """One file, one process (a lock file sees to that elsewhere), any number of threads."""
 
     def __init__(self, path: Path) -> None:
@@ -175,127 +126,135 @@ class JobStore:
                 where="data_dir",
                 hint="Run the newer program, or name another data_dir.",
             )
-        for number in range(version, len(_MIGRATIONS)):
-            self._writer.executescript(f"BEGIN; {_MIGRATIONS[number]}; PRAGMA user_version = {number + 1}; COMMIT;")
+        for number, migrate in enumerate(_MIGRATIONS[version:], version + 1):
+            with self._transaction() as writer:
+                migrate(writer)
+                writer.execute(f"PRAGMA user_version = {number}")
 
     # ------------------------------------------------------------------ the life of a job
 
     def accept(self, job: NewJob) -> StoredJob:
-        """Store a new job, or return the one that has its key. Raises IdempotencyConflict, StorageFailed."""
-        names = [field.name for field in fields(NewJob)]
-        row = f"INSERT INTO jobs ({', '.join(names)}, state) VALUES ({', '.join('?' * len(names))}, 'queued')"
+        row = f"INSERT INTO jobs ({', '.join(_NEW_COLUMNS)}, state) VALUES ({_marks(len(_NEW_COLUMNS))}, 'queued')"
         with self._transaction() as writer:
             known = _repeated(writer, job.client, job.idempotency_key, job.digest)
             if known is None:
-                writer.execute(row, [getattr(job, name) for name in names])
-                known = _job(_select(writer, "WHERE id = ?", job.id)[0])
+                values = [getattr(job, name) for name in _NEW_COLUMNS]
+                coded = zip(_NEW_COLUMNS, values, strict=True)
+                writer.execute(row, [encode(value) if name in _CODED else value for name, value in coded])
+                known = _select(writer, "WHERE id = ?", job.id)[0]
         return known
 
     def repeated(self, client: str, key: str | None, digest: str) -> StoredJob | None:
-        """Return the job that has the client's idempotency key. Raises IdempotencyConflict."""
         with self._reading:
             return _repeated(self._reader, client, key, digest)
 
     def knows(self, client: str, key: str) -> bool:
-        """Return whether the client has used that idempotency key."""
         with self._reading:
             return bool(_select(self._reader, "WHERE client = ? AND idempotency_key = ?", client, key))
 
     def probe(self) -> None:
-        """Write something. Raises StorageFailed."""
         with self._transaction() as writer:
             writer.execute(f"PRAGMA user_version = {len(_MIGRATIONS)}")
 
-    def claim(self, job: StoredJob) -> int | None:
-        """Start the next attempt; return its number, or None if the job isn't what the caller believes."""
+    def claim(self, job: StoredJob, lease_until: float) -> int | None:
         with self._transaction() as writer:
             changed = writer.execute(
-                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, records = 0, stage = NULL "
-                "WHERE id = ? AND state = 'queued' AND attempt = ? AND NOT cancelled",
-                (time.time(), job.id, job.attempt),
+                "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, lease_until = ?, records = 0, "
+                "stage = NULL WHERE id = ? AND state = 'queued' AND attempt = ? AND NOT cancelled",
+                (time.time(), lease_until, job.id, job.attempt),
             ).rowcount
             writer.execute("DELETE FROM events WHERE job = ? AND attempt <= ?", (job.id, job.attempt))
         return job.attempt + 1 if changed else None
 
+    def renew(self, attempts: Sequence[tuple[str, int]], lease_until: float) -> None:
+        with self._transaction() as writer:
+            writer.executemany(
+                "UPDATE jobs SET lease_until = ? WHERE id = ? AND state = 'running' AND attempt = ?",
+                [(lease_until, job_id, attempt) for job_id, attempt in attempts],
+            )
+
+    def reclaim(self, before: float, most_lost: int, failure: Failure) -> list[StoredJob]:
+        now = time.time()
+        end = (
+            "finished = ?, bytes = photo_bytes, photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END "
+            "WHERE state = 'running' AND lease_until < ?"
+        )
+        over = "SELECT id FROM jobs WHERE state = 'running' AND lease_until < ?"
+        with self._reading:
+            if not self._reader.execute(over, (before,)).fetchone():
+                return []
+        with self._transaction() as writer:
+            ids = [job_id for (job_id,) in writer.execute(over, (before,))]
+            writer.execute("UPDATE jobs SET lost = lost + 1 WHERE state = 'running' AND lease_until < ?", (before,))
+            writer.execute(f"UPDATE jobs SET state = 'cancelled', {end} AND cancelled", (now, now, before))
+            writer.execute(
+                f"UPDATE jobs SET state = 'interrupted', failure = ?, {end} AND lost >= ?",
+                (encode(failure), now, now, before, most_lost),
+            )
+            writer.execute("UPDATE jobs SET state = 'queued' WHERE state = 'running' AND lease_until < ?", (before,))
+            return _select(writer, f"WHERE id IN ({_marks(len(ids))}) ORDER BY number", *ids)
+
     def append(self, job_id: str, attempt: int, batch: Batch) -> bool:
-        """Store some of an attempt's records. False if the attempt is over."""
         with self._transaction() as writer:
             return _append(writer, job_id, attempt, batch)
 
     def finish(self, job_id: str, attempt: int, batch: Batch, ending: Ending, photo_until: float | None) -> bool:
-        """Store an attempt's last records and its end, once. False if the attempt is over."""
-        size = len(ending.result or "") + len(ending.error or "")
+        verdict = ending.result.estimate.verdict if ending.result else None
+        result, failure = (value and encode(value) for value in (ending.result, ending.failure))
+        size = len(result or "") + len(failure or "")
         with self._transaction() as writer:
             if not _append(writer, job_id, attempt, batch):
                 return False
             writer.execute(
-                "UPDATE jobs SET state = ?, status = ?, score = ?, result = ?, error = ?, "
+                "UPDATE jobs SET state = ?, status = ?, score = ?, result = ?, failure = ?, "
                 "scene = coalesce(?, scene), finished = ?, "
                 "photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END, bytes = ? + photo_bytes + "
                 "(SELECT coalesce(sum(length(record)), 0) FROM events WHERE job = jobs.id) WHERE id = ?",
                 (
-                    *(ending.state, ending.status, ending.score, ending.result, ending.error),
+                    *(ending.state, verdict and verdict.status, verdict and verdict.score, result, failure),
                     *(ending.scene, time.time(), photo_until, size, job_id),
                 ),
             )
         return True
 
     def end_queued(self, job: StoredJob, ending: Ending, photo_until: float | None) -> bool:
-        """End a job that waits. False if it doesn't."""
         with self._transaction() as writer:
             changed = writer.execute(
-                "UPDATE jobs SET state = ?, error = ?, finished = ?, bytes = photo_bytes, "
+                "UPDATE jobs SET state = ?, failure = ?, finished = ?, bytes = photo_bytes, "
                 "photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END "
                 "WHERE id = ? AND state = 'queued' AND attempt = ?",
-                (ending.state, ending.error, time.time(), photo_until, job.id, job.attempt),
+                (
+                    *(ending.state, ending.failure and encode(ending.failure), time.time()),
+                    *(photo_until, job.id, job.attempt),
+                ),
             ).rowcount
         return bool(changed)
 
-    def ask_to_cancel(self, job_id: str) -> None:
-        """Put on record that an unfinished job shall end: a restart must not run it again."""
+    def request_cancel(self, job_id: str) -> None:
         with self._transaction() as writer:
             writer.execute(f"UPDATE jobs SET cancelled = 1 WHERE id = ? AND state NOT IN ({_ENDED_SQL})", (job_id,))
 
     def requeue(self, job_id: str, attempt: int) -> bool:
-        """Let an attempt that was stopped on purpose be made again."""
         with self._transaction() as writer:
             changed = writer.execute(
                 "UPDATE jobs SET state = 'queued' WHERE id = ? AND state = 'running' AND attempt = ?", (job_id, attempt)
             ).rowcount
         return bool(changed)
 
-    def recover(self, crashes: int, interrupted: Ending) -> list[StoredJob]:
-        """Sort out what an ended process left: return the jobs that wait, oldest first.
-
-        What was running waits again, unless it was cancelled, or has been running in `crashes` crashes: it may be
-        what causes them.
-        """
-        now = time.time()
-        ends = f"finished = {now}, bytes = photo_bytes, photo_until = CASE WHEN keep_photo THEN NULL ELSE {now} END"
-        with self._transaction() as writer:
-            writer.execute(
-                f"UPDATE jobs SET state = 'cancelled', {ends} WHERE cancelled AND state NOT IN ({_ENDED_SQL})"
-            )
-            writer.execute("UPDATE jobs SET crashes = crashes + 1 WHERE state = 'running'")
-            writer.execute(
-                f"UPDATE jobs SET state = ?, error = ?, {ends} WHERE state = 'running' AND crashes >= ?",
-                (interrupted.state, interrupted.error, crashes),
-            )
-            writer.execute("UPDATE jobs SET state = 'queued' WHERE state = 'running'")
-            return [_job(row) for row in _select(writer, "WHERE state = 'queued' ORDER BY number")]
-
     # ------------------------------------------------------------------ reading
 
     def get(self, job_id: str) -> StoredJob:
-        """Raises JobNotFound."""
         with self._reading:
-            rows = _select(self._reader, "WHERE id = ?", job_id)
-        if not rows:
+            found = _select(self._reader, "WHERE id = ?", job_id)
+        if not found:
             raise JobNotFound(f"there is no job '{job_id}', or it was forgotten.", where="job")
-        return _job(rows[0])
+        return found[0]
+
+    def queued(self) -> list[StoredJob]:
+        with self._reading:
+            return _select(self._reader, "WHERE state = 'queued' ORDER BY number")
 
     def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:
-        """Return the newest jobs that fit, at most `limit`."""
         tests = {
             "scene = ?": wanted.scene,
             "estimator = ?": wanted.estimator,
@@ -307,37 +266,38 @@ class JobStore:
         given = {test: value for test, value in tests.items() if value is not None}
         where = f"WHERE {' AND '.join(given)} " if given else ""
         with self._reading:
-            rows = _select(self._reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
-        return [_job(row) for row in rows]
+            return _select(self._reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
 
-    def count(self, state: str) -> int:
+    def count(self, state: JobState) -> int:
         with self._reading:
             return self._reader.execute("SELECT count(*) FROM jobs WHERE state = ?", (state,)).fetchone()[0]
 
-    def records(self, job_id: str, first: int = 0) -> list[str]:
-        """Return the records of the latest attempt that has any, from number `first` on, as JSON."""
+    def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
         with self._reading:
             rows = self._reader.execute(
                 "SELECT record FROM events WHERE job = ? AND seq >= ? "
                 "AND attempt = (SELECT attempt FROM jobs WHERE id = ?) ORDER BY seq",
                 (job_id, first, job_id),
             ).fetchall()
-        return [zlib.decompress(data).decode() for (data,) in rows]
+        return [decode(JobRecord, zlib.decompress(data).decode()) for (data,) in rows]
+
+    def result(self, job_id: str) -> JobResult | None:
+        with self._reading:
+            row = self._reader.execute("SELECT result FROM jobs WHERE id = ?", (job_id,)).fetchone()
+        return decode(JobResult, row[0]) if row and row[0] else None
 
     # ------------------------------------------------------------------ forgetting
 
     def stale_photos(self) -> list[str]:
-        """Return the ended jobs whose photo is due for deletion, and take note that it is gone."""
         with self._transaction() as writer:
             rows = writer.execute(
-                f"UPDATE jobs SET photo_until = NULL, keep_photo = 0, bytes = bytes - photo_bytes, photo_bytes = 0 "
+                "UPDATE jobs SET photo_until = NULL, keep_photo = 0, bytes = bytes - photo_bytes, photo_bytes = 0 "
                 f"WHERE photo_until < ? AND state IN ({_ENDED_SQL}) RETURNING id",
                 (time.time(),),
             ).fetchall()
         return [job_id for (job_id,) in rows]
 
     def forget(self, kept: Retention) -> list[str]:
-        """Delete the oldest ended jobs beyond what shall be kept; return their ids."""
         with self._transaction() as writer:
             ended = "SELECT id, finished, row_number() OVER newest AS place, sum(bytes) OVER newest AS total "
             ended += f"FROM jobs WHERE state IN ({_ENDED_SQL}) WINDOW newest AS (ORDER BY number DESC)"
@@ -369,13 +329,18 @@ class JobStore:
                 raise
 
 
-def _select(connection: sqlite3.Connection, where: str, *values: object) -> list[tuple]:
-    return connection.execute(f"SELECT {_JOB_COLUMNS} FROM jobs {where}", values).fetchall()
+def _marks(count: int) -> str:
+    return ", ".join("?" * count)
+
+
+def _select(connection: sqlite3.Connection, where: str, *values: object) -> list[StoredJob]:
+    rows = connection.execute(f"SELECT {', '.join(_JOB_COLUMNS)} FROM jobs {where}", values).fetchall()
+    return [_job(row) for row in rows]
 
 
 def _repeated(connection: sqlite3.Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
-    rows = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key is not None else []
-    known = _job(rows[0]) if rows else None
+    found = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key is not None else []
+    known = found[0] if found else None
     if known and known.digest != digest:
         raise IdempotencyConflict(
             f"the key was used for job {known.id}, which was another request.",
@@ -386,16 +351,23 @@ def _repeated(connection: sqlite3.Connection, client: str, key: str | None, dige
 
 
 def _job(row: tuple) -> StoredJob:
-    return StoredJob(*row)
+    values: dict[str, Any] = dict(zip(_JOB_COLUMNS, row, strict=True))
+    for name, kind in _CODED.items():
+        values[name] = decode(kind, values[name]) if values[name] else None
+    values["status"] = values["status"] and Status(values["status"])
+    for name in ("cancelled", "keep_photo"):
+        values[name] = bool(values[name])
+    return StoredJob(**values)
 
 
 def _append(writer: sqlite3.Connection, job_id: str, attempt: int, batch: Batch) -> bool:
+    stage = batch.records[-1].step.stage if batch.records else None
     changed = writer.execute(
-        "UPDATE jobs SET records = ?, stage = ? WHERE id = ? AND state = 'running' AND attempt = ?",
-        (batch.first + len(batch.records), batch.stage, job_id, attempt),
+        "UPDATE jobs SET records = ?, stage = coalesce(?, stage) WHERE id = ? AND state = 'running' AND attempt = ?",
+        (batch.first + len(batch.records), stage, job_id, attempt),
     ).rowcount
     if changed:
-        rows = enumerate((zlib.compress(text.encode(), 1) for text in batch.records), batch.first)
+        rows = enumerate((zlib.compress(encode(record).encode(), 1) for record in batch.records), batch.first)
         writer.executemany(
             "INSERT INTO events VALUES (?, ?, ?, ?)", [(job_id, attempt, seq, record) for seq, record in rows]
         )

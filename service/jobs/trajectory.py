@@ -1,32 +1,31 @@
-"""The answer to several photos, or a video, as the API gives it; `sequence` reads them."""
+"""The answer to several photos, or a video: a frame for each, and one result for the whole."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+from service.jobs.model import JobRecord, JobResult, SequenceFrame
 from service.localize import Clock
 from service.results import PoseEstimate, StageTiming, Status
 from service.tracking import SequencePose
 from service.types import GeoAnchor
-from service.web.schemas.conversion import covariance_out, record_out, result_out, timing_out, transform_out
-from service.web.schemas.job_results import FrameOut, Record, Result
-from service.web.schemas.resources import versions
+from service.versions import versions
 
 
 class Trajectory:
-    """What a sequence's photos told, as the API gives it."""
+    """Collects the poses of a sequence's photos."""
 
     def __init__(self) -> None:
         self._clock = Clock()
-        self._frames: list[FrameOut] = []
+        self._frames: list[SequenceFrame] = []
         self._spent: dict[str, StageTiming] = {}
         self._warnings: dict[str, None] = {}
-        self.renders = 0
+        self._renders = 0
         self._exhausted = False
         self.shown: PoseEstimate | None = None
         """The last that was localized; before there is one, the last."""
 
-    def add(self, found: SequencePose) -> Record:
+    def add(self, found: SequencePose) -> JobRecord:
         """Take a photo's answer; return its record, whose pose is the last that was localized."""
         estimate = found.estimate
         last = estimate.records[-1]
@@ -34,16 +33,16 @@ class Trajectory:
             self.shown = estimate
         assert self.shown
         shown = self.shown.records[-1]
-        frame = _frame_out(len(self._frames), found)
+        frame = _frame(len(self._frames), found)
         self._frames.append(frame)
         for timing in estimate.timings:
             before = self._spent.get(timing.stage, StageTiming(timing.stage, 0.0, 0.0))
             wall_s, cpu_s = before.wall_s + timing.wall_s, before.cpu_s + timing.cpu_s
             self._spent[timing.stage] = StageTiming(timing.stage, wall_s, cpu_s)
         self._warnings |= dict.fromkeys(estimate.warnings)
-        self.renders += estimate.renders
+        self._renders += estimate.renders
         self._exhausted |= found.exhausted
-        record = replace(
+        step = replace(
             last,
             stage="track" if frame.tracked else "localize",
             pose=shown.pose,
@@ -52,10 +51,10 @@ class Trajectory:
             elapsed_s=self._clock.wall_s,
             cpu_s=self._clock.cpu_s,
         )
-        return record_out(record).model_copy(update={"frame": frame})
+        return JobRecord(step, frame)
 
-    def result(self, anchor: GeoAnchor | None) -> Result:
-        """Answer for the whole: the shown photo's result with all frames, and the time that all took.
+    def result(self, anchor: GeoAnchor | None) -> JobResult:
+        """Return the shown photo's result with all frames, and the time that all took.
 
         Needs one photo. Time that no stage took is the reading of the photos.
         """
@@ -63,7 +62,6 @@ class Trajectory:
         spent = self._spent.values()
         wall_s = self._clock.wall_s - sum(timing.wall_s for timing in spent)
         cpu_s = self._clock.cpu_s - sum(timing.cpu_s for timing in spent)
-        decode = timing_out(StageTiming("decode", wall_s, cpu_s))
         missed = sum(frame.status is not Status.LOCALIZED for frame in self._frames)
         warnings = [
             *self._warnings,
@@ -71,23 +69,24 @@ class Trajectory:
         ]
         if self._exhausted:
             warnings.append(f"The budget ended after {len(self._frames)} photos.")
-        shown = replace(
+        estimate = replace(
             self.shown,
             timings=tuple(spent),
             warnings=tuple(warnings),
             budget_exhausted=self._exhausted,
-            renders=self.renders,
+            renders=self._renders,
         )
-        return result_out(shown, decode, versions(), anchor).model_copy(update={"frames": self._frames})
+        decode = StageTiming("decode", wall_s, cpu_s)
+        return JobResult(estimate, decode, anchor, versions(), tuple(self._frames))
 
 
 def _localized(estimate: PoseEstimate | None) -> bool:
     return estimate is not None and estimate.verdict.status is Status.LOCALIZED
 
 
-def _frame_out(index: int, found: SequencePose) -> FrameOut:
+def _frame(index: int, found: SequencePose) -> SequenceFrame:
     estimate, verdict = found.estimate, found.estimate.verdict
-    return FrameOut(
+    return SequenceFrame(
         index=index,
         name=found.photo.name,
         time_s=found.photo.time_s,
@@ -95,6 +94,6 @@ def _frame_out(index: int, found: SequencePose) -> FrameOut:
         reason=verdict.reason,
         score=verdict.score,
         tracked=estimate.records[-1].stage == "track",
-        world_from_camera=transform_out(estimate.pose.world_from_camera),
-        covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
+        pose=estimate.pose,
+        covariance=verdict.covariance,
     )

@@ -3,37 +3,54 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from contextlib import closing
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
 
-from service.errors import DeadlineExceeded, Interrupted, SceneError, StorageFailed
-from service.jobs.context import Desk, ending
+from service.errors import DeadlineExceeded, Failure, Interrupted, SceneError, StorageFailed
+from service.jobs.config import JobsConfig, Observer
+from service.jobs.engine import Engine, EngineAnswer, EngineLost
 from service.jobs.live_job import LiveJob
-from service.jobs.sqlite_store import Batch, Ending, StoredJob
-from service.jobs.trajectory import Trajectory
-from service.localize import Cancelled, LoadedScene, Request, localize
+from service.jobs.model import Batch, Ending, JobRecord, StoredJob
+from service.jobs.photo_store import PhotoStore
+from service.jobs.read_photo import read_photo
+from service.jobs.store import JobStore
+from service.localize import Cancelled
 from service.logs import bound
-from service.multi_scene import SceneEstimate, localize_in_scenes
-from service.photos.sequence import Reading, read_sequence
-from service.results import IterationRecord
-from service.scene_manager.manager import several
-from service.tracking import localize_sequence
+from service.photos.images import encode_image
 from service.types import Query
-from service.web.schemas.conversion import record_out, result_out, timing_out
-from service.web.schemas.job_results import Record, Result
-from service.web.schemas.requests import LocalizeFields
-from service.web.schemas.resources import versions
 
 _log = logging.getLogger(__name__)
+_T = TypeVar("_T")
 
 _BATCH_S = 0.5
+_RETRY_S = 0.5
 
 
-class Attempts:
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
+class _AttemptLost(Exception):
+    """Another worker has the job, or it ended: what this attempt finds is not wanted any more."""
+
+
+class Worker:
+    """Runs attempts, one on each thread that calls `run`."""
+
+    def __init__(
+        self, config: JobsConfig, engine: Engine, store: JobStore, photos: PhotoStore, observer: Observer
+    ) -> None:
+        self._config, self._engine, self._observer = config, engine, observer
+        self._store, self._photos = store, photos
+        self.live: dict[str, LiveJob] = {}
+        """The jobs that haven't ended."""
+        self.running: set[tuple[str, int]] = set()
+        """The attempts (job, number) whose leases are to be renewed."""
+        self.closing = threading.Event()
+        """The service ends: what can't be finished waits for the next start."""
+        self.storage_error = ""
+        """Why nothing can be written to disk; empty while it can."""
+
+    # ------------------------------------------------------------------ an attempt
 
     def run(self, live: LiveJob) -> None:
         """Make one attempt, unless the job was cancelled while it waited."""
@@ -41,115 +58,160 @@ class Attempts:
             self._run(live)
 
     def give_up(self, live: LiveJob) -> None:
-        """End a job whose worker is stuck."""
-        desk = self._desk
-        error = Interrupted(f"the job told nothing for {desk.settings.stuck_s:g} s and was given up.")
-        nothing = Batch(len(desk.store.records(live.id)), (), live.stage)
-        end = ending("interrupted", error)
-        if desk.store.finish(live.id, live.attempt, nothing, end, desk.photo_until()):
-            live.cancel.set()
-            desk.retire(live)
+        """End a job whose thread is stuck."""
+        error = Interrupted(f"the job had no new record for {self._config.stuck_s:g} s and was given up.")
+        nothing = Batch(len(self._store.records(live.id)), ())
+        end = Ending("interrupted", failure=Failure.of(error))
+        if self._store.finish(live.id, live.attempt, nothing, end, self.photo_until()):
+            live.cancelled.set()
+            self._engine.cancel(live.task_id)
+            self.retire(live)
 
     def _run(self, live: LiveJob) -> None:
-        desk = self._desk
-        job = desk.store.get(live.id)
-        attempt = desk.persisted(live, lambda: desk.store.claim(job))
+        job = self._store.get(live.id)
+        lease_until = time.time() + self._config.lease_s
+        attempt = self._persisted(live, lambda: self._store.claim(job, lease_until))
         if attempt is None:
             return
-        desk.metrics.started(time.time() - job.created)
-        live.attempt = attempt
-        live.announce()
-        sent = _Sent()
-        end = self._attempt(live, job, sent)
-        if end is None:
-            desk.persisted(live, lambda: desk.store.requeue(job.id, attempt))
-            return
-        batch = Batch(sent.count, live.records[sent.count :], live.stage)
-        until = desk.photo_until()
-        if desk.persisted(live, lambda: desk.store.finish(job.id, attempt, batch, end, until)):
-            _log.info("job %s: %s %s", job.id, end.state, end.status or "")
-            desk.retire(live)
-
-    def _attempt(self, live: LiveJob, job: StoredJob, sent: _Sent) -> Ending | None:
-        """Localize; None if it was stopped because the service ends."""
-        desk = self._desk
+        self._observer.started(time.time() - job.created)
+        live.begin(attempt)
+        self.running.add((job.id, attempt))
         try:
-            if not live.held:
-                asked = LocalizeFields.model_validate_json(job.fields).scene
-                live.held = desk.scenes.acquire(desk.scenes.chosen(asked if several(asked) else job.scene))
-            if live.task is None or live.query is None:
-                live.task, live.query = desk.decoded(job, live.held[0])
-            request = replace(live.task.request, cancel=live.cancel, budget_s=self._budget_s(job))
-            if live.task.reading is not None:
-                result, renders = self._sequence(live, live.task.reading, request, live.held[0], sent)
-                scene = None  # it was named
-            else:
-                found = self._found(live, live.query, request, sent)
-                anchor, renders = found.loaded.scene.info.geo_anchor, found.estimate.renders
-                result = result_out(found.estimate, timing_out(live.task.decode), versions(), anchor)
-                scene = desk.scenes.id_of(found.loaded)
-            for timing in result.timings[1:]:
-                desk.metrics.stage(job.estimator, timing.stage, timing.wall_s)
-            desk.metrics.renders(job.estimator, renders)
-            return Ending("succeeded", result.status, result.score, result.model_dump_json(), scene=scene)
+            self._carry_out(live, job, attempt)
+        finally:
+            self.running.discard((job.id, attempt))
+
+    def _carry_out(self, live: LiveJob, job: StoredJob, attempt: int) -> None:
+        """Make an attempt that was claimed, and put its end on record."""
+        stored = _Stored(attempt)
+        try:
+            end = self._attempt(live, job, stored)
+        except _AttemptLost:
+            _log.warning("job %s: attempt %d was lost to another", job.id, attempt)
+            return
+        except EngineLost:
+            # Without its lease it counts as lost: a job that its engine dies of must not be tried for ever.
+            _log.error("job %s: its engine ended in attempt %d", job.id, attempt)
+            live.held = None
+            self.running.discard((job.id, attempt))
+            self._persisted(live, lambda: self._store.renew([(job.id, attempt)], 0.0))
+            return
+        if end is None:
+            self._persisted(live, lambda: self._store.requeue(job.id, attempt))
+            return
+        batch = Batch(stored.count, live.records[stored.count :])
+        until = self.photo_until()
+        if self._persisted(live, lambda: self._store.finish(job.id, attempt, batch, end, until)):
+            status = end.result.estimate.verdict.status if end.result else ""
+            _log.info("job %s: %s %s", job.id, end.state, status)
+            self.retire(live)
+
+    def _attempt(self, live: LiveJob, job: StoredJob, stored: _Stored) -> Ending | None:
+        """Localize; None if it was stopped because the service ends."""
+        try:
+            answer = self._localize(live, job, stored)
+            for timing in answer.result.estimate.timings:
+                self._observer.stage(job.estimator, timing.stage, timing.wall_s)
+            self._observer.renders(job.estimator, answer.result.estimate.renders)
+            several = job.spec.names_several_scenes
+            return Ending("succeeded", answer.result, scene=answer.scene if several else None)
         except Cancelled:
-            stopped = desk.closing.is_set() and not desk.store.get(job.id).cancelled
+            stopped = self.closing.is_set() and not self._store.get(job.id).cancelled
             return None if stopped else Ending("cancelled")
+        except (_AttemptLost, EngineLost):
+            raise
         except Exception as error:  # a job's failure, even by a bug, must not end its worker
             expected = isinstance(error, DeadlineExceeded | SceneError)
             _log.error("job %s failed: %s", job.id, error, exc_info=not expected)
-            return ending("interrupted" if isinstance(error, SceneError) else "failed", error)
+            state = "interrupted" if isinstance(error, SceneError) else "failed"
+            return Ending(state, failure=Failure.of(error))
 
-    def _found(self, live: LiveJob, query: Query, request: Request, sent: _Sent) -> SceneEstimate:
-        """Localize one photo in the job's scene, or in the one of several that it shows."""
-        told = partial(self._tell_step, live, sent)
-        loaded, *others = live.held
-        if others:
-            return localize_in_scenes(query, live.held, request, told)
-        return SceneEstimate(localize(query, loaded, request, told), loaded)
+    def _localize(self, live: LiveJob, job: StoredJob, stored: _Stored) -> EngineAnswer:
+        spec = job.spec
+        if live.held is None:
+            live.held = self._engine.hold(spec.scene if spec.names_several_scenes else job.scene)
+        if live.photo is None:
+            data = self._photos.original(job.id)
+            live.photo = read_photo(data, spec, live.held.background_rgb, self._config.max_frames)
+            live.shown = live.photo.query
+        task = live.photo.task(spec, live.task_id, live.held.token, self._budget_s(job))
 
-    def _sequence(
-        self, live: LiveJob, reading: Reading, request: Request, loaded: LoadedScene, sent: _Sent
-    ) -> tuple[Result, int]:
-        """Localize several photos; the one that the result shows becomes the job's photo. Return renders, too."""
-        trajectory = Trajectory()
-        photos = read_sequence(self._desk.photos.original(live.id), reading)
-        with closing(photos), closing(localize_sequence(photos, loaded, request)) as poses:
-            for found in poses:
-                record = trajectory.add(found)
-                if trajectory.shown is found.estimate:
-                    live.query = found.photo.query
-                self._tell(live, sent, record)
-        return trajectory.result(loaded.scene.info.geo_anchor), trajectory.renders
+        def on_record(record: JobRecord, shown: Query | None) -> None:
+            # `cancel` may have come before the engine knew the attempt.
+            if live.cancelled.is_set():
+                raise Cancelled
+            if shown is not None:
+                live.shown = shown
+            self._add(live, stored, record)
 
-    def _tell_step(self, live: LiveJob, sent: _Sent, record: IterationRecord) -> None:
-        self._tell(live, sent, record_out(record))
+        return self._engine.localize(task, on_record)
 
-    def _tell(self, live: LiveJob, sent: _Sent, record: Record) -> None:
-        live.tell(record.model_dump_json(), record.stage)
-        if time.monotonic() - sent.at < _BATCH_S:
+    def _add(self, live: LiveJob, stored: _Stored, record: JobRecord) -> None:
+        if live.attempt != stored.attempt:
+            raise _AttemptLost
+        live.add(record)
+        if time.monotonic() - stored.at < _BATCH_S:
             return
-        batch = Batch(sent.count, live.records[sent.count :], live.stage)
+        batch = Batch(stored.count, live.records[stored.count :])
         try:
-            self._desk.store.append(live.id, live.attempt, batch)
+            if not self._store.append(live.id, stored.attempt, batch):
+                raise _AttemptLost
         except StorageFailed as error:  # they stay in memory, and go with the next batch
-            self._desk.note_storage(error)
+            self.note_storage(error)
         else:
-            sent.count += len(batch.records)
-        sent.at = time.monotonic()
+            stored.count += len(batch.records)
+        stored.at = time.monotonic()
 
     def _budget_s(self, job: StoredJob) -> float:
         """What is left of the caller's budget, the caller's deadline and the operator's limit."""
-        asked = LocalizeFields.model_validate_json(job.fields).budget_s
         left = None if job.deadline is None else job.deadline - time.time()
         if left is not None and left <= 0:
             raise DeadlineExceeded("the deadline was over before the job could start.", where="deadline_s")
-        return min(limit for limit in (asked, left, self._desk.settings.max_job_s) if limit is not None)
+        return min(limit for limit in (job.spec.budget_s, left, self._config.max_job_s) if limit is not None)
+
+    # ------------------------------------------------------------------ its end
+
+    def retire(self, live: LiveJob) -> None:
+        """Let go of an ended job's memory, and of its photo as it was sent."""
+        job = self._store.get(live.id)
+        took_s = job.finished - job.started if job.finished and job.started else None
+        self._observer.ended(job.estimator, job.state, job.status, took_s)
+        wanted = live.shown is not None and (job.keep_photo or self._config.photo_grace_s > 0)
+        self._photos.settle(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
+        self.live.pop(live.id, None)
+        if live.held is not None:
+            self._engine.release(live.held.token)
+        live.end()
+
+    def photo_until(self) -> float:
+        """Return until when the photo of a job that ends now can be looked at."""
+        return time.time() + self._config.photo_grace_s
+
+    def note_storage(self, error: StorageFailed) -> None:
+        """Take note of a disk that is full or broken."""
+        if not self.storage_error:
+            _log.error("%s", error)
+        self.storage_error = error.message
+
+    def _persisted(self, live: LiveJob, write: Callable[[], _T]) -> _T | None:
+        """Write to the store, again and again while the disk is full. None if the service ends before that."""
+        while True:
+            try:
+                result = write()
+            except StorageFailed as error:
+                self.note_storage(error)
+                live.beat()
+                if self.closing.wait(_RETRY_S):
+                    return None
+            else:
+                self.storage_error = ""
+                return result
 
 
 @dataclass(slots=True)
-class _Sent:
+class _Stored:
     """How many records of an attempt are in the store, and since when."""
 
+    attempt: int
     count: int = 0
     at: float = 0.0

@@ -1,4 +1,4 @@
-"""The scenes of a running service: loaded in the background, shared by all jobs, and dropped when memory is short.
+"""The scenes of a running process: loaded in the background, shared by all jobs, and dropped when memory is short.
 
     unloaded -> loading -> preparing -> ready -> (unloading ->) unloaded
                    `-----------`-> failed
@@ -13,27 +13,29 @@ import logging
 import queue
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from service.errors import BadInput, NoRoom, SceneNotFound, SceneNotReady, SceneUnloaded, SplatfixError
+import numpy as np
+
+from service.errors import (
+    BadInput,
+    Failure,
+    NoRoom,
+    SceneInUse,
+    SceneNotFound,
+    SceneNotReady,
+    SceneUnloaded,
+    SplatfixError,
+)
 from service.localize import DEFAULT_MATCHER, LoadedScene
-from service.scene_formats.discovery import find_scenes
+from service.scene_manager.status import AUTO, Readiness, SceneContents, SceneState, SceneStatus
 from service.scene_manager.warm_up import warm_up
-from service.web.schemas.scenes import SceneState
-from service.web.schemas.system import Readiness
 
 _log = logging.getLogger(__name__)
 
 _GRACE_S = 5.0
-AUTO = "auto"
-"""Asks for all scenes that are ready; so no scene is called that."""
-
-
-def several(asked: str | Sequence[str] | None) -> bool:
-    """Whether a request asks for more than a certain scene."""
-    return asked == AUTO or (asked is not None and not isinstance(asked, str))
 
 
 @dataclass(slots=True)
@@ -42,7 +44,7 @@ class Entry:
 
     id: str
     path: Path | None
-    """None: it was given to the service in memory, and can't be loaded again."""
+    """None: it was given in memory, and can't be loaded again."""
     state: SceneState = "unloaded"
     loaded: LoadedScene | None = None
     error: Exception | None = None
@@ -50,7 +52,6 @@ class Entry:
     """Load it when it is asked for."""
     awaited: bool = False
     """The service isn't ready without it."""
-    uploaded: bool = False
     jobs: int = 0
     """That use it, waiting or running: while there are any it stays."""
     used: float = 0.0
@@ -58,25 +59,39 @@ class Entry:
     waiting: list[Callable[[], object]] = field(default_factory=list)
     """To call when it is loaded, or failed to."""
 
+    def status(self) -> SceneStatus:
+        """Return what can be said of it."""
+        failure = Failure.of(self.error) if self.error else None
+        loaded = self.loaded
+        if loaded is None:
+            return SceneStatus(self.id, self.state, self.jobs, failure)
+        scene = loaded.scene
+        return SceneStatus(
+            self.id,
+            self.state,
+            self.jobs,
+            failure,
+            info=scene.info,
+            gaussians=scene.count,
+            sh_degree=scene.sh_degree,
+            cameras=len(scene.cameras),
+            memory_bytes=loaded.nbytes,
+        )
+
 
 class Scenes:
-    """All scenes of the service. Safe to use from several threads."""
+    """All scenes of the process. Safe to use from several threads."""
 
     def __init__(
         self,
-        paths: Iterable[Path],
         estimator: str,
         cache_dir: Path | None,
         *,
         matcher: str = DEFAULT_MATCHER,
-        preload: list[str] | None = None,
-        memory_bytes: int | None = None,
         rasterizer: str | None = None,
+        memory_bytes: int | None = None,
     ) -> None:
-        """Find the scenes, without reading them. Raises SceneNotFound, BadInput.
-
-        `estimator` is the one that they are made ready for. `preload` names those to load at start, None all.
-        """
+        """`estimator` is the one that scenes are prepared for; `memory_bytes` limits them all together."""
         self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
         self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
         self._entries: dict[str, Entry] = {}
@@ -84,19 +99,6 @@ class Scenes:
         self._stop = threading.Event()
         self._tasks: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
-        for path in (scene for given in paths for scene in find_scenes(given)):
-            self.add(path.resolve().stem if path.is_file() else path.resolve().name, path)
-        for name in preload if preload is not None else self._entries:
-            if name not in self._entries:
-                raise SceneNotFound(f"there is no scene '{name}' to preload.", where="preload")
-            self._entries[name].awaited = True
-
-    @classmethod
-    def of(cls, loaded: Mapping[str, LoadedScene], estimator: str) -> Scenes:
-        """Take scenes that are in memory already."""
-        scenes = cls((), estimator, None)
-        scenes._entries = {k: Entry(k, None, loaded=v, awaited=True) for k, v in loaded.items()}
-        return scenes
 
     def start(self) -> None:
         self._thread.start()
@@ -129,29 +131,30 @@ class Scenes:
                 raise SceneNotFound(f"there is no scene '{scene_id}'; known: {known}.", where="scene")
             return self._entries[scene_id]
 
-    def add(self, scene_id: str, path: Path, *, uploaded: bool = False) -> Entry:
-        """Add a scene without loading it. Raises BadInput if there is one of that name."""
+    def add(self, entry: Entry) -> None:
+        """Add a scene without loading it; in the place of another of that name."""
         with self._lock:
-            if scene_id == AUTO:
-                raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
-            if scene_id in self._entries:
-                raise BadInput(f"two scenes are called '{scene_id}'.", where=str(path))
-            entry = self._entries[scene_id] = Entry(scene_id, path, uploaded=uploaded)
-            return entry
+            self._entries[entry.id] = entry
 
-    def add_uploaded(self, paths: Iterable[Path]) -> None:
-        """Add the scenes that were uploaded before; one that the operator names wins."""
-        for path in paths:
-            if path.name in self._entries:
-                _log.warning("the uploaded scene %s is hidden by another of that name", path.name)
-            else:
-                self.add(path.name, path, uploaded=True)
-
-    def remove(self, entry: Entry) -> None:
-        """Take a scene out of the list; jobs that use it keep it until they end."""
+    def remove(self, scene_id: str) -> None:
+        """Take a scene out of the list. Raises SceneNotFound, SceneInUse."""
         with self._lock:
-            self._entries.pop(entry.id, None)
+            entry = self.entry(scene_id)
+            if entry.jobs:
+                raise SceneInUse(
+                    f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them."
+                )
+            del self._entries[scene_id]
             entry.wanted = False
+
+    def contents(self, scene_id: str) -> SceneContents | None:
+        """Summarize a scene; None while it isn't in memory. Raises SceneNotFound."""
+        loaded = self.entry(scene_id).loaded
+        if loaded is None:
+            return None
+        scene = loaded.scene
+        bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) if scene.count else None
+        return SceneContents(scene.cameras, bounds)
 
     # ------------------------------------------------------------------ use
 
@@ -237,10 +240,6 @@ class Scenes:
                 return
         do()
 
-    def memory(self) -> dict[tuple[str, ...], float]:
-        """Return the bytes of each scene in memory, by (id,)."""
-        return {(e.id,): float(e.loaded.nbytes) for e in self.entries() if e.loaded}
-
     def readiness(self) -> Readiness:
         entries = self.entries()
         awaited = [f"scene {e.id}: {e.state}" for e in entries if e.awaited and e.state in _UNDER_WAY]
@@ -249,10 +248,10 @@ class Scenes:
         loaded = [e.loaded for e in entries if e.loaded]
         return Readiness(
             ready=usable and not awaited,
-            pending=awaited,
-            failed=failed,
-            rasterizers=sorted({scene.rasterizer.name for scene in loaded}),
-            skipped_rasterizers=sorted({scene.passed_over for scene in loaded if scene.passed_over}),
+            pending=tuple(awaited),
+            failed=tuple(failed),
+            rasterizers=tuple(sorted({scene.rasterizer.name for scene in loaded})),
+            skipped_rasterizers=tuple(sorted({scene.passed_over for scene in loaded if scene.passed_over})),
         )
 
     # ------------------------------------------------------------------ on the loading thread

@@ -9,12 +9,11 @@ import numpy as np
 from service.errors import InvalidIntrinsics
 from service.localize import LoadedScene
 from service.photos.images import encode_image
+from service.scene_manager.status import PictureFormat, PictureSpec
 from service.scene_manager.warm_up import overview
 from service.types import Camera, Intrinsics
-from service.web.schemas.parsing import checked_intrinsics, pose_from
-from service.web.schemas.requests import RenderIn
 
-PICTURE_TYPES = {"png": "image/png", "jpeg": "image/jpeg", "depth": "application/x-npy"}
+PICTURE_TYPES: dict[PictureFormat, str] = {"png": "image/png", "jpeg": "image/jpeg", "depth": "application/x-npy"}
 MAX_RENDER_PIXELS = 8_000_000
 """A renderer's thread holds about 30 bytes for each."""
 THUMBNAIL_PX = 480
@@ -26,10 +25,9 @@ def thumbnail(loaded: LoadedScene) -> bytes:
     return encode_image(loaded.rasterizer.render([overview(loaded, THUMBNAIL_PX)])[0].rgb)
 
 
-def picture(loaded: LoadedScene, wanted: RenderIn) -> bytes:
-    """Render to a file. Raises InvalidIntrinsics, InvalidPrior."""
-    camera = Camera(_intrinsics(loaded, wanted), pose_from(wanted.pose, "pose"))
-    frame = loaded.rasterizer.render([camera])[0]
+def picture(loaded: LoadedScene, wanted: PictureSpec) -> bytes:
+    """Render to a file. Raises InvalidIntrinsics."""
+    frame = loaded.rasterizer.render([Camera(_intrinsics(loaded, wanted.intrinsics), wanted.pose)])[0]
     if wanted.format == "depth":
         file = io.BytesIO()
         np.lib.format.write_array(file, frame.median_depth.astype("<f4"), allow_pickle=False)
@@ -37,16 +35,14 @@ def picture(loaded: LoadedScene, wanted: RenderIn) -> bytes:
     return encode_image(frame.rgb, "png" if wanted.format == "png" else "jpg", quality=wanted.quality)
 
 
-def _intrinsics(loaded: LoadedScene, wanted: RenderIn) -> Intrinsics:
-    if wanted.intrinsics is not None:
-        found = checked_intrinsics(wanted.intrinsics)
-        if found.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
-            raise InvalidIntrinsics("pictures are rendered with a pinhole camera.", where="intrinsics.model")
-        if found.width * found.height > MAX_RENDER_PIXELS:
-            raise InvalidIntrinsics(
-                f"{found.width} x {found.height} is more than {MAX_RENDER_PIXELS / 1e6:g} megapixels.",
-                where="intrinsics",
-            )
-        return found
-    cameras = loaded.scene.cameras
-    return cameras[0].camera.intrinsics if cameras else Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+def _intrinsics(loaded: LoadedScene, given: Intrinsics | None) -> Intrinsics:
+    if given is None:
+        cameras = loaded.scene.cameras
+        return cameras[0].camera.intrinsics if cameras else Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0)
+    if given.model not in ("PINHOLE", "SIMPLE_PINHOLE"):
+        raise InvalidIntrinsics("pictures are rendered with a pinhole camera.", where="intrinsics.model")
+    if given.width * given.height > MAX_RENDER_PIXELS:
+        raise InvalidIntrinsics(
+            f"{given.width} x {given.height} is more than {MAX_RENDER_PIXELS / 1e6:g} megapixels.", where="intrinsics"
+        )
+    return given

@@ -1,24 +1,26 @@
-"""Scenes that come over HTTP: streamed to disk, checked, and only then given a name that others see.
+"""The catalogue of scenes: which there are, where their files lie, and what was added to them over HTTP.
 
-An archive is a ZIP of a scene folder (or of what is in it). Only files that a scene is read from are taken out of it,
-under their own names; what the archive says of paths, links and sizes is not trusted.
+An upload is streamed to disk, checked, and only then given a name that others see. An archive is a ZIP of a scene
+folder (or of what is in it). Only files that a scene is read from are taken out of it, under their own names; what the
+archive says of paths, links and sizes is not trusted.
 """
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shutil
 import zipfile
 import zlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from typing import IO
-
-from anyio import to_thread
+from types import TracebackType
+from typing import IO, Protocol, Self, runtime_checkable
 
 from service.errors import (
+    BadInput,
     CorruptScene,
     InvalidRequest,
     SceneError,
@@ -28,10 +30,13 @@ from service.errors import (
     UnsupportedFormat,
 )
 from service.scene_formats import load_scene
+from service.scene_formats.discovery import find_scenes
 from service.scene_formats.folder import COLMAP_FOLDER
 from service.scene_formats.formats import is_scene_file, readable_suffixes
 from service.scene_formats.manifest import MANIFEST
+from service.scene_manager.status import AUTO, StoredScene
 
+_log = logging.getLogger(__name__)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 _MAX_MEMBERS = 20_000
 _COPY_BYTES = 1 << 20
@@ -39,59 +44,140 @@ _MAX_NAME_BYTES = 255
 """On all usual file systems."""
 
 
-class Uploads:
-    """One folder of scenes; `.incoming` in it holds what is not checked yet."""
+@runtime_checkable
+class SceneDraft(Protocol):
+    """An upload that is coming in; as a context manager it deletes what was not committed."""
 
-    def __init__(self, folder: Path, max_bytes: int) -> None:
+    def write(self, data: bytes) -> None:
+        """Append to the file that is uploaded. Raises StorageFailed."""
+        ...
+
+    def commit(self, file_name: str) -> StoredScene:
+        """Check what was written and add it to the store under the draft's id. `file_name` tells the format.
+
+        Raises InvalidRequest, SceneError, StorageFailed.
+        """
+        ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+
+@runtime_checkable
+class SceneStore(Protocol):
+    """The scenes that there are, in memory or not, and their files. Safe to call from several threads."""
+
+    def scenes(self) -> list[StoredScene]:
+        """Return all scenes: the operator's in their order, then the uploaded ones by name."""
+        ...
+
+    def find(self, scene_id: str) -> StoredScene | None:
+        """Return a scene, None if there is none of that name."""
+        ...
+
+    def draft(self, scene_id: str) -> SceneDraft:
+        """Begin an upload. Raises InvalidRequest for a name that no scene can have, SceneExists, StorageFailed."""
+        ...
+
+    def delete(self, scene_id: str) -> None:
+        """Delete an uploaded scene with its files. Raises SceneNotFound, StorageFailed."""
+        ...
+
+
+def named_scenes(paths: Iterable[Path]) -> list[StoredScene]:
+    """Return the scenes at the paths that an operator names, without reading them. Raises SceneNotFound, BadInput."""
+    found: dict[str, StoredScene] = {}
+    for path in (scene for given in paths for scene in find_scenes(given)):
+        scene_id = path.resolve().stem if path.is_file() else path.resolve().name
+        if scene_id == AUTO:
+            raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
+        if scene_id in found:
+            raise BadInput(f"two scenes are called '{scene_id}'.", where=str(path))
+        found[scene_id] = StoredScene(scene_id, path)
+    return list(found.values())
+
+
+class FolderSceneStore:
+    """Scenes that the operator names, and one folder of uploads; `.incoming` in it holds what is not checked yet."""
+
+    def __init__(self, named: Sequence[StoredScene], folder: Path, max_bytes: int) -> None:
+        self._named = {scene.id: scene for scene in named}
         self._folder, self._max_bytes = folder, max_bytes
         self._incoming = folder / ".incoming"
         shutil.rmtree(self._incoming, ignore_errors=True)  # of an ended process
         self._incoming.mkdir(parents=True, exist_ok=True)
+        for scene_id in self._named.keys() & {path.name for path in self._uploads()}:
+            _log.warning("the uploaded scene %s is hidden by another of that name", scene_id)
 
-    def scenes(self) -> list[Path]:
-        """Return the scenes that were uploaded before."""
-        return sorted(p for p in self._folder.iterdir() if p.is_dir() and _NAME.fullmatch(p.name))
+    def scenes(self) -> list[StoredScene]:
+        uploads = [StoredScene(p.name, p, uploaded=True) for p in self._uploads() if p.name not in self._named]
+        return [*self._named.values(), *uploads]
 
-    async def receive(self, scene_id: str, file_name: str, body: AsyncIterator[bytes]) -> Path:
-        """Store a scene file, or an archive of a scene folder. Raises InvalidRequest, SceneError, StorageFailed."""
+    def find(self, scene_id: str) -> StoredScene | None:
+        return next((scene for scene in self.scenes() if scene.id == scene_id), None)
+
+    def draft(self, scene_id: str) -> FolderDraft:
         check_scene_id(scene_id)
-        if (self._folder / scene_id).exists():
+        if scene_id in self._named or (self._folder / scene_id).exists():
             raise _exists(scene_id)
-        draft = self._incoming / f"{scene_id}.{os.urandom(4).hex()}"
-        try:
-            draft.mkdir()
-            await self._written(draft / "upload", body)
-            await to_thread.run_sync(self._check, draft, file_name)
-            target = self._folder / scene_id
-            await to_thread.run_sync(draft.rename, target)
-        except OSError as error:
-            if (self._folder / scene_id).exists():  # sent twice at once, and the other came first
-                raise _exists(scene_id) from error
-            raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
-        finally:
-            await to_thread.run_sync(lambda: shutil.rmtree(draft, ignore_errors=True))
-        return target
+        return FolderDraft(
+            self._incoming / f"{scene_id}.{os.urandom(4).hex()}", self._folder / scene_id, self._max_bytes
+        )
 
-    def delete(self, path: Path) -> None:
-        """Delete an uploaded scene. Raises StorageFailed."""
+    def delete(self, scene_id: str) -> None:
+        scene = self.find(scene_id)
+        if scene is None or not scene.uploaded:
+            raise SceneNotFound(f"there is no uploaded scene '{scene_id}'.", where="scene")
         try:
-            shutil.rmtree(path)
+            shutil.rmtree(scene.path)
         except OSError as error:
             raise StorageFailed(f"the service can't delete the scene: {error.strerror}.") from error
 
-    async def _written(self, path: Path, body: AsyncIterator[bytes]) -> None:
-        with path.open("wb") as file:
-            async for chunk in body:
-                await to_thread.run_sync(file.write, chunk)
-            await to_thread.run_sync(lambda: os.fsync(file.fileno()))
+    def _uploads(self) -> list[Path]:
+        return sorted(p for p in self._folder.iterdir() if p.is_dir() and _NAME.fullmatch(p.name) and p.name != AUTO)
 
-    def _check(self, draft: Path, file_name: str) -> None:
+
+class FolderDraft:
+    """A folder that becomes the scene's when all is well."""
+
+    def __init__(self, folder: Path, target: Path, max_bytes: int) -> None:
+        self._folder, self._target, self._max_bytes = folder, target, max_bytes
+        with _storing(target):
+            folder.mkdir()
+            self._file = (folder / "upload").open("wb")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+        shutil.rmtree(self._folder, ignore_errors=True)
+
+    def write(self, data: bytes) -> None:
+        with _storing(self._target):
+            self._file.write(data)
+
+    def commit(self, file_name: str) -> StoredScene:
+        with _storing(self._target):
+            self._file.flush()
+            os.fsync(self._file.fileno())
+            self._file.close()
+            self._check(file_name)
+            self._folder.rename(self._target)
+        return StoredScene(self._target.name, self._target, uploaded=True)
+
+    def _check(self, file_name: str) -> None:
         """Make a scene folder of what was sent, and read it once."""
-        upload = draft / "upload"
+        upload = self._folder / "upload"
         if zipfile.is_zipfile(upload):
-            self._unpack(upload, draft)
+            _unpack(upload, self._folder, self._max_bytes)
             upload.unlink()
-            if not any(is_scene_file(path) for path in draft.iterdir()):
+            if not any(is_scene_file(path) for path in self._folder.iterdir()):
                 raise UnsupportedFormat(
                     f"the archive holds no scene file ({', '.join(readable_suffixes())}).", where="archive"
                 )
@@ -99,34 +185,46 @@ class Uploads:
             if not is_scene_file(Path(file_name)):
                 names = " or ".join(f"`scene{suffix}`" for suffix in readable_suffixes())
                 raise InvalidRequest(f"say what kind of file it is: {names}, or send a ZIP.", where="query.file")
-            upload.rename(draft / f"scene{Path(file_name).suffix.lower()}")
+            upload.rename(self._folder / f"scene{Path(file_name).suffix.lower()}")
         try:
-            load_scene(draft)
+            load_scene(self._folder)
         except SceneError as error:
-            error.where = error.where.replace(str(draft), "archive")  # our folders are nobody's business
+            error.where = error.where.replace(str(self._folder), "archive")  # our folders are nobody's business
             raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
-    def _unpack(self, archive: Path, folder: Path) -> None:
-        """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat, OSError."""
-        left = self._max_bytes
-        with _reading():
-            opened = zipfile.ZipFile(archive)
-        with opened:
-            members = [m for m in opened.infolist() if not m.filename.endswith("/")]
-            if len(members) > _MAX_MEMBERS:
-                raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
-            paths = [PurePosixPath(m.filename.lstrip("/")) for m in members]
-            top = _common_top(paths)
-            for member, path in zip(members, paths, strict=True):
-                if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    # LZMA takes as much memory as the archive says, up to 4 GB.
-                    raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
-                name = _wanted(path.relative_to(top))
-                if name is not None:
-                    with _reading():
-                        source = opened.open(member)
-                    with source:
-                        left = _copied(source, folder / name, left)
+
+@contextmanager
+def _storing(target: Path) -> Iterator[None]:
+    """Report what the disk refuses. Raises StorageFailed; SceneExists if the same upload came twice at once."""
+    try:
+        yield
+    except OSError as error:
+        if target.exists():
+            raise _exists(target.name) from error
+        raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
+
+
+def _unpack(archive: Path, folder: Path, max_bytes: int) -> None:
+    """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat, OSError."""
+    left = max_bytes
+    with _reading():
+        opened = zipfile.ZipFile(archive)
+    with opened:
+        members = [m for m in opened.infolist() if not m.filename.endswith("/")]
+        if len(members) > _MAX_MEMBERS:
+            raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
+        paths = [PurePosixPath(m.filename.lstrip("/")) for m in members]
+        top = _common_top(paths)
+        for member, path in zip(members, paths, strict=True):
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                # LZMA takes as much memory as the archive says, up to 4 GB.
+                raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
+            name = _wanted(path.relative_to(top))
+            if name is not None:
+                with _reading():
+                    source = opened.open(member)
+                with source:
+                    left = _copied(source, folder / name, left)
 
 
 @contextmanager
@@ -146,6 +244,8 @@ def check_scene_id(scene_id: str) -> None:
     """Raises InvalidRequest unless it can be the name of a folder anywhere."""
     if not _NAME.fullmatch(scene_id):
         raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
+    if scene_id == AUTO:
+        raise InvalidRequest(f"no scene can be called '{AUTO}': it stands for all.", where="path.scene_id")
 
 
 def _common_top(paths: list[PurePosixPath]) -> PurePosixPath:

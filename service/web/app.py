@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
-from collections.abc import AsyncIterator, Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,15 +21,18 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
 
 from service import __version__
-from service.errors import InvalidRequest, StorageFailed
+from service.errors import InvalidRequest, SceneNotFound, StorageFailed
 from service.estimators import ESTIMATORS
+from service.jobs.embedded_engine import EmbeddedEngine
+from service.jobs.engine import Engine
+from service.jobs.photo_store import FolderPhotoStore
 from service.jobs.service import Jobs
-from service.localize import LoadedScene
+from service.jobs.sqlite_store import SqliteJobStore
 from service.matchers import MATCHERS
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
-from service.scene_manager.manager import Scenes
-from service.scene_manager.scene_store import Uploads
+from service.scene_manager.scene_store import FolderSceneStore, named_scenes
+from service.scene_manager.status import StoredScene
 from service.web.api_keys import KeyRing
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts, is_loopback
@@ -47,11 +50,7 @@ from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
 
 
-def create_app(
-    settings: Settings | None = None,
-    scenes: Mapping[str, LoadedScene] | None = None,
-    keys: KeyRing | None = None,
-) -> FastAPI:
+def create_app(settings: Settings | None = None, engine: Engine | None = None, keys: KeyRing | None = None) -> FastAPI:
     """Make the app. Scenes are found now and loaded after start-up, unless `scenes` gives loaded ones.
 
     `keys` defaults to those of the settings' key file. Raises SceneNotFound, BadInput or BackendMissing for scenes
@@ -64,18 +63,10 @@ def create_app(
         kind.load(name)  # an unknown name must stop the start, not fail each job
     if settings.rasterizer:
         RASTERIZERS.load(settings.rasterizer)
-    if scenes is None:
-        known = Scenes(
-            settings.scenes,
-            settings.estimator,
-            settings.cache_dir,
-            matcher=settings.matcher,
-            preload=settings.preload,
-            memory_bytes=settings.scene_memory_bytes,
-            rasterizer=settings.rasterizer,
-        )
-    else:
-        known = Scenes.of(scenes, settings.estimator)
+    engine = engine or EmbeddedEngine(settings.engine)
+    named = _named_scenes(settings)
+    for scene in named:
+        engine.add(scene, awaited=settings.preload is None or scene.id in settings.preload)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
     viewer = ViewerChild(settings.loopback_url, keys.make_temporary("viewer", "read")) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
@@ -84,16 +75,19 @@ def create_app(
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
             folder = stack.enter_context(data_folder(settings.data_dir))
-            uploads = Uploads(folder / "scenes", settings.max_scene_bytes)
-            known.add_uploaded(uploads.scenes())
-            jobs = Jobs(settings, known, folder, metrics)
+            scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
+            for scene in scene_store.scenes():
+                if scene.uploaded:
+                    engine.add(scene)
+            store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
+            jobs = Jobs(settings.jobs, engine, store, photos, metrics)
+            stack.push_async_callback(to_thread.run_sync, engine.close)
+            await to_thread.run_sync(engine.start)
             stack.push_async_callback(to_thread.run_sync, jobs.close)
             await to_thread.run_sync(jobs.start)
-            known.start()
-            stack.push_async_callback(to_thread.run_sync, known.close)
             limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
-            app.state.parts = Parts(settings, known, jobs, uploads, keys, metrics, *limits)
-            _add_gauges(metrics, known, jobs, settings.workers)
+            app.state.parts = Parts(settings, engine, scene_store, jobs, keys, metrics, *limits)
+            _add_gauges(metrics, engine, jobs, settings.workers)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -183,13 +177,26 @@ def access_rules(settings: Settings, keys: KeyRing) -> AccessRules:
     return AccessRules(keys, is_open, hosts, settings.cors_origins)
 
 
-def _add_gauges(metrics: Metrics, scenes: Scenes, jobs: Jobs, workers: int) -> None:
+def _add_gauges(metrics: Metrics, engine: Engine, jobs: Jobs, workers: int) -> None:
     """Add gauges of the queue, the workers and the scenes."""
     metrics.gauge("jobs_queued", "Queued jobs", (), lambda: {(): jobs.waiting()})
     metrics.gauge("jobs_running", "Running jobs", (), lambda: {(): jobs.running()})
     metrics.gauge("workers", "Worker threads", (), lambda: {(): workers})
     metrics.gauge("workers_stuck", "Workers given up as stuck", (), lambda: {(): jobs.stuck_workers()})
-    metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), scenes.memory)
+    metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), lambda: _scene_bytes(engine))
+
+
+def _scene_bytes(engine: Engine) -> dict[tuple[str, ...], float]:
+    return {(scene.id,): float(scene.memory_bytes) for scene in engine.scenes() if scene.memory_bytes is not None}
+
+
+def _named_scenes(settings: Settings) -> list[StoredScene]:
+    """Return the scenes that the settings name. Raises SceneNotFound, BadInput."""
+    named = named_scenes(settings.scenes)
+    for scene_id in settings.preload or ():
+        if scene_id not in {scene.id for scene in named}:
+            raise SceneNotFound(f"there is no scene '{scene_id}' to preload.", where="preload")
+    return named
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

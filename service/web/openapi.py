@@ -12,6 +12,7 @@ from pydantic.json_schema import models_json_schema
 from service.web.problems import Problem
 from service.web.schemas.error_examples import example_components
 from service.web.schemas.job_results import Record
+from service.web.schemas.jobs import Restarted
 from service.web.schemas.openapi_links import add_links
 from service.web.schemas.requests import LocalizeIn
 
@@ -38,7 +39,7 @@ def description(app: FastAPI) -> dict[str, Any]:
             routes=app.routes,
         )
         _, extra = models_json_schema(
-            [(LocalizeIn, "validation"), (Problem, "serialization"), (Record, "serialization")],
+            [(LocalizeIn, "validation"), *((model, "serialization") for model in (Problem, Record, Restarted))],
             ref_template="#/components/schemas/{model}",
         )
         models = schema.setdefault("components", {}).setdefault("schemas", {})

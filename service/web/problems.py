@@ -6,6 +6,7 @@ import asyncio
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import cache
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -20,6 +21,7 @@ from service.errors import (
     BackendMissing,
     BadInput,
     DeadlineExceeded,
+    Failure,
     Forbidden,
     IdempotencyConflict,
     Interrupted,
@@ -119,14 +121,34 @@ class Problem(Model):
 def problem_of(error: Exception, instance: str) -> Problem:
     """Describe an exception. Details of unexpected ones go to the log only."""
     if isinstance(error, SplatfixError):
-        status = next(status for kind, status in _STATUS if isinstance(error, kind))
-        return _problem(status, error.code, error.message, instance, error.where, error.hint)
+        return _problem(_status(type(error)), error.code, error.message, instance, error.where, error.hint)
     if isinstance(error, ClientDisconnect):
         return _problem(400, "bad_request", "The client disconnected before it had sent everything.", instance)
     if isinstance(error, HTTPException):
         code = _HTTP_CODES.get(error.status_code, "http_error")
         return _problem(error.status_code, code, str(error.detail), instance)
-    return _problem(500, "internal_error", "The service failed; the reason is in its log.", instance)
+    return problem_of_failure(Failure.of(error), instance)
+
+
+def problem_of_failure(failure: Failure, instance: str) -> Problem:
+    """Describe an error that was kept as data, as it would have been described when it was raised."""
+    status = _status_by_code().get(failure.code, 500)
+    return _problem(status, failure.code, failure.message, instance, failure.where, failure.hint)
+
+
+def _status(kind: type[SplatfixError]) -> int:
+    return next(status for listed, status in _STATUS if issubclass(kind, listed))
+
+
+@cache
+def _status_by_code() -> dict[str, int]:
+    """Return the HTTP status of every error of ours, by its code."""
+    kinds, found = [SplatfixError], {}
+    while kinds:
+        kind = kinds.pop()
+        kinds += kind.__subclasses__()
+        found[kind.code] = _status(kind)
+    return found
 
 
 def _problem(status: int, code: str, detail: str, instance: str, where: str = "", hint: str = "") -> Problem:

@@ -9,8 +9,10 @@ from typing import Any
 from pydantic import Field
 from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
+from service.jobs.config import JobsConfig
+from service.jobs.embedded_engine import EngineConfig
+from service.jobs.read_photo import MAX_FRAMES
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
-from service.web.schemas.parsing import MAX_FRAMES
 
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
 """Folder in which `splatfix serve` keeps its jobs, in a subfolder for each port."""
@@ -121,6 +123,31 @@ class Settings(BaseSettings):
     """Log in JSON; None: unless the log goes to a terminal."""
     viewer: bool = True
     """Start the viewer, and serve it under /viewer."""
+
+    @property
+    def jobs(self) -> JobsConfig:
+        """How jobs are run and kept."""
+        return JobsConfig(
+            workers=self.workers,
+            queue_size=self.queue_size,
+            queue_bytes=self.queue_bytes,
+            max_job_s=self.max_job_s,
+            max_frames=self.max_frames,
+            stuck_s=self.stuck_s,
+            max_lost=self.crashes,
+            shutdown_s=self.shutdown_s,
+            keep_jobs=self.keep_jobs,
+            keep_days=self.keep_days,
+            keep_bytes=self.keep_bytes,
+            photo_grace_s=self.photo_grace_s,
+        )
+
+    @property
+    def engine(self) -> EngineConfig:
+        """What scenes are prepared for, and what they may take."""
+        return EngineConfig(
+            self.estimator, self.matcher, self.rasterizer, self.cache_dir, memory_bytes=self.scene_memory_bytes
+        )
 
     @property
     def loopback_url(self) -> str:

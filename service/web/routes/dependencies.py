@@ -11,12 +11,14 @@ import anyio
 from anyio import to_thread
 from fastapi import Depends, Path, Request
 
+from service.jobs.engine import Engine
+from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
-from service.jobs.sqlite_store import StoredJob
-from service.scene_manager.manager import Scenes
-from service.scene_manager.scene_store import Uploads
+from service.scene_manager.scene_store import SceneStore
 from service.web.api_keys import Caller, KeyRing
 from service.web.metrics import Metrics
+from service.web.schemas import resources
+from service.web.schemas.jobs import JobOut
 from service.web.settings import Settings
 
 
@@ -25,9 +27,9 @@ class Parts:
     """Everything that routes use; one per app."""
 
     settings: Settings
-    scenes: Scenes
+    engine: Engine
+    scene_store: SceneStore
     jobs: Jobs
-    uploads: Uploads
     keys: KeyRing
     metrics: Metrics
     decoding: anyio.CapacityLimiter
@@ -57,6 +59,13 @@ def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id."
 
 def _caller(request: Request) -> Caller | None:
     return request.state.caller
+
+
+def job_document(parts: Parts, job_id: str, root: str) -> JobOut:
+    """Describe a job in full, as it stands. Not for the event loop: reads the disk. Raises JobNotFound."""
+    job = parts.jobs.get(job_id)
+    result = parts.jobs.result(job) if job.state == "succeeded" else None
+    return resources.job_document(job, result, root)
 
 
 PartsOf = Annotated[Parts, Depends(_parts)]

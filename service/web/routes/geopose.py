@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
-from service.jobs.service import Order
 from service.photos.sequence import is_sequence
-from service.web.middleware.limits import client_of
-from service.web.problems import Problem, problem_answer
+from service.web.problems import problem_answer, problem_of_failure
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import PartsOf
+from service.web.routes.localize import accepted
 from service.web.schemas import geopose_protocol as gpp
-from service.web.schemas import resources as documents
+from service.web.schemas import resources
+from service.web.schemas.conversion import result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.parsing import Body
 from service.web.schemas.requests import LocalizeFields
@@ -60,23 +59,24 @@ async def geopose(
     photo, intrinsics = gpp.image_of(wanted)
     if is_sequence(photo):
         raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
-    entry = parts.scenes.entry(scene or gpp.nearest_scene(parts.scenes.entries(), wanted))
-    anchor = parts.scenes.get(entry.id).scene.info.geo_anchor
+    named = scene or gpp.nearest_scene(await to_thread.run_sync(parts.engine.scenes), wanted)
+    scene_id = (await to_thread.run_sync(parts.engine.scene, named)).id
+    anchor = (await to_thread.run_sync(parts.engine.require, scene_id)).geo_anchor
     if anchor is None:
-        raise NoGeoAnchor(f"scene '{entry.id}' has no geo_anchor.", where="scene")
+        raise NoGeoAnchor(f"scene '{scene_id}' has no geo_anchor.", where="scene")
     wait_s = parts.settings.max_wait_s
-    fields = LocalizeFields(scene=entry.id, intrinsics=intrinsics, deadline_s=wait_s)
-    order = Order(Body(photo, "", {}), fields, client_of(request.scope), None, hashlib.sha256(photo).hexdigest())
-    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
+    fields = LocalizeFields(scene=scene_id, intrinsics=intrinsics, deadline_s=wait_s)
+    job = await accepted(request, parts, Body(photo, "", {}), fields)
     if live := parts.jobs.live(job.id):
         await live.wait(wait_s)
     job = await to_thread.run_sync(parts.jobs.get, job.id)
     if not job.ended:
         await to_thread.run_sync(parts.jobs.cancel, job)
         raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
-    if job.error:
-        return problem_answer(Problem.model_validate_json(job.error), request.url.path)
-    _, _, result = documents.answer(job)
+    if job.failure:
+        return problem_answer(problem_of_failure(job.failure, request.url.path), request.url.path)
+    resources.require_pose(job)
+    result = result_out(await to_thread.run_sync(parts.jobs.result, job))
     answer = gpp.response_of(wanted, result, anchor)
     if GEOPOSE in accept:
         return Response(answer.geopose.model_dump_json(), media_type=GEOPOSE)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from typing import Annotated, Literal
 from urllib.parse import urlencode
@@ -13,19 +15,16 @@ from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import Field
 
-from service.jobs.sqlite_store import JobFilter
-from service.localize import LoadedScene
-from service.photos.images import encode_image
+from service.jobs.model import JobFilter, JobRecord, JobState
 from service.results import Status
-from service.types import Camera
+from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SMALL_BODY, route_policy
-from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf
+from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf, job_document
 from service.web.schemas import resources as documents
-from service.web.schemas.conversion import record_camera
+from service.web.schemas.conversion import record_camera, record_out, result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.exports import EXPORT_TYPES, ExportFormat, exported
-from service.web.schemas.job_results import Record
-from service.web.schemas.jobs import JobList, JobOut, JobState, PhotoOut, Trace
+from service.web.schemas.jobs import JobList, JobOut, Restarted, Trace
 
 router = APIRouter()
 
@@ -59,9 +58,9 @@ def list_jobs(
 
 @router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
 @route_policy(role="read")
-def get_job(job: JobOf, root: RootOf) -> JobOut:
+def get_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     """Return a job; with its result or its error if it has ended."""
-    return documents.job_document(job, root)
+    return job_document(parts, job.id, root)
 
 
 @router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
@@ -69,7 +68,7 @@ def get_job(job: JobOf, root: RootOf) -> JobOut:
 def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
     """Cancel a job: at once if it is queued, after its current step if it runs, without effect if it has ended."""
     parts.jobs.cancel(job)
-    return documents.job_document(parts.jobs.get(job.id), root)
+    return job_document(parts, job.id, root)
 
 
 @router.get(
@@ -84,33 +83,57 @@ async def job_events(
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream a job as server-sent events: `record` for each step from the first on, then `result` or `error`.
 
-    A `record` has `attempt.index` as id and a `Record` as data; after a crash of the service another attempt
-    starts again at index 0. The last event has the id `end` and a `JobOut` as data: `result` if the job succeeded,
-    else `error`. `Last-Event-ID` resumes, also after a restart of the service.
+    A `record` has `attempt.index` as id and a `Record` as data. If an attempt is lost, as by a crash, the job is tried
+    again: an event `restarted`, without an id and with a `Restarted` as data, says that the records of another attempt
+    follow from index 0 on, and that those before don't count any more. The last event has the id `end` and a `JobOut`
+    as data: `result` if the job succeeded, else `error`. `Last-Event-ID` resumes, also after a restart of the service.
     """
-    attempt, sent = _resumed(last_event_id)
+    stream = _EventStream.after(last_event_id)
     if live := parts.jobs.live(job.id):
         async for _ in live.changes():
-            if live.attempt != attempt:
-                attempt, sent = live.attempt, 0
-            for record in live.records[sent:]:
-                yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
-                sent += 1
+            attempt, records = live.progress
+            if attempt:  # 0: after a restart of the service it waits for its next one
+                for event in await stream.events(attempt, records):
+                    yield event
     job = await to_thread.run_sync(parts.jobs.get, job.id)
-    if job.attempt != attempt:
-        attempt, sent = job.attempt, 0
-    for record in await to_thread.run_sync(parts.jobs.records, job, sent):
-        yield ServerSentEvent(event="record", id=f"{attempt}.{sent}", raw_data=record)
-        sent += 1
+    for event in await stream.events(job.attempt, await to_thread.run_sync(parts.jobs.records, job)):
+        yield event
     if job.ended:  # else the service ends: the client comes again
-        data = documents.job_document(job, root).model_dump_json()
-        yield ServerSentEvent(event="result" if job.result else "error", id="end", raw_data=data)
+        document = await to_thread.run_sync(job_document, parts, job.id, root)
+        name = "result" if document.result else "error"
+        yield ServerSentEvent(event=name, id="end", raw_data=document.model_dump_json())
 
 
-def _resumed(last_event_id: str) -> tuple[int, int]:
-    """Return the attempt of the last event that a client has, and how many of its records the client has."""
-    found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
-    return (int(found[1]), int(found[2]) + 1) if found else (0, 0)
+@dataclass(slots=True)
+class _EventStream:
+    """How far a client is: the attempt that it knows, and how many of its records."""
+
+    attempt: int = 0
+    sent: int = 0
+
+    @classmethod
+    def after(cls, last_event_id: str) -> _EventStream:
+        """Return where a client is that has seen that event."""
+        found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
+        return cls(int(found[1]), int(found[2]) + 1) if found else cls()
+
+    async def events(self, attempt: int, records: Sequence[JobRecord]) -> list[ServerSentEvent]:
+        """Return what is new to the client, and take note that it gets it."""
+        events: list[ServerSentEvent] = []
+        if attempt != self.attempt:
+            if self.attempt:
+                restarted = Restarted(attempt=attempt).model_dump_json()
+                events.append(ServerSentEvent(event="restarted", raw_data=restarted))
+            self.attempt, self.sent = attempt, 0
+        fresh = records[self.sent :]
+        for text in await to_thread.run_sync(_record_texts, fresh) if fresh else ():
+            events.append(ServerSentEvent(event="record", id=f"{attempt}.{self.sent}", raw_data=text))
+            self.sent += 1
+        return events
+
+
+def _record_texts(records: Sequence[JobRecord]) -> list[str]:
+    return [record_out(record.step, record.frame).model_dump_json() for record in records]
 
 
 @router.get(
@@ -154,16 +177,11 @@ async def job_render(
     ] = "pose",
 ) -> Response:
     """Render the scene from the camera of a record."""
-    text = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
-    photo = PhotoOut.model_validate_json(job.photo)
-    seen_by = record_camera(Record.model_validate_json(text), photo.intrinsics, of_matches=camera == "matches")
-    loaded = parts.scenes.get(job.scene)
-    render = partial(_rendered_jpeg, loaded, seen_by)
+    record = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
+    seen_by = record_camera(record.step, job.photo.intrinsics, of_matches=camera == "matches")
+    wanted = PictureSpec(seen_by.pose, seen_by.intrinsics)
+    render = partial(parts.engine.render, job.scene, wanted)
     return Response(await parts.drawn(job.scene, render), media_type="image/jpeg")
-
-
-def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
-    return encode_image(loaded.rasterizer.render([camera])[0].rgb)
 
 
 @router.get(
@@ -179,7 +197,7 @@ def _rendered_jpeg(loaded: LoadedScene, camera: Camera) -> bytes:
     | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
 )
 @route_policy(role="read")
-def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response:
+def export_pose(job: JobOf, parts: PartsOf, format: Annotated[ExportFormat, Path()]) -> Response:
     """Return the pose in the format of another program, unless the job is `not_localized`.
 
     `colmap`: an entry of `images.txt`, with its camera in a comment. `nerfstudio`: an entry of `frames` in
@@ -187,5 +205,6 @@ def export_pose(job: JobOf, format: Annotated[ExportFormat, Path()]) -> Response
     GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
     an `images.txt`, a `transforms.json`, or a trajectory with the photos' times; `geopose` has the last one only.
     """
-    name, created, result = documents.answer(job)
-    return Response(exported(format, name, created, result), media_type=EXPORT_TYPES[format])
+    documents.require_pose(job)
+    created, result = datetime.fromtimestamp(job.created, UTC), result_out(parts.jobs.result(job))
+    return Response(exported(format, job.photo.name, created, result), media_type=EXPORT_TYPES[format])

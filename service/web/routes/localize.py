@@ -9,14 +9,14 @@ from typing import Annotated, Any
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request, Response
 
-from service.jobs.service import Order
+from service.jobs.model import ENDED, StoredJob
+from service.jobs.service import JobOrder
 from service.web.middleware.limits import client_of
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import PartsOf, RootOf
-from service.web.schemas import resources as documents
+from service.web.routes.dependencies import Parts, PartsOf, RootOf, job_document
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.jobs import JobOut
-from service.web.schemas.parsing import read_body, read_fields
+from service.web.schemas.parsing import Body, job_spec, read_body, read_fields
 from service.web.schemas.requests import LocalizeFields, LocalizeIn
 
 router = APIRouter()
@@ -98,19 +98,31 @@ async def localize_photo(
     `record` has each frame's answer, and `frames` of the result has all of them.
     """
     body = await read_body(request, parts.settings.max_frames)
-    fields = read_fields(body.fields)
-    digest = await to_thread.run_sync(lambda: hashlib.sha256(body.photo).hexdigest())
-    order = Order(body, fields, client_of(request.scope), idempotency_key, digest)
-    job = await to_thread.run_sync(parts.jobs.accept, order, limiter=parts.decoding)
+    job = await accepted(request, parts, body, read_fields(body.fields), idempotency_key)
     wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
     if wait_s:
         if live := parts.jobs.live(job.id):
             await live.wait(wait_s)
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
-    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    document = await to_thread.run_sync(job_document, parts, job.id, root)
     response.headers["Location"] = f"{root}/jobs/{job.id}"
-    response.status_code = 200 if job.ended else 202
-    return documents.job_document(job, root)
+    response.status_code = 200 if document.state in ENDED else 202
+    return document
+
+
+async def accepted(
+    request: Request, parts: Parts, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
+) -> StoredJob:
+    """Make a job of a request. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
+    client = client_of(request.scope)
+
+    def accept() -> StoredJob:
+        sha256 = hashlib.sha256(body.photo).hexdigest()
+        digest = hashlib.sha256((fields.model_dump_json() + sha256).encode()).hexdigest()
+        spec = job_spec(fields, parts.settings.estimator)
+        return parts.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))
+
+    return await to_thread.run_sync(accept, limiter=parts.decoding)
 
 
 def wait_preference(header: str) -> float:

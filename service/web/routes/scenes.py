@@ -10,11 +10,13 @@ from fastapi import APIRouter, Query, Request, Response
 
 from service.errors import SceneExists, SceneInUse
 from service.scene_manager import splat_sample as splats
-from service.scene_manager.scene_images import PICTURE_TYPES, picture, thumbnail
+from service.scene_manager.scene_images import PICTURE_TYPES
+from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
 from service.web.routes.dependencies import JPEG, PartsOf, RootOf
 from service.web.schemas import resources as documents
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
+from service.web.schemas.parsing import checked_intrinsics, pose_from
 from service.web.schemas.requests import RenderIn
 from service.web.schemas.scenes import SceneList, SceneOut, SceneSummary
 
@@ -25,16 +27,16 @@ router = APIRouter()
 
 @router.get("/scenes", tags=["scenes"], responses=errors())
 @route_policy(role="read")
-async def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
+def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
     """List the scenes with their states."""
-    return SceneList(scenes=[documents.scene_summary(entry, root) for entry in parts.scenes.entries()])
+    return SceneList(scenes=[documents.scene_summary(scene, root) for scene in parts.engine.scenes()])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
 @route_policy(role="read")
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Return a scene with its training cameras."""
-    return documents.scene_document(parts.scenes.entry(scene_id), root)
+    return documents.scene_document(parts.engine.scene(scene_id), parts.engine.contents(scene_id), root)
 
 
 @router.put(
@@ -62,12 +64,15 @@ async def upload_scene(
     file: Annotated[str, Query(description="Name of the file; its suffix decides the format.")] = "scene.ply",
 ) -> SceneOut:
     """Upload a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, stored and loaded."""
-    if any(entry.id == scene_id for entry in parts.scenes.entries()):
+    known = await to_thread.run_sync(parts.engine.scenes)
+    if any(scene.id == scene_id for scene in known):
         raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
-    path = await parts.uploads.receive(scene_id, file, request.stream())
-    entry = parts.scenes.add(scene_id, path, uploaded=True)
-    parts.scenes.load(entry)
-    return documents.scene_document(entry, root)
+    with await to_thread.run_sync(parts.scene_store.draft, scene_id) as draft:
+        async for chunk in request.stream():
+            await to_thread.run_sync(draft.write, chunk)
+        stored = await to_thread.run_sync(draft.commit, file)
+    await to_thread.run_sync(parts.engine.add, stored)
+    return documents.scene_document(await to_thread.run_sync(parts.engine.load, scene_id), None, root)
 
 
 @router.post(
@@ -76,9 +81,7 @@ async def upload_scene(
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Load a scene into memory and prepare it; also a scene whose loading failed."""
-    entry = parts.scenes.entry(scene_id)
-    parts.scenes.load(entry)
-    return documents.scene_summary(entry, root)
+    return documents.scene_summary(parts.engine.load(scene_id), root)
 
 
 @router.post(
@@ -90,9 +93,7 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Remove a scene from memory once the last job on it has ended. It accepts no new jobs until it is loaded again."""
-    entry = parts.scenes.entry(scene_id)
-    parts.scenes.unload(entry)
-    return documents.scene_summary(entry, root)
+    return documents.scene_summary(parts.engine.unload(scene_id), root)
 
 
 @router.delete(
@@ -104,13 +105,12 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def delete_scene(scene_id: str, parts: PartsOf) -> None:
     """Delete an uploaded scene and its files; not a scene of the settings, nor one that jobs use."""
-    entry = parts.scenes.entry(scene_id)
-    if not entry.uploaded or entry.path is None:
+    parts.engine.scene(scene_id)
+    stored = parts.scene_store.find(scene_id)
+    if stored is None or not stored.uploaded:
         raise SceneInUse("this scene is in the service's settings; it can only be unloaded.", where="scene")
-    if entry.jobs:
-        raise SceneInUse(f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
-    parts.scenes.remove(entry)
-    parts.uploads.delete(entry.path)
+    parts.engine.remove(scene_id)
+    parts.scene_store.delete(scene_id)
 
 
 @router.get(
@@ -122,7 +122,7 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
 @route_policy(role="read")
 async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
     """Return a small image of the scene from its middle training camera."""
-    draw = partial(thumbnail, parts.scenes.get(scene_id))
+    draw = partial(parts.engine.thumbnail, scene_id)
     return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
 
 
@@ -145,7 +145,7 @@ async def scene_splats(
     limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="Most Gaussians to return.")] = 200_000,
 ) -> Response:
     """Return the most important Gaussians of the scene for drawing, as little-endian binary."""
-    pack = partial(splats.packed_splats, parts.scenes.get(scene_id).scene, limit)
+    pack = partial(parts.engine.splats, scene_id, limit)
     return Response(await to_thread.run_sync(pack, limiter=parts.rendering), media_type=splats.BINARY)
 
 
@@ -164,5 +164,7 @@ async def scene_splats(
 @route_policy(role="read", body=SMALL_BODY, rate_limited=True)
 async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
     """Render a colour image or a depth map of a scene from any pose."""
-    draw = partial(picture, parts.scenes.get(scene_id), wanted)
+    intrinsics = None if wanted.intrinsics is None else checked_intrinsics(wanted.intrinsics)
+    spec = PictureSpec(pose_from(wanted.pose, "pose"), intrinsics, wanted.format, wanted.quality)
+    draw = partial(parts.engine.render, scene_id, spec)
     return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])

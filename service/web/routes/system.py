@@ -5,6 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Response
 
 from service.errors import NoKeys
+from service.versions import versions
 from service.web.metrics import METRICS_TYPE
 from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import CallerOf, PartsOf
@@ -29,7 +30,7 @@ def get_capabilities(parts: PartsOf) -> Capabilities:
 @route_policy(role="read")
 def get_version() -> dict[str, str]:
     """Return the versions of the service and of the packages that results depend on."""
-    return documents.versions()
+    return versions()
 
 
 @router.get("/livez", tags=["service"], responses=errors(always=_CANNOT_FAIL))
@@ -41,11 +42,16 @@ async def live() -> Liveness:
 
 @router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not ready"}} | errors())
 @route_policy(role=None)
-async def ready(parts: PartsOf, response: Response) -> Readiness:
+def ready(parts: PartsOf, response: Response) -> Readiness:
     """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work."""
-    readiness = parts.scenes.readiness()
-    ill = parts.jobs.ailments()
-    readiness = readiness.model_copy(update={"ready": readiness.ready and not ill, "failed": readiness.failed + ill})
+    scenes, ill = parts.engine.readiness(), parts.jobs.ailments()
+    readiness = Readiness(
+        ready=scenes.ready and not ill,
+        pending=list(scenes.pending),
+        failed=[*scenes.failed, *ill],
+        rasterizers=list(scenes.rasterizers),
+        skipped_rasterizers=list(scenes.skipped_rasterizers),
+    )
     response.status_code = 200 if readiness.ready else 503
     return readiness
 

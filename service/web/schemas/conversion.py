@@ -7,12 +7,14 @@ from dataclasses import asdict
 import numpy as np
 
 from service.geometry import quat_from_rotation
-from service.results import HINTS, IterationRecord, PoseEstimate, StageTiming
-from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, PriorRegion
+from service.jobs.model import JobResult, SequenceFrame
+from service.results import HINTS, IterationRecord, StageTiming
+from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
 from service.web.schemas.geodesy import geographic
 from service.web.schemas.job_results import (
     Alternative,
     CandidatesOut,
+    FrameOut,
     MatchesOut,
     RankedScene,
     Record,
@@ -102,7 +104,7 @@ def named_camera_out(named: NamedCamera) -> NamedCameraOut:
     return NamedCameraOut(name=named.name, **camera_out(named.camera).model_dump())
 
 
-def record_out(record: IterationRecord) -> Record:
+def record_out(record: IterationRecord, frame: SequenceFrame | None = None) -> Record:
     """Convert one step of a job."""
     matches, candidates = record.matches, record.candidates
     return Record(
@@ -126,20 +128,30 @@ def record_out(record: IterationRecord) -> Record:
         ),
         candidates=candidates
         and CandidatesOut(world_from_camera=candidates.world_from_camera.tolist(), scores=candidates.scores.tolist()),
+        frame=frame and frame_out(frame),
     )
 
 
-def record_camera(record: Record, photo: IntrinsicsOut, *, of_matches: bool) -> Camera:
-    """Return a record's camera: its pose in the photo's size, or the camera that its matches refer to."""
+def frame_out(frame: SequenceFrame) -> FrameOut:
+    """Spell out where one photo of a sequence was taken."""
+    return FrameOut(
+        index=frame.index,
+        name=frame.name,
+        time_s=frame.time_s,
+        status=frame.status,
+        reason=frame.reason,
+        score=frame.score,
+        tracked=frame.tracked,
+        world_from_camera=transform_out(frame.pose.world_from_camera),
+        covariance=None if frame.covariance is None else covariance_out(frame.covariance),
+    )
+
+
+def record_camera(record: IterationRecord, photo: Intrinsics, *, of_matches: bool) -> Camera:
+    """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
     if of_matches and record.matches is not None:
-        camera = record.matches.render_camera
-        return Camera(_intrinsics_in(camera.intrinsics), Pose(np.array(camera.world_from_camera)))
-    correction = IntrinsicsCorrection(**record.intrinsics_correction.model_dump())
-    return Camera(_intrinsics_in(photo).corrected(correction), Pose(np.array(record.world_from_camera)))
-
-
-def _intrinsics_in(intrinsics: IntrinsicsOut) -> Intrinsics:
-    return Intrinsics(**{**intrinsics.model_dump(), "distortion": tuple(intrinsics.distortion)})
+        return record.matches.render_camera
+    return Camera(photo.corrected(record.lens), record.pose)
 
 
 def covariance_out(matrix: np.ndarray) -> Covariance:
@@ -163,10 +175,9 @@ def timing_out(timing: StageTiming) -> Timing:
     return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
 
 
-def result_out(
-    estimate: PoseEstimate, decode: Timing, versions: dict[str, str], anchor: GeoAnchor | None = None
-) -> Result:
+def result_out(result: JobResult) -> Result:
     """Convert a finished estimate. `decode` is the time to read the photo, `anchor` the scene's geo_anchor."""
+    estimate, anchor = result.estimate, result.geo_anchor
     verdict = estimate.verdict
     return Result(
         status=verdict.status,
@@ -184,7 +195,7 @@ def result_out(
         coverage=verdict.coverage,
         signals=dict(verdict.signals),
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
-        timings=[decode, *map(timing_out, estimate.timings)],
+        timings=[timing_out(timing) for timing in (result.decode, *estimate.timings)],
         budget_exhausted=estimate.budget_exhausted,
         seed=estimate.seed,
         estimator=estimate.estimator,
@@ -192,6 +203,7 @@ def result_out(
         rasterizer=estimate.rasterizer,
         scene=SceneRef(id=estimate.scene_id, sha256=estimate.scene_sha256),
         scene_ranking=[RankedScene(id=scene, inliers=inliers) for scene, inliers in estimate.considered],
-        versions=versions,
+        versions=dict(result.versions),
         warnings=list(estimate.warnings),
+        frames=None if result.frames is None else [frame_out(frame) for frame in result.frames],
     )

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.errors import InvalidIntrinsics, InvalidRequest, NoGeoAnchor
 from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
-from service.scene_manager.manager import Entry
+from service.scene_manager.status import SceneStatus
 from service.types import GeoAnchor
 from service.web.api_model import Model
 from service.web.schemas.job_results import Result
@@ -117,10 +117,9 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
     }
 
 
-def nearest_scene(entries: Sequence[Entry], request: GeoPoseRequest) -> str:
+def nearest_scene(scenes: Sequence[SceneStatus], request: GeoPoseRequest) -> str:
     """Return the id of the scene to localize in. Raises NoGeoAnchor."""
-    anchored = [(e.id, e.loaded.scene.info.geo_anchor) for e in entries if e.loaded]
-    places = {scene_id: anchor for scene_id, anchor in anchored if anchor}
+    places = {s.id: s.info.geo_anchor for s in scenes if s.info and s.info.geo_anchor}
     readings = request.sensorReadings.geolocationReadings
     if len(places) == 1:
         return next(iter(places))

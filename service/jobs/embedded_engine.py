@@ -1,0 +1,181 @@
+"""The engine of a service that is one process: scenes of this process, jobs on the threads that call `localize`."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from service.errors import SceneNotReady
+from service.estimators import ESTIMATORS
+from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask, OnRecord, SequenceSource
+from service.jobs.model import JobRecord, JobResult
+from service.jobs.trajectory import Trajectory
+from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene, Request, localize
+from service.multi_scene import SceneEstimate, localize_in_scenes
+from service.photos.sequence import read_sequence
+from service.results import PoseEstimate
+from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.scene_images import picture, thumbnail
+from service.scene_manager.splat_sample import packed_splats
+from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.tracking import localize_sequence
+from service.types import Query, SceneInfo
+from service.versions import versions
+
+
+@dataclass(frozen=True, slots=True)
+class EngineConfig:
+    """What scenes are prepared for, and what they may take."""
+
+    estimator: str = DEFAULT_ESTIMATOR
+    matcher: str = DEFAULT_MATCHER
+    rasterizer: str | None = None
+    """None: the first that can run here."""
+    cache_dir: Path | None = None
+    """Where view indexes are kept between runs; None: nowhere."""
+    memory_bytes: int | None = None
+    """Of all scenes together; None: any number."""
+
+
+class EmbeddedEngine:
+    """Implements `Engine`."""
+
+    def __init__(self, config: EngineConfig) -> None:
+        self._manager = Scenes(
+            config.estimator,
+            config.cache_dir,
+            matcher=config.matcher,
+            rasterizer=config.rasterizer,
+            memory_bytes=config.memory_bytes,
+        )
+        self._held: dict[str, tuple[LoadedScene, ...]] = {}
+        self._cancels: dict[str, threading.Event] = {}
+        """By the id of the attempt that runs."""
+
+    def start(self) -> None:
+        self._manager.start()
+
+    def close(self) -> None:
+        self._manager.close()
+
+    # ------------------------------------------------------------------ scenes
+
+    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
+        self._manager.add(Entry(scene.id, scene.path, awaited=awaited))
+
+    def add_loaded(self, scene_id: str, loaded: LoadedScene) -> None:
+        """Add a scene that is in memory already and has no file; it is awaited."""
+        self._manager.add(Entry(scene_id, None, loaded=loaded, awaited=True))
+
+    def remove(self, scene_id: str) -> None:
+        self._manager.remove(scene_id)
+
+    def scenes(self) -> list[SceneStatus]:
+        return [entry.status() for entry in self._manager.entries()]
+
+    def scene(self, scene_id: str | None) -> SceneStatus:
+        return self._manager.entry(scene_id).status()
+
+    def contents(self, scene_id: str) -> SceneContents | None:
+        return self._manager.contents(scene_id)
+
+    def require(self, scene_id: str) -> SceneInfo:
+        return self._manager.get(scene_id).scene.info
+
+    def readiness(self) -> Readiness:
+        return self._manager.readiness()
+
+    def load(self, scene_id: str) -> SceneStatus:
+        entry = self._manager.entry(scene_id)
+        self._manager.load(entry)
+        return entry.status()
+
+    def unload(self, scene_id: str) -> SceneStatus:
+        entry = self._manager.entry(scene_id)
+        self._manager.unload(entry)
+        return entry.status()
+
+    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+        self._manager.when_settled(scene_id, do)
+
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        ids = self._manager.chosen(asked)
+        held, token = self._manager.acquire(ids), secrets.token_hex(8)
+        self._held[token] = held
+        return HeldScenes(token, tuple(ids), held[0].scene.info.background_rgb)
+
+    def release(self, token: str) -> None:
+        self._manager.release(self._held.pop(token, ()))
+
+    # ------------------------------------------------------------------ work
+
+    def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
+        held = self._held.get(task.held)
+        if held is None:
+            raise SceneNotReady("the job's scenes are not in memory any more.", where="scene")
+        cancel = self._cancels[task.id] = threading.Event()
+        try:
+            result, loaded = run_task(task, held, on_record, cancel)
+        finally:
+            del self._cancels[task.id]
+        return EngineAnswer(result, self._manager.id_of(loaded))
+
+    def cancel(self, task_id: str) -> None:
+        if cancel := self._cancels.get(task_id):
+            cancel.set()
+
+    def render(self, scene_id: str, wanted: PictureSpec) -> bytes:
+        return picture(self._manager.get(scene_id), wanted)
+
+    def thumbnail(self, scene_id: str) -> bytes:
+        return thumbnail(self._manager.get(scene_id))
+
+    def splats(self, scene_id: str, limit: int) -> bytes:
+        return packed_splats(self._manager.get(scene_id).scene, limit)
+
+
+def run_task(
+    task: LocalizeTask,
+    scenes: Sequence[LoadedScene],
+    on_record: OnRecord | None = None,
+    cancel: threading.Event | None = None,
+) -> tuple[JobResult, LoadedScene]:
+    """Localize on this thread, in one scene or in the one of several that the photo shows; return that scene, too.
+
+    A sequence is localized in the first scene.
+    """
+    options = ESTIMATORS.load(task.estimator).Options(**task.options)
+    request = Request(task.estimator, options, seed=task.seed, budget_s=task.budget_s, cancel=cancel)
+    if isinstance(task.source, SequenceSource):
+        return _run_sequence(task.source, request, scenes[0], on_record), scenes[0]
+    step = (lambda record: on_record(JobRecord(record), None)) if on_record else None
+    if len(scenes) > 1:
+        found = localize_in_scenes(task.source, scenes, request, step)
+    else:
+        found = SceneEstimate(localize(task.source, scenes[0], request, step), scenes[0])
+    anchor = found.loaded.scene.info.geo_anchor
+    return JobResult(without_trace(found.estimate), task.decode, anchor, versions()), found.loaded
+
+
+def _run_sequence(
+    source: SequenceSource, request: Request, loaded: LoadedScene, on_record: OnRecord | None
+) -> JobResult:
+    trajectory = Trajectory()
+    photos = read_sequence(source.data, source.reading)
+    with closing(photos), closing(localize_sequence(photos, loaded, request)) as poses:
+        for found in poses:
+            record = trajectory.add(found)
+            shown: Query | None = found.photo.query if trajectory.shown is found.estimate else None
+            if on_record:
+                on_record(record, shown)
+    result = trajectory.result(loaded.scene.info.geo_anchor)
+    return replace(result, estimate=without_trace(result.estimate))
+
+
+def without_trace(estimate: PoseEstimate) -> PoseEstimate:
+    """Return the estimate with its last record only, of which nothing but the answer is left."""
+    return replace(estimate, records=(replace(estimate.records[-1], matches=None, candidates=None),))

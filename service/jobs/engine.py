@@ -1,0 +1,160 @@
+"""What works on scenes in memory, as a protocol: jobs and routes reach scenes through it only.
+
+Arguments and results are plain values that can be pickled, so an engine may be threads of this process
+(`embedded_engine`), another process, or another machine. Records come through a callback while `localize` blocks its
+caller; a session, in which photos and poses go both ways, fits beside it as another method of the same kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+from service.jobs.model import JobRecord, JobResult
+from service.photos.sequence import Reading
+from service.results import StageTiming
+from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.types import Query, SceneInfo
+
+
+class EngineLost(Exception):
+    """The engine ended while it worked: its scenes are gone from memory, and the attempt is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldScenes:
+    """Scenes that stay in memory until they are released."""
+
+    token: str
+    """Names them to `localize` and `release`."""
+    ids: tuple[str, ...]
+    background_rgb: tuple[float, float, float]
+    """Of the first one."""
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceSource:
+    """Several photos, or a video, and how they are read."""
+
+    data: bytes
+    reading: Reading
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizeTask:
+    """One attempt to localize a photo or a sequence."""
+
+    id: str
+    """Names the attempt to `cancel`."""
+    held: str
+    """The token of the scenes to look in."""
+    estimator: str
+    options: Mapping[str, Any]
+    """For the estimator's `Options`."""
+    seed: int
+    budget_s: float | None
+    source: Query | SequenceSource
+    decode: StageTiming
+    """What reading the photo took: a part of the result."""
+
+
+@dataclass(frozen=True, slots=True)
+class EngineAnswer:
+    """What `localize` found."""
+
+    result: JobResult
+    scene: str | None
+    """The scene that the photo shows, by the name under which it is served; None if it was removed meanwhile."""
+
+
+OnRecord = Callable[[JobRecord, Query | None], None]
+"""Takes a record; of a sequence with the photo that the result would show if it ended here, if that is another now."""
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Scenes in memory and all that works on them. Safe to call from several threads.
+
+    Methods raise errors of `service.errors`, and EngineLost where that is said.
+    """
+
+    def start(self) -> None:
+        """Begin to load the scenes that are awaited."""
+        ...
+
+    def close(self) -> None:
+        """Stop loading and give the scenes' memory back."""
+        ...
+
+    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
+        """Make a scene known without loading it; the engine isn't ready before those that are awaited are."""
+        ...
+
+    def remove(self, scene_id: str) -> None:
+        """Forget a scene. Raises SceneNotFound, SceneInUse."""
+        ...
+
+    def scenes(self) -> list[SceneStatus]:
+        """Return all scenes, how far they have come, and what they take of memory."""
+        ...
+
+    def scene(self, scene_id: str | None) -> SceneStatus:
+        """Return a scene; None: the only one. Raises SceneNotFound."""
+        ...
+
+    def contents(self, scene_id: str) -> SceneContents | None:
+        """Summarize a scene; None while it isn't in memory. Raises SceneNotFound."""
+        ...
+
+    def require(self, scene_id: str) -> SceneInfo:
+        """Return what is known of a scene in memory. Raises SceneError, and has it loaded if it may be."""
+        ...
+
+    def readiness(self) -> Readiness:
+        """Return whether the scenes that are awaited are loaded and prepared."""
+        ...
+
+    def load(self, scene_id: str) -> SceneStatus:
+        """Begin to load and prepare a scene; `scene` says how far that has come. Raises SceneNotFound."""
+        ...
+
+    def unload(self, scene_id: str) -> SceneStatus:
+        """Drop a scene from memory as soon as no job uses it. Raises SceneNotFound, BadInput."""
+        ...
+
+    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+        """Call `do` once, as soon as the scene is in memory or certain not to come there; load it for that."""
+        ...
+
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        """Keep scenes in memory: one, the only one (None), several, or all that are ready (AUTO). Raises SceneError."""
+        ...
+
+    def release(self, token: str) -> None:
+        """Let go of scenes that were held; without effect on a token that isn't known (any more)."""
+        ...
+
+    def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
+        """Localize; return when the answer is verified.
+
+        Raises `service.localize.Cancelled` between two records after `cancel`, EngineLost, what `on_record` raises
+        (the attempt ends then), and what the estimator raises.
+        """
+        ...
+
+    def cancel(self, task_id: str) -> None:
+        """End an attempt at its next record; without effect if it doesn't run."""
+        ...
+
+    def render(self, scene_id: str, picture: PictureSpec) -> bytes:
+        """Render a scene to a file. Raises SceneError, InvalidIntrinsics."""
+        ...
+
+    def thumbnail(self, scene_id: str) -> bytes:
+        """Return a small JPEG of a scene. Raises SceneError."""
+        ...
+
+    def splats(self, scene_id: str, limit: int) -> bytes:
+        """Return a scene's most important Gaussians in the form of `splat_sample`. Raises SceneError."""
+        ...

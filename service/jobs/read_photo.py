@@ -1,0 +1,86 @@
+"""Decode what was sent with a job: one photo, or the first of several, as the query that is localized."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from service.errors import InvalidPrior, InvalidRequest
+from service.jobs.engine import LocalizeTask, SequenceSource
+from service.jobs.model import JobSpec
+from service.photos.images import read_query
+from service.photos.sequence import Reading, check_sequence, is_sequence, read_sequence
+from service.results import StageTiming
+from service.types import Query
+
+MAX_FRAMES = 1000
+"""Photos of a sequence, unless an operator sets another limit."""
+_OF_SEQUENCES = ("every", "times_s")
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedPhoto:
+    query: Query
+    """The photo; of a sequence the first."""
+    decode: StageTiming
+    """What decoding took."""
+    source: Query | SequenceSource
+    """What is localized: the query, or the whole sequence as it was sent."""
+
+    def task(self, spec: JobSpec, task_id: str = "", held: str = "", budget_s: float | None = None) -> LocalizeTask:
+        """Return what an engine is to do: look in the scenes that are held, within the spec's budget or another."""
+        return LocalizeTask(
+            id=task_id,
+            held=held,
+            estimator=spec.estimator,
+            options=spec.options,
+            seed=spec.seed,
+            budget_s=spec.budget_s if budget_s is None else budget_s,
+            source=self.source,
+            decode=self.decode,
+        )
+
+
+def read_photo(
+    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], max_frames: int = MAX_FRAMES
+) -> DecodedPhoto:
+    """Decode a photo, of several the first, against what the request says of it. Takes up to seconds.
+
+    `background_rgb` (0..1) is the scene's: what is transparent is filled with it. Raises BadInput.
+    """
+    wall, cpu = time.perf_counter(), time.thread_time()
+    if is_sequence(data):
+        query, source = _read_sequence(data, spec, background_rgb, max_frames)
+    else:
+        defaults = {field.name: field.default for field in fields(JobSpec)}
+        for name in _OF_SEQUENCES:
+            if getattr(spec, name) != defaults[name]:
+                raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
+        query = read_query(data, intrinsics=spec.intrinsics, prior=spec.prior, background_rgb=background_rgb)
+        query = source = replace(query, region=spec.region)
+    return DecodedPhoto(query, StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu), source)
+
+
+def _read_sequence(
+    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], max_frames: int
+) -> tuple[Query, SequenceSource]:
+    _require_ascending(spec.times_s)
+    if spec.truth is not None:
+        raise InvalidPrior("a single photo's; this is a sequence.", where="truth")
+    if spec.names_several_scenes:
+        raise InvalidRequest(
+            "only a single photo is looked for in several scenes; this is a sequence.",
+            where="scene",
+            hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
+        )
+    reading = Reading(max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb)
+    check_sequence(data, reading)
+    return next(read_sequence(data, reading)).query, SequenceSource(data, reading)
+
+
+def _require_ascending(times_s: Sequence[float] | None) -> None:
+    if times_s is not None and not (np.all(np.isfinite(times_s)) and np.all(np.diff(times_s) > 0)):
+        raise InvalidRequest("must be finite numbers, each greater than the one before.", where="times_s")

@@ -1,0 +1,115 @@
+"""Where jobs are kept, as a protocol; `sqlite_store` is the implementation of the service.
+
+A worker owns an attempt from its claim until its lease ends. While it works it renews the lease; whose lease has ended
+loses the attempt to the next `reclaim`, and whatever it still brings is refused. So a job ends once, however many
+workers, processes or machines share a store.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+from service.errors import Failure
+from service.jobs.model import Batch, Ending, JobFilter, JobRecord, JobResult, JobState, NewJob, Retention, StoredJob
+
+
+@runtime_checkable
+class JobStore(Protocol):
+    """Jobs with their records and results. Safe to call from several threads.
+
+    A method that changes something has made it last when it returns; it raises StorageFailed if it can't.
+    """
+
+    def accept(self, job: NewJob) -> StoredJob:
+        """Store a new job, or return the one that has its idempotency key. Raises IdempotencyConflict."""
+        ...
+
+    def repeated(self, client: str, key: str | None, digest: str) -> StoredJob | None:
+        """Return the job that has the client's idempotency key. Raises IdempotencyConflict."""
+        ...
+
+    def knows(self, client: str, key: str) -> bool:
+        """Return whether the client has used that idempotency key."""
+        ...
+
+    def claim(self, job: StoredJob, lease_until: float) -> int | None:
+        """Start the next attempt, whose lease ends then; return its number.
+
+        None if the job has changed since `job` was read, or was cancelled. The records of earlier attempts go.
+        """
+        ...
+
+    def renew(self, attempts: Sequence[tuple[str, int]], lease_until: float) -> None:
+        """Let the leases of running attempts (job, number) end then; without effect on those that are over."""
+        ...
+
+    def reclaim(self, before: float, most_lost: int, failure: Failure) -> list[StoredJob]:
+        """Take running attempts away whose lease ended before that time; return their jobs.
+
+        A job waits again; but it is cancelled if somebody wanted that, and interrupted with `failure` when so many of
+        its attempts were lost: it may be what its workers die of.
+        """
+        ...
+
+    def append(self, job_id: str, attempt: int, batch: Batch) -> bool:
+        """Store some of an attempt's records. False if the attempt is over."""
+        ...
+
+    def finish(self, job_id: str, attempt: int, batch: Batch, ending: Ending, photo_until: float | None) -> bool:
+        """Store an attempt's last records and its end, once. False if the attempt is over."""
+        ...
+
+    def requeue(self, job_id: str, attempt: int) -> bool:
+        """Let an attempt that was stopped on purpose be made again; it isn't lost. False if it is over."""
+        ...
+
+    def end_queued(self, job: StoredJob, ending: Ending, photo_until: float | None) -> bool:
+        """End a job that waits. False if it doesn't."""
+        ...
+
+    def request_cancel(self, job_id: str) -> None:
+        """Put on record that an unfinished job shall end: it isn't started again."""
+        ...
+
+    def get(self, job_id: str) -> StoredJob:
+        """Return a job. Raises JobNotFound."""
+        ...
+
+    def queued(self) -> list[StoredJob]:
+        """Return the jobs that wait, oldest first."""
+        ...
+
+    def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:
+        """Return the newest jobs that fit, at most `limit`."""
+        ...
+
+    def count(self, state: JobState) -> int:
+        """Return how many jobs are in that state."""
+        ...
+
+    def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
+        """Return the records of the latest attempt from number `first` on."""
+        ...
+
+    def result(self, job_id: str) -> JobResult | None:
+        """Return what a job found; None if it has no result."""
+        ...
+
+    def stale_photos(self) -> list[str]:
+        """Return the ended jobs whose photo is due for deletion, and take note that it is gone."""
+        ...
+
+    def forget(self, kept: Retention) -> list[str]:
+        """Delete the oldest ended jobs beyond what shall be kept; return their ids."""
+        ...
+
+    def ids(self) -> set[str]:
+        """Return the ids of all jobs."""
+        ...
+
+    def probe(self) -> None:
+        """Write something, to find out whether that is possible."""
+        ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,86 @@
+"""What the scene manager is given and what it reports: plain values, which may come from other processes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.errors import Failure
+from service.types import Intrinsics, NamedCamera, Pose, SceneInfo
+
+AUTO = "auto"
+"""Requests name all scenes that are ready by it, so no scene is called that."""
+PictureFormat = Literal["png", "jpeg", "depth"]
+SceneState = Literal["unloaded", "loading", "preparing", "ready", "unloading", "failed"]
+
+
+@dataclass(frozen=True, slots=True)
+class StoredScene:
+    """A scene that can be loaded."""
+
+    id: str
+    path: Path
+    """A scene folder or a scene file."""
+    uploaded: bool = False
+    """It came over HTTP, and may be deleted."""
+
+
+@dataclass(frozen=True, slots=True)
+class SceneStatus:
+    """One scene and how far loading it has come."""
+
+    id: str
+    state: SceneState
+    jobs: int = 0
+    """That use it, waiting or running."""
+    failure: Failure | None = None
+    """Why it could not be loaded."""
+    info: SceneInfo | None = None
+    """None until it is in memory, like everything below."""
+    gaussians: int | None = None
+    sh_degree: int | None = None
+    cameras: int | None = None
+    """Number of training cameras."""
+    memory_bytes: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SceneContents:
+    """What a scene in memory holds, summarized."""
+
+    cameras: tuple[NamedCamera, ...]
+    """Of the training photos."""
+    bounds_in_world: Float64[np.ndarray, "2 3"] | None
+    """1 % and 99 % quantiles of the Gaussians' means along each axis; None without Gaussians."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readiness:
+    """Whether photos can be localized at full speed, and what is missing."""
+
+    ready: bool
+    pending: tuple[str, ...]
+    """Scenes that are still being loaded or prepared, with their state."""
+    failed: tuple[str, ...]
+    """Scenes that could not be loaded, with the reason."""
+    rasterizers: tuple[str, ...]
+    """What the scenes in memory are rendered with."""
+    skipped_rasterizers: tuple[str, ...]
+    """Why no GPU is used, where the operator left the choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSpec:
+    """What to render of a scene, and how to encode it."""
+
+    pose: Pose
+    intrinsics: Intrinsics | None = None
+    """Pinhole; None: those of the first training camera, or 640 x 480."""
+    format: PictureFormat = "jpeg"
+    """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
+    quality: int = 90
+    """JPEG's, 1..100."""

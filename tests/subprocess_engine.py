@@ -1,0 +1,238 @@
+"""A second implementation of `Engine`: a child process that has the scenes, and a pipe of pickled values.
+
+A child that dies takes its scenes and attempts with it; another one is started in its place.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import pickle
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from typing import Any
+
+from service.errors import SceneNotReady
+from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
+from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, OnRecord
+from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.types import SceneInfo
+
+SetUp = Callable[[EmbeddedEngine], None]
+"""Is pickled, and called in the child before its engine starts."""
+_SPAWN = multiprocessing.get_context("spawn")
+
+
+def no_set_up(engine: EmbeddedEngine) -> None: ...
+
+
+@dataclass
+class _Call:
+    name: str
+    arguments: tuple
+    messages: SimpleQueue = field(default_factory=SimpleQueue)
+    """("record", ...)..., then ("value", ...) or ("error", ...)."""
+
+
+class SubprocessEngine:
+    """Implements `Engine`."""
+
+    def __init__(self, config: EngineConfig, set_up: SetUp = no_set_up) -> None:
+        self._config, self._set_up = config, set_up
+        self._scenes: dict[str, tuple[StoredScene, bool]] = {}
+        self._calls: dict[int, _Call] = {}
+        self._count = 0
+        self._lock = threading.RLock()
+        self._closed = False
+        self._pipe: Connection | None = None
+
+    def start(self) -> None:
+        with self._lock:
+            self._pipe, theirs = _SPAWN.Pipe()
+            self.child = _SPAWN.Process(target=_run, args=(theirs, self._config, self._set_up), daemon=True)
+            self.child.start()
+            theirs.close()
+            threading.Thread(target=self._receive, args=(self._pipe,), daemon=True).start()
+            for scene, awaited in self._scenes.values():
+                self._send(_Call("add", (scene, awaited)))
+            self._send(_Call("start", ()))
+
+    def close(self) -> None:
+        with self._lock:
+            self._closed = True
+            if self._pipe is None:
+                return
+            self._pipe.send(None)  # to close it would not wake the thread that reads it, nor the child
+        self.child.join(5)
+        self.child.terminate()
+
+    # ------------------------------------------------------------------ scenes
+
+    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
+        with self._lock:
+            self._scenes[scene.id] = scene, awaited
+            if self._pipe is not None:
+                self._ask("add", scene, awaited)
+
+    def remove(self, scene_id: str) -> None:
+        self._ask("remove", scene_id)
+        self._scenes.pop(scene_id, None)
+
+    def scenes(self) -> list[SceneStatus]:
+        return self._ask("scenes")
+
+    def scene(self, scene_id: str | None) -> SceneStatus:
+        return self._ask("scene", scene_id)
+
+    def contents(self, scene_id: str) -> SceneContents | None:
+        return self._ask("contents", scene_id)
+
+    def require(self, scene_id: str) -> SceneInfo:
+        return self._ask("require", scene_id)
+
+    def readiness(self) -> Readiness:
+        return self._ask("readiness")
+
+    def load(self, scene_id: str) -> SceneStatus:
+        return self._ask("load", scene_id)
+
+    def unload(self, scene_id: str) -> SceneStatus:
+        return self._ask("unload", scene_id)
+
+    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+        def wait() -> None:
+            while not self._closed:
+                try:
+                    self._ask("when_settled", scene_id)
+                except _ChildGone:
+                    continue
+                do()
+                return
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        return self._ask("hold", asked)
+
+    def release(self, token: str) -> None:
+        self._ask("release", token)
+
+    # ------------------------------------------------------------------ work
+
+    def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
+        try:
+            return self._ask("localize", task, on_record=on_record)
+        except _ChildGone as error:
+            raise EngineLost from error
+        except BaseException:
+            self.cancel(task.id)  # it may be `on_record` that failed
+            raise
+
+    def cancel(self, task_id: str) -> None:
+        self._ask("cancel", task_id)
+
+    def render(self, scene_id: str, picture: PictureSpec) -> bytes:
+        return self._ask("render", scene_id, picture)
+
+    def thumbnail(self, scene_id: str) -> bytes:
+        return self._ask("thumbnail", scene_id)
+
+    def splats(self, scene_id: str, limit: int) -> bytes:
+        return self._ask("splats", scene_id, limit)
+
+    # ------------------------------------------------------------------ the pipe
+
+    def _ask(self, name: str, *arguments: Any, on_record: OnRecord | None = None) -> Any:
+        call = self._send(_Call(name, arguments))
+        while True:
+            kind, value = call.messages.get()
+            if kind == "error":
+                raise value
+            if kind == "value":
+                return value
+            assert on_record
+            on_record(*value)
+
+    def _send(self, call: _Call) -> _Call:
+        with self._lock:
+            self._count += 1
+            self._calls[self._count] = call
+            try:
+                assert self._pipe is not None
+                self._pipe.send((self._count, call.name, call.arguments))
+            except OSError:  # the child is gone; `_receive` ends all its calls
+                if self._closed:
+                    call.messages.put(("error", _gone()))
+        return call
+
+    def _receive(self, pipe: Connection) -> None:
+        while True:
+            try:
+                number, kind, value = pipe.recv()
+            except (EOFError, OSError):
+                break
+            if kind == "record":
+                self._calls[number].messages.put((kind, value))
+            else:
+                self._calls.pop(number).messages.put((kind, value))
+        with self._lock:
+            calls, self._calls = self._calls, {}
+            if not self._closed:
+                self.start()
+        for call in calls.values():
+            call.messages.put(("error", _gone()))
+
+
+class _ChildGone(SceneNotReady): ...
+
+
+def _gone() -> _ChildGone:
+    return _ChildGone("the engine's process ended; another one is started.", where="scene")
+
+
+def _run(pipe: Connection, config: EngineConfig, set_up: SetUp) -> None:
+    """Answer calls until the other end of the pipe is closed."""
+    engine, lock = EmbeddedEngine(config), threading.Lock()
+    set_up(engine)
+
+    def send(*message: Any) -> None:
+        with lock:
+            pipe.send(message)
+
+    def answer(number: int, name: str, arguments: tuple) -> None:
+        try:
+            if name == "localize":
+                value = engine.localize(*arguments, lambda *record: send(number, "record", record))
+            elif name == "when_settled":
+                engine.when_settled(*arguments, lambda: send(number, "value", None))
+                return
+            elif name == "add":
+                value = engine.add(arguments[0], awaited=arguments[1])
+            else:
+                value = getattr(engine, name)(*arguments)
+            send(number, "value", value)
+        except Exception as error:
+            send(number, "error", _portable(error))
+
+    while True:
+        try:
+            call = pipe.recv()
+        except (EOFError, OSError):
+            break
+        if call is None:
+            break
+        if call[1] in ("add", "start", "cancel"):
+            answer(*call)  # in their order
+        else:
+            threading.Thread(target=answer, args=call, daemon=True).start()
+    engine.close()
+
+
+def _portable(error: Exception) -> Exception:
+    """Return what survives pickling: the error, or one of the same text."""
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")
