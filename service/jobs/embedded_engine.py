@@ -18,8 +18,8 @@ from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene, Re
 from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import read_sequence
 from service.results import PoseEstimate
+from service.scene_manager import scene_images
 from service.scene_manager.manager import Entry, Scenes
-from service.scene_manager.scene_images import picture, thumbnail
 from service.scene_manager.splat_sample import packed_splats
 from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
 from service.tracking import localize_sequence
@@ -128,11 +128,11 @@ class EmbeddedEngine:
         if cancel := self._cancels.get(task_id):
             cancel.set()
 
-    def render(self, scene_id: str, wanted: PictureSpec) -> bytes:
-        return picture(self._manager.get(scene_id), wanted)
+    def render(self, scene_id: str, picture: PictureSpec) -> bytes:
+        return scene_images.picture(self._manager.get(scene_id), picture)
 
     def thumbnail(self, scene_id: str) -> bytes:
-        return thumbnail(self._manager.get(scene_id))
+        return scene_images.thumbnail(self._manager.get(scene_id))
 
     def splats(self, scene_id: str, limit: int) -> bytes:
         return packed_splats(self._manager.get(scene_id).scene, limit)

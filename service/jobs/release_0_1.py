@@ -120,11 +120,12 @@ def _pose(spelled: dict[str, Any]) -> Pose:
 
 
 def _covariance(given: dict[str, Any] | None) -> np.ndarray | None:
-    return given and np.array(given["matrix"], np.float64)
+    return None if given is None else np.array(given["matrix"], np.float64)
 
 
 def _intrinsics(given: dict[str, Any]) -> Intrinsics:
-    return Intrinsics(**given | {"distortion": tuple(given.get("distortion", ()))})
+    values: dict[str, Any] = {**given, "distortion": tuple(given.get("distortion", ()))}
+    return Intrinsics(**values)
 
 
 def _anchor(geopose: dict[str, Any], pose: Pose) -> GeoAnchor:
