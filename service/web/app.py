@@ -51,7 +51,7 @@ from service.web.viewer_relay import Relay
 
 
 def create_app(settings: Settings | None = None, engine: Engine | None = None, keys: KeyRing | None = None) -> FastAPI:
-    """Make the app. Scenes are found now and loaded after start-up, unless `scenes` gives loaded ones.
+    """Make the app. Scenes are found now and loaded after start-up; `engine` defaults to threads of this process.
 
     `keys` defaults to those of the settings' key file. Raises SceneNotFound, BadInput or BackendMissing for scenes
     and plug-ins of the settings that can't be used, InvalidRequest if anybody could use the service without `open`.

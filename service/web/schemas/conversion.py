@@ -133,7 +133,7 @@ def record_out(record: IterationRecord, frame: SequenceFrame | None = None) -> R
 
 
 def frame_out(frame: SequenceFrame) -> FrameOut:
-    """Spell out where one photo of a sequence was taken."""
+    """Convert the answer of one photo of a sequence."""
     return FrameOut(
         index=frame.index,
         name=frame.name,
