@@ -61,7 +61,7 @@ def old_result(text: str) -> JobResult:
     pose, intrinsics = _pose(result["pose"]), _intrinsics(result["intrinsics"])
     decode, *timings = (StageTiming(t["stage"], t["wall_s"], t["cpu_s"]) for t in result["timings"])
     others = result["alternatives"]
-    rivals = Candidates(
+    alternatives = Candidates(
         np.array([other["pose"]["world_from_camera"]["matrix"] for other in others], np.float64).reshape(-1, 4, 4),
         np.array([other["probability"] for other in others], np.float64),
     )
@@ -91,7 +91,7 @@ def old_result(text: str) -> JobResult:
         renders=0,
         timings=tuple(timings),
         warnings=tuple(result["warnings"]),
-        records=(IterationRecord(timings[-1].stage, pose, rivals=rivals if others else None),),
+        records=(IterationRecord(timings[-1].stage, pose, alternatives=alternatives if others else None),),
         considered=tuple((scene["id"], scene["matches"]) for scene in result["considered"]),
     )
     anchor = _anchor(result["geopose"], pose) if result["geopose"] else None

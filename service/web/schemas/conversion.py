@@ -151,7 +151,7 @@ def record_camera(record: IterationRecord, photo: Intrinsics, *, of_matches: boo
     """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
     if of_matches and record.matches is not None:
         return record.matches.render_camera
-    return Camera(photo.corrected(record.lens), record.pose)
+    return Camera(photo.corrected(record.correction), record.pose)
 
 
 def covariance_out(matrix: np.ndarray) -> Covariance:
