@@ -1,21 +1,22 @@
-"""Tell where a photo was taken inside a 3D Gaussian Splatting scene.
+"""Find where a photo was taken inside a 3D Gaussian Splatting scene.
 
-How data flows (each arrow is a module):
+How data flows, with the modules that take each step:
 
-    photo bytes --images--> Query ---------------------------+
-    scene folder --scene_formats--> GaussianScene            |
-                                      |                      |
-                                    render (Rasterizer)      |
-                                      |                      v
-    localize.py: makes the tools, drives one estimator, keeps clock, budget and cancel flag
-                                      |
-       estimators/view_index: retrieve -> match -> pnp -> align     (parts live in pose/)
-                                      |
-    IterationRecord, IterationRecord, ...   (the last one's pose is the answer)
-                                      |
-       pose/gate: one verification for every estimator -> PoseEstimate --api--> HTTP --> viewer
+    photo bytes  --photos-->         Query --------------+
+    scene folder --scene_formats-->  GaussianScene       |
+                                       |                 |
+                                     render, matchers    |
+                                       v                 v
+    localize         makes the tools, drives an estimator; keeps clock, budget and cancel flag
+    estimators/      view_index: retrieval -> matching -> absolute pose -> refinement  (the steps: pose/)
+                       |
+                       v  IterationRecord, IterationRecord, ..., Answer
+    pose/verification  the gate, the same for every estimator
+                       |
+                       v  PoseEstimate
+    jobs, web        --> JSON over HTTP --> viewer
 
-Read `localize.py` first, then `estimators/view_index.py`.
+Read `localize.py` first, then `estimators/view_index.py`; CONTRIBUTING.md has the map of all modules.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
