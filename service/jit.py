@@ -1,7 +1,7 @@
-"""numba, wrapped: how every compiled kernel of ours is declared, and where the machine code is kept.
+"""Decorators of the compiled kernels (numba), and the directory of their machine code.
 
-A kernel runs on one thread with the GIL released. numba's disk cache notices a change in a kernel's own file but
-not in an imported one, so the cache directory is named by a hash of all kernel sources.
+A kernel runs on one thread with the GIL released. numba's disk cache notices a change in a kernel's own file but not in
+an imported one, so the cache directory is named by a hash of all kernel sources.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ def _cache_dir() -> Path:
     digest = hashlib.sha256()
     for folder in ("render", "pose", "matchers"):
         for source in sorted((root / folder).rglob("*.py")):
+            # By its text, not by its imports: this must be known before the first kernel is imported.
             text = source.read_bytes()
             if b"service.jit" in text or source.name == "simd.py":
                 digest.update(text)
@@ -27,21 +28,22 @@ def _cache_dir() -> Path:
     return base / f"jit-{digest.hexdigest()[:12]}"
 
 
+# Set before any kernel is declared: numba looks up the directory when it decorates.
 if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_cache_dir())  # type: ignore[attr-defined]
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a compiled function: no GIL, no bounds checks, C division; strict floating point."""
+    """Compile a function: without the GIL, bounds checks or Python's division by zero; with strict floating point."""
     return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)(function)
 
 
 def summing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a kernel whose sums may be taken in any order, several numbers at a time."""
-    freely = {"reassoc", "nsz", "contract"}
-    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=freely)(function)
+    """Compile a kernel whose sums may be reordered, so that LLVM vectorizes them; NaN and infinity stay exact."""
+    flags = {"reassoc", "nsz", "contract"}
+    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=flags)(function)
 
 
 def inline(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorate a function that only kernels call: it is compiled into them."""
+    """Compile a function that only kernels call; it has no cache of its own, since it is compiled into them."""
     return numba.njit(nogil=True, error_model="numpy", boundscheck=False)(function)

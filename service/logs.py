@@ -1,4 +1,4 @@
-"""Logs with the ids of what they are about, as JSON lines for machines. The only file with structlog."""
+"""Log records as JSON lines, with the ids of the request and job they belong to. The only file with structlog."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import structlog
 
 
 def bound(**ids: Any) -> AbstractContextManager:
-    """Put ids (request_id, job_id) on every line that this task or thread logs."""
+    """Return a context in which every line that this task or thread logs has these ids (request_id, job_id)."""
     return structlog.contextvars.bound_contextvars(**ids)
 
 
@@ -24,6 +24,7 @@ def json_handler() -> logging.Handler:
         structlog.stdlib.add_logger_name,
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
+    # Records of other libraries come through the standard library, so structlog formats those ("foreign") only.
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,

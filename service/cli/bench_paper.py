@@ -64,7 +64,7 @@ def bench_paper(
 
 
 def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
-    """SCENE or SCENE=DATA; a scene's name is its folder's."""
+    """Parse SCENE or SCENE=DATA arguments to (scene, data) by name, which is the scene's stem. Raises InvalidRequest."""
     found: dict[str, tuple[Path, Path | None]] = {}
     for text in given:
         scene, _, data = text.partition("=")
@@ -77,7 +77,7 @@ def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
 
 @contextmanager
 def _live_table() -> Iterator[Callable[[Progress], None]]:
-    """Yield a function that shows how far a run is: a table in a terminal, else a line a minute."""
+    """Yield a function that shows the progress of a run: a table in a terminal, else a line a minute."""
     from rich.live import Live
 
     printed_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""What runs on this machine, and why the rest doesn't."""
+"""The findings of `splatfix doctor`: each part of the service is tried on this machine."""
 
 from __future__ import annotations
 
@@ -31,15 +31,17 @@ from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
 
 @dataclass(frozen=True, slots=True)
 class Finding:
+    """The result of examining one part."""
+
     subject: str
     ok: bool
     detail: str
     needed: bool = True
-    """Whether localizing depends on it."""
+    """Whether localizing depends on it: then `doctor` fails without it."""
 
 
 def findings() -> Iterator[Finding]:
-    """Examine the machine; some of it takes seconds, so one after the other."""
+    """Examine the machine, yielding each finding as it is made: some take seconds."""
     yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
     chosen, passed_over = choose_rasterizer()
@@ -55,7 +57,7 @@ def findings() -> Iterator[Finding]:
 
 
 def compile_kernels() -> None:
-    """Compile every kernel now, so that nothing has to later: a minute the first time, seconds after that."""
+    """Run every compiled kernel once, so that later runs find it in the cache: a minute, later seconds."""
     (camera,) = room_cameras(64)[:1]
     rasterizer = RASTERIZERS.load("cpu").create(synthetic_room(2000))
     frame = rasterizer.render([camera])[0]
@@ -65,7 +67,7 @@ def compile_kernels() -> None:
 
 
 def processor() -> str:
-    """Name the processor, its SIMD and its load: what a timing rests on."""
+    """Return the processor's name, cores, SIMD extensions and load, on which every timing depends."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
     values = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
@@ -80,18 +82,19 @@ def _tried(subject: str, attempt: Callable[[], str]) -> Finding:
     began = time.perf_counter()
     try:
         detail = attempt()
-    except Exception as error:  # whatever it is, it is the finding
+    except Exception as error:  # any error is the finding
         return Finding(subject, False, f"{type(error).__name__}: {error}")
     return Finding(subject, True, f"{detail} ({time.perf_counter() - began:.1f} s)")
 
 
 def _try_renderer(name: str) -> str:
-    """Render one opaque red Gaussian: the kernels compile for this machine, and the middle is red."""
+    """Render one opaque red Gaussian, which shows that the kernels compile and compute here."""
     scene = GaussianScene(
         means=np.zeros((1, 3), np.float32),
         quats=np.array([[1, 0, 0, 0]], np.float32),
         scales=np.full((1, 3), 0.3, np.float32),
         opacities=np.ones(1, np.float32),
+        # Degree 0: colour = 0.5 + 0.2821 sh.
         sh=np.array([[[1.7725, -1.7725, -1.7725]]], np.float32),
         info=SceneInfo("doctor", "doctor", "", "none"),
     )
@@ -100,11 +103,12 @@ def _try_renderer(name: str) -> str:
     middle = RASTERIZERS.load(name).create(scene).render([camera])[0].rgb[32, 32]
     if np.abs(middle - [1, 0, 0]).max() > 0.05:
         raise ArithmeticError(f"a red Gaussian came out as {middle}")
-    return "a picture is right"
+    return "a test image is right"
 
 
 def _try_matcher() -> str:
-    """Match a noise image with itself: the weights are there."""
+    """Match a noise image with itself, which shows that the weights are installed."""
+    # Blocks of 4 pixels: finer noise has no corners at the scale of the features.
     image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8).repeat(4, 0).repeat(4, 1)
     matcher = MATCHERS.load(DEFAULT_MATCHER).create()
     features = matcher.extract(image, 200)
@@ -134,6 +138,7 @@ def _gpu() -> Finding:
     tool = shutil.which("nvidia-smi")
     if not tool:
         return Finding("GPU", False, "no NVIDIA driver; rendering is on the CPU", needed=False)
+    # Not PyTorch: it may be built without CUDA on a machine that has a GPU.
     listed = subprocess.run([tool, "-L"], capture_output=True, text=True, timeout=20, check=False).stdout.strip()
     if importlib.util.find_spec("gsplat") is None:
         return Finding("GPU", False, f"{listed or 'none'}; gsplat is not installed", needed=False)

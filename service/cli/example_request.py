@@ -1,4 +1,4 @@
-"""A line to try a running service with: curl, a photo that lies with the scene, and what it needs."""
+"""The curl command that `splatfix serve` prints: a photo from the scene's folder, and the fields that it needs."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from service.scene_formats.folder import same_photo
 from service.types import NamedCamera
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic")
-_AT_MOST = 2000
-"""Files to look through."""
+_MAX_FILES = 2000
+"""Searched for a photo: a data set may have more, and the start must not wait for them."""
 
 
 def curl_line(
     url: str, folder: Path | None, cameras: Sequence[NamedCamera], *, scene_id: str = "", key: str = ""
 ) -> str:
-    """Return a command that localizes a photo; `PHOTO.jpg` stands for one where the scene's folder has none."""
+    """Return a shell command that localizes a photo of the folder, or a placeholder `PHOTO.jpg` if it has none."""
     photo = example_photo(folder, cameras) if folder and folder.is_dir() else None
     parts = ["curl", "-H", "Prefer: wait=30", "-F", f"photo=@{photo or 'PHOTO.jpg'}"]
     if key:
@@ -34,15 +34,15 @@ def curl_line(
 
 
 def example_photo(folder: Path, cameras: Sequence[NamedCamera]) -> Path | None:
-    """Return a photo below the folder, rather one that the scene was not trained with."""
-    files = [p for p, _ in zip(sorted(folder.rglob("*")), range(_AT_MOST), strict=False)]
+    """Return a photo in the folder or below, if possible one that the scene was not trained with."""
+    files = [p for p, _ in zip(sorted(folder.rglob("*")), range(_MAX_FILES), strict=False)]
     photos = [p for p in files if p.suffix.lower() in _SUFFIXES and p.is_file()]
     unseen = [p for p in photos if not any(same_photo(str(p), camera.name) for camera in cameras)]
     return next(iter(unseen or photos), None)
 
 
 def _needed_intrinsics(photo: Path, cameras: Sequence[NamedCamera]) -> dict[str, float] | None:
-    """Return those of a training photo of the same size, if the photo doesn't tell its own."""
+    """Return the intrinsics of a training photo of the same size, if the photo has no focal length in EXIF."""
     try:
         query = read_query(photo.read_bytes())
     except BadInput:

@@ -1,4 +1,4 @@
-"""What the command line tells of answers: a line each, tables, trajectories."""
+"""Results as text: a line for each photo, and tables as CSV."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ _POSE_COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 
 def photo_line(name: str, result: Result) -> str:
-    """Return a photo's answer as a line."""
+    """Return one photo's result as a line."""
     status = f"{result.status} in {result.scene.id}" if result.scene_ranking else result.status
-    told = _line(name, status, result.score, result.pose.world_from_camera)
-    return f"{told}. {result.hint}" if result.hint else told
+    line = _line(name, status, result.score, result.pose.world_from_camera)
+    return f"{line}. {result.hint}" if result.hint else line
 
 
 def frame_line(frame: FrameOut) -> str:
-    """Return the answer of one photo of a sequence as a line."""
+    """Return the result of one photo of a sequence as a line."""
     name = f"{frame.time_s:.3f} s, {frame.name}"
-    told = _line(name, frame.status, frame.score, frame.world_from_camera)
-    return told if frame.tracked else f"{told}, searched"
+    line = _line(name, frame.status, frame.score, frame.world_from_camera)
+    return line if frame.tracked else f"{line}, searched"
 
 
 def _line(name: str, status: str, score: float, world_from_camera: Transform) -> str:
-    place = " ".join(f"{value:.4f}" for value in world_from_camera.translation)
-    turn = " ".join(f"{value:.4f}" for value in world_from_camera.quaternion_wxyz)
-    return f"{name}: {status}, score {score:.2f}, position {place}, quaternion_wxyz {turn}"
+    position = " ".join(f"{value:.4f}" for value in world_from_camera.translation)
+    quaternion = " ".join(f"{value:.4f}" for value in world_from_camera.quaternion_wxyz)
+    return f"{name}: {status}, score {score:.2f}, position {position}, quaternion_wxyz {quaternion}"
 
 
 def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None:
-    """One row a photo; the pose is world_from_camera in OpenCV axes."""
+    """Write a CSV table with one row a photo; the pose is world_from_camera in OpenCV axes, in scene units."""
     rows = [
         (
             *(name, result.scene.id, result.status, result.reason, result.score),
@@ -46,7 +46,7 @@ def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None
 
 
 def write_frame_table(path: Path, frames: Sequence[FrameOut]) -> None:
-    """One row a photo of the sequence; the pose is world_from_camera in OpenCV axes."""
+    """Write a CSV table with one row a photo of the sequence; the pose is world_from_camera in OpenCV axes."""
     rows = [
         (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.tracked)) for f in frames
     ]

@@ -1,4 +1,4 @@
-"""What `splatfix scenes inspect` tells: what a scene has, what of it is unknown, and from where it is looked at."""
+"""The facts of `splatfix scenes inspect`: content of a scene, what is unknown of it, and where its views are placed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from service.types import GaussianScene
 
 
 def scene_facts(path: Path) -> dict[str, Any]:
-    """Return the facts as JSON has them; lengths in scene units. Renders some hundred small views: seconds.
+    """Load a scene and measure it; lengths in scene units. Renders some hundred small views, which takes seconds.
 
-    Raises SceneError.
+    Returns values that JSON can hold. Raises SceneError.
     """
     scene = load_scene(path)
     rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(scene)
     info = scene.info
+    # Quantiles: a few stray Gaussians would make the bounds meaningless.
     low, high = np.quantile(scene.means, [0.01, 0.99], axis=0)
     facts: dict[str, Any] = {
         "id": info.id,
@@ -53,10 +54,10 @@ def scene_facts(path: Path) -> dict[str, Any]:
 
 
 def _training_size(path: Path, scene: GaussianScene) -> dict[str, Any]:
-    """Return the long side of the training photos in pixels, and who says so."""
-    said = read_manifest(path).training_size if path.is_dir() else None
-    if said:
-        return {"px": max(said), "source": "manifest"}
+    """Return the long side of the training photos in pixels, and its source."""
+    given = read_manifest(path).training_size if path.is_dir() else None
+    if given:
+        return {"px": max(given), "source": "manifest"}
     if scene.info.training_long_side_px:
         return {"px": scene.info.training_long_side_px, "source": "training cameras"}
     low, high = ASSUMED_TRAINING_PX
@@ -64,8 +65,8 @@ def _training_size(path: Path, scene: GaussianScene) -> dict[str, Any]:
 
 
 def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
-    """Return from where the view index would be rendered."""
-    rng = np.random.default_rng(0)  # as `LoadedScene.prepare` has it
+    """Return from where the view index of the default estimator would be rendered, and how much its views cover."""
+    rng = np.random.default_rng(0)  # the seed of `LoadedScene.prepare`
     if scene.cameras:
         cameras = index_cameras(scene, rasterizer, rng)
         return {
@@ -86,7 +87,7 @@ def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
 
 
 def as_lines(facts: dict[str, Any]) -> dict[str, str]:
-    """Return the facts for people: one line each."""
+    """Return the facts as text, by label."""
     index, size, memory = facts["index"], facts["training_size"], facts["memory_bytes"]
     placed = f"{index['views']} views, placed by {index['placed_by']}"
     if "candidates" in index:

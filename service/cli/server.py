@@ -1,4 +1,4 @@
-"""`splatfix serve`: a socket, a server, and a few lines that tell where it is."""
+"""The process of `splatfix serve`: a socket, the server, and the lines printed once it is ready."""
 
 from __future__ import annotations
 
@@ -21,17 +21,18 @@ from service.web.middleware.authentication import is_loopback
 from service.web.settings import DATA_HOME, Settings
 
 _CONNECTIONS_S = 3
-"""What open connections get after SIGTERM, before the running jobs get their own grace period."""
+"""Time for open connections after SIGTERM, before the running jobs get their own."""
 
 
 def run(settings: Settings, out: Console, err: Console) -> None:
     """Serve until SIGTERM or SIGINT. Raises InvalidRequest, StorageFailed and what `create_app` raises."""
     if settings.log_json if settings.log_json is not None else not err.is_terminal:
         logging.getLogger().handlers = [json_handler()]
-    if settings.data_dir is None and settings.port:  # on a random port nobody would come back to it
+    if settings.data_dir is None and settings.port:  # a random port is never the same again
         settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
     keys = KeyRing(settings.keys_file)
     key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_temporary("start", "admin")
+    # The socket first: the port is known, and an error is reported before scenes are loaded.
     with _listener(settings.host, settings.port) as listener:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
         application = create_app(settings, keys=keys)
@@ -44,13 +45,13 @@ def run(settings: Settings, out: Console, err: Console) -> None:
                 server_header=False,
                 ws="websockets-sansio",
                 ws_max_size=2**26,
-                ws_per_message_deflate=False,  # whole scenes pass: compressing them costs more than it saves
+                ws_per_message_deflate=False,  # scenes are sent whole: compressing them costs more than it saves
                 timeout_graceful_shutdown=_CONNECTIONS_S,
             )
         )
         logging.getLogger("service").setLevel(logging.INFO)
-        told = server, application, settings, key, out, err
-        threading.Thread(target=_announce, args=told, daemon=True).start()
+        arguments = server, application, settings, key, out, err
+        threading.Thread(target=_announce, args=arguments, daemon=True).start()
         server.run(sockets=[listener])
 
 
@@ -65,7 +66,7 @@ def _listener(host: str, port: int) -> socket.socket:
 def _announce(
     server: uvicorn.Server, application: FastAPI, settings: Settings, key: str, out: Console, err: Console
 ) -> None:
-    """Wait until the service is ready, then say where it is and what to type."""
+    """Wait until the service is ready, then print its addresses and an example request."""
     with err.status("starting") as status:
         while not server.started:
             time.sleep(0.05)
@@ -74,13 +75,13 @@ def _announce(
             status.update(", ".join(pending))
             time.sleep(0.1)
     readiness, url = parts.engine.readiness(), settings.loopback_url
-    entrance = f"?key={key}" if key else ""
+    query = f"?key={key}" if key else ""
     for reason in readiness.failed:
         err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
     lines = [
         f"splatfix {__version__} {'is ready' if readiness.ready else 'runs, but has no usable scene'}:",
-        f"  start page  {url}/{entrance}",
-        *([f"  viewer      {url}/viewer/{entrance}"] if settings.viewer else []),
+        f"  start page  {url}/{query}",
+        *([f"  viewer      {url}/viewer/{query}"] if settings.viewer else []),
         f"  API         {url}/docs",
     ]
     scenes = parts.engine.scenes()

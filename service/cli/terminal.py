@@ -1,4 +1,4 @@
-"""What the commands share on a terminal: consoles, progress bars, options that are JSON, and loading a scene."""
+"""Shared by the commands: consoles, progress bars, options that are JSON, and loading a scene."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ JsonFileOption = Annotated[Path | None, typer.Option("--json", help="Write the w
 
 
 def settings_of(given: dict[str, Any]) -> Settings:
-    """Return the settings, some of them given on the command line. Raises SplatfixError."""
+    """Return the settings of the environment and the file, overridden by `given`. Raises SplatfixError."""
     from pydantic import ValidationError
 
     from service.web.problems import described
@@ -42,12 +42,12 @@ def settings_of(given: dict[str, Any]) -> Settings:
 
 
 def say(text: str) -> None:
-    """Print a line as it is."""
+    """Print text without rich's markup and line breaks."""
     out.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def short(value: Any) -> str:
-    """Return a figure as people read it."""
+    """Return a value as text, a number with 4 digits."""
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -61,7 +61,7 @@ def parsed_option(text: str, where: str) -> Any:
 
 
 def read_file(path: Path) -> bytes:
-    """Return what a file holds. Raises InvalidRequest."""
+    """Read a file's bytes. Raises InvalidRequest."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -69,7 +69,7 @@ def read_file(path: Path) -> bytes:
 
 
 def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -> LoadedScene:
-    """Load a scene and, if an estimator is to use it, make what that prepares for it."""
+    """Load a scene, and prepare it for the estimator, if one is given. Raises SceneError, BackendMissing."""
     from service.localize import LoadedScene
 
     with err.status(f"reading {scene}") as status:
@@ -82,30 +82,30 @@ def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -
 
 
 def print_machine() -> None:
-    """Say on what a benchmark runs, and what else runs there."""
+    """Print the processor and its load, without which a benchmark's times mean nothing."""
     from service.cli.diagnostics import processor
 
     err.print(processor(), markup=False, highlight=False, soft_wrap=True)
 
 
 def progress_bar() -> Progress:
-    """Return bars for what takes more than a second; they disappear when it is done."""
+    """Return a progress display on stderr, which disappears at the end."""
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     return Progress(*columns, console=err, transient=True)
 
 
 def counter(progress: Progress, unit: str) -> Callable[[int, int], None]:
-    """Return a function that shows (done, of how many) as a bar."""
+    """Add a bar and return the function that updates it: (done, total)."""
     task = progress.add_task(unit, total=None)
     return lambda done, total: progress.update(task, completed=done, total=total)
 
 
 def write_json(path: Path | None, value: Any) -> None:
-    """Write a file, if one is asked for."""
+    """Write a value as JSON, if a path is given."""
     if path:
         path.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
 
 
 def print_json(value: Any) -> None:
-    """Print for other programs."""
+    """Print a value as JSON on standard output."""
     say(json.dumps(value, indent=1))
