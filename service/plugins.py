@@ -47,6 +47,7 @@ class PluginRegistry:
     def __init__(self, package: str, group: str, required: tuple[str, ...]) -> None:
         self.package, self._group, self._required = package, group, required
         self._kind = package.rsplit(".", 1)[-1]
+        # Behind the package's own folder in its search path: `import package.name` finds the built-in one first.
         if os.environ.get(PLUGINS_DIR):
             sys.modules[package].__path__.append(str(Path(os.environ[PLUGINS_DIR], self._kind)))
 
@@ -113,6 +114,7 @@ def _discovered(
     """
     own = {info.name for info in pkgutil.iter_modules(folders[:1])}
     found: dict[str, _Plugin] = {}
+    # The first folder is the package's own; others were appended.
     for folder in folders:
         source = BUILT_IN if folder == folders[0] else FOLDER
         for info in pkgutil.iter_modules([folder]):

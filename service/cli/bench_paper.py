@@ -64,7 +64,7 @@ def bench_paper(
 
 
 def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
-    """Parse SCENE or SCENE=DATA arguments to (scene, data) by name, which is the scene's stem. Raises InvalidRequest."""
+    """Parse SCENE or SCENE=DATA arguments to (scene, data) by the scene's name, its stem. Raises InvalidRequest."""
     found: dict[str, tuple[Path, Path | None]] = {}
     for text in given:
         scene, _, data = text.partition("=")

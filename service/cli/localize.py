@@ -70,6 +70,7 @@ def localize(
         {"intrinsics": intrinsics, "prior": prior, "times_s": times},
     )
     files = [(str(photo), read_file(photo)) for photo in photos]
+    # A video is a sequence by itself; photos are one only on request.
     track_camera = sequence or any(is_sequence(data) for _, data in files)
     if not track_camera:
         _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times})
@@ -88,6 +89,7 @@ def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
     """Return the request's fields as the API parses them; `nested` options are JSON, or files of it."""
     from service.web.schemas.parsing import read_fields
 
+    # Through the API's own parser: the same names, limits and error texts.
     given = plain | {name: parsed_option(text, name) for name, text in nested.items()}
     return read_fields({name: value for name, value in given.items() if value is not None})
 
@@ -140,6 +142,7 @@ def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, 
     from service.web.schemas.parsing import job_spec
 
     spec = job_spec(fields)
+    # The service limits the frames of a job; the command line doesn't.
     photo = read_photo(body.photo, spec, loaded.scene.info.background_rgb, max_frames=sys.maxsize)
     if not isinstance(photo.source, SequenceSource):
         raise InvalidRequest("a sequence has two photos or more, or is a video.", where="photos")

@@ -327,6 +327,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
         ) from None
     # JPEG's reduction rounds up to whole pixels: the decoded image may cover a fraction of a pixel more than the photo.
     covered = (pixels.shape[1] * step[0], pixels.shape[0] * step[1])
+    # Intrinsics were checked against the header's size: another one would shift every ray.
     if min(covered[0] - raw_size[0], covered[1] - raw_size[1]) < 0:
         raise InvalidImage(f"the {name} decodes to another size than its header says.", where="photo")
     layers = [pixels] if alpha is None else [pixels, alpha]
@@ -339,9 +340,8 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
     transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
     if transpose:
-        layers = [layer.swapaxes(0, 1) for layer in layers]
         scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
-    upright = [np.ascontiguousarray(layer[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1]) for layer in layers]
+    upright = [_oriented(layer, transpose, mirror_x, mirror_y) for layer in layers]
     return _Decoded(
         upright[0],
         upright[1] >= DEFAULTS.opaque if len(upright) > 1 else None,
@@ -350,6 +350,11 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
         offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
         warnings=tuple(warnings),
     )
+
+
+def _oriented(layer: UInt8[np.ndarray, "..."], transpose: bool, mirror_x: bool, mirror_y: bool) -> np.ndarray:
+    turned = layer.swapaxes(0, 1) if transpose else layer
+    return np.ascontiguousarray(turned[:: -1 if mirror_y else 1, :: -1 if mirror_x else 1])
 
 
 def _rgb(

@@ -80,6 +80,7 @@ def check_sequence(data: bytes, reading: Reading) -> None:
         if reading.times_s is not None and len(reading.times_s) != len(entries):
             raise InvalidRequest(f"{len(reading.times_s)} times for {len(entries)} photos.", where="times_s")
         sizes: list[tuple[int, int]] = []
+        # Photos that are skipped may be broken: they are never decoded.
         for index in range(0, len(entries), reading.every):
             with _at_photo(index):
                 sizes.append(photo_size(archive.read(entries[index])))
@@ -96,6 +97,7 @@ def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, Non
     for count, (index, name, time_s, source) in enumerate(_sources(data, reading), 1):
         _check_count(count, reading)
         with _at_photo(index):
+            # The prior is of the first pose; later ones start from the pose before.
             prior = reading.prior if first is None else None
             if isinstance(source, bytes):
                 query = read_query(source, prior=prior, background_rgb=reading.background_rgb, **given)
@@ -103,6 +105,7 @@ def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, Non
                 query = query_of(source, prior=prior, **given)
             if first is None:
                 query = replace(query, region=reading.region)
+            # One camera: intrinsics that are refined with one photo hold for the next.
             size = query.photo_intrinsics.width, query.photo_intrinsics.height
             first = first or size
             _check_size(size, first)

@@ -50,6 +50,7 @@ DEFAULTS = RenderConfig()
 
 NO_OCCLUSION = np.empty(0, np.float32)
 
+# One for all scenes: kernels release the GIL, and more threads than cores would only take turns.
 _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
 
 
@@ -137,7 +138,7 @@ class CpuRasterizer:
         """Return d loss / d parameter of the Gaussians in view."""
         s = self._backward(camera, d_rgb, d_depth, d_alpha)
         n, scene = s.visible, self.scene
-        rows = aligned((n + LANES) * ROW)
+        rows = aligned((n + LANES) * ROW)  # the last group of 16 is written whole
         scene_rows(s.records, s.sums, n, *self._chain_arguments(camera, s), rows)
         result = SceneGradients(
             np.empty(n, np.int32),
@@ -157,7 +158,7 @@ class CpuRasterizer:
         self, camera: Camera, end_t: np.float32 = T_MIN, occlusion_depth: Float32[np.ndarray, "_ _"] | None = None
     ) -> Frame:
         s = self._scratch()
-        s.camera = None  # an error on the way must not leave another camera's lists behind
+        s.camera = None  # after an error the lists belong to no camera
         self._bin(camera, s, occlusion_depth)
         k = camera.intrinsics
         frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))

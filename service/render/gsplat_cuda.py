@@ -112,6 +112,7 @@ class GsplatRasterizer:
         for index, camera in enumerate(cameras):
             k = camera.intrinsics
             groups[k.width, k.height, dilation_for(camera, self.scene.info)].append(index)
+        # gsplat allocates for all cameras of a call at once.
         at_once = max(1, PROJECTED_AT_ONCE // max(1, self.scene.count))
         frames: dict[int, Frame] = {}
         for members in groups.values():
@@ -149,6 +150,7 @@ class GsplatRasterizer:
         leaves = tuple(tensor.detach().requires_grad_() for tensor in self._parameters)
         image, alpha, meta = self._rasterize([camera], self._views([camera]), leaves)
         gradients = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), leaves)
+        # The CPU renderer, too, has rows for the Gaussians in view only.
         seen = (meta["radii"][0] > 0).all(-1).nonzero()[:, 0]
         return SceneGradients(
             seen.int().cpu().numpy(), *(gradient[seen].float().cpu().numpy() for gradient in gradients)

@@ -109,6 +109,7 @@ def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
+    # Behind the camera. The tests below compare with the planes through the camera's centre.
     if cz + radius < near:
         return False
     # Distances from the four side planes, whose normals aren't normalized: the radius is scaled instead.
@@ -126,7 +127,7 @@ def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, tile_depths):
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
     nearest, farthest = cz - radius, cz + radius
-    if nearest <= near:
+    if nearest <= near:  # its projection is unbounded
         return False
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]

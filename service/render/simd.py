@@ -189,7 +189,7 @@ def _function(llvm_name: str, arity: int) -> Any:
 def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, rounded once."""
     if not all(isinstance(x, (VectorF, types.Number)) for x in (a, b, c)):
-        return None
+        return None  # numba then reports a type error at the call
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         values = [_widened(context, builder, v, t, f32x16) for v, t in zip(args, sig.args, strict=True)]
@@ -261,7 +261,7 @@ def vmax(typingctx: Any, a: Any, b: Any) -> Any:
 @intrinsic
 def select(typingctx: Any, mask: Any, a: Any, b: Any) -> Any:
     """`a` where the mask is set, else `b`; numbers are broadcast."""
-    vector = i32x16 if i32x16 in (a, b) else f32x16
+    vector = i32x16 if i32x16 in (a, b) else f32x16  # two numbers become floats
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
         x, y = (_widened(context, builder, v, t, vector) for v, t in zip(args[1:], sig.args[1:], strict=True))
@@ -319,6 +319,7 @@ def sum16(typingctx: Any, a: Any) -> Any:
     """Sum over the lanes, pairwise."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        # Four rotations and additions; afterwards every lane has the sum.
         vector, undef = args[0], ir.Constant(_VF, ir.Undefined)
         for half in (8, 4, 2, 1):
             order = [(i + half) % LANES for i in range(LANES)]
@@ -432,6 +433,7 @@ def compress(typingctx: Any, vector: Any, mask: Any) -> Any:
     """Move the lanes whose mask is set to the front, in order; the rest is undefined."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: tuple) -> Any:
+        # One instruction with AVX-512; LLVM emulates it elsewhere.
         kind = _LLVM[sig.args[0]]
         suffix = "v16f32" if sig.args[0] is f32x16 else "v16i32"
         fn = cgutils.get_or_insert_function(

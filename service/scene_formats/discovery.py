@@ -16,6 +16,7 @@ def find_scenes(path: Path) -> list[Path]:
     """
     if path.is_file() or (path.is_dir() and _is_scene(path)):
         return [path]
+    # One level only: a scene folder may hold photos and other files in folders of its own.
     found = sorted(p for p in path.iterdir() if p.is_dir() and _is_scene(p)) if path.is_dir() else []
     if not found:
         raise SceneNotFound("there is no scene.", where=str(path))

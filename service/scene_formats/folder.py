@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from types import ModuleType
@@ -45,22 +45,18 @@ def load_scene(
     file, reader = _scene_file(path, manifest)
     raw = checked(reader.read(file), file.name)
     mode = require_render_mode(manifest.render_mode or raw.render_mode or "default", file.name)
-
-    def keep(name: str) -> bool:
-        return not any(same_photo(name, photo) for photo in without_photos)
-
     # A bare file has neither manifest nor cameras: what lies beside it may belong to another scene.
-    found = _training(path, manifest, keep) if path.is_dir() and training is None else _Training(tuple(training or ()))
+    given = training is not None or path.is_file()
+    found = _Training(tuple(training or ())) if given else _training(path, manifest, without_photos)
     size = manifest.training_size or _median_size(found.cameras)
     used = found.cameras if cameras else ()
     focal_px = _training_focal_px(used, manifest.training_size)
     if manifest.world_from_scene is not None:
         raw = moved_gaussians(raw, manifest.world_from_scene)
         used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
-    name = path.resolve().name if path.is_dir() else path.stem  # resolved: "." has no name
     info = SceneInfo(
-        id=name,
-        name=manifest.name or name,
+        id=_scene_id(path),
+        name=manifest.name or _scene_id(path),
         sha256=_digest(file, path, used, (found.background, size, focal_px)),
         format=reader.__name__.rsplit(".", 1)[-1],
         background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
@@ -75,11 +71,16 @@ def load_scene(
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)
 
 
+def _scene_id(path: Path) -> str:
+    return path.resolve().name if path.is_dir() else path.stem  # resolved, since "." has no name
+
+
 def same_photo(a: str, b: str) -> bool:
     """Whether two names may mean the same photo: one path is the tail of the other, suffixes apart.
 
     "0001.png", "images/0001" and "./data/images/0001.jpg" are the same; "train/r_0" and "test/r_0" are not.
     """
+    # Camera files name photos by different roots, and with or without a suffix.
     parts = [_parts(name) for name in (a, b)]
     shared = min(len(p) for p in parts)
     return shared > 0 and parts[0][-shared:] == parts[1][-shared:]
@@ -98,8 +99,12 @@ class _Training:
     background: tuple[float, float, float] | None = None
 
 
-def _training(folder: Path, manifest: Manifest, keep: Callable[[str], bool]) -> _Training:
+def _training(folder: Path, manifest: Manifest, without_photos: Collection[str]) -> _Training:
     """Read the training cameras; transforms*.json before sparse/0, from which it was converted where both exist."""
+
+    def keep(name: str) -> bool:
+        return not any(same_photo(name, photo) for photo in without_photos)
+
     transforms = transforms_path(folder)
     if transforms is not None:
         file = TransformsFile.open(transforms)
@@ -169,6 +174,7 @@ def _digest(file: Path, path: Path, cameras: tuple[NamedCamera, ...], *facts: ob
     if (path / MANIFEST).is_file():
         digest.update((path / MANIFEST).read_bytes())
     digest.update(repr(facts).encode())
+    # The cameras as used, moved and filtered: an index depends on them.
     for camera in cameras:
         digest.update(repr((camera.name, camera.camera.intrinsics)).encode())
         digest.update(camera.camera.pose.world_from_camera.tobytes())

@@ -46,6 +46,7 @@ def checked(raw: RawGaussians, where: str) -> RawGaussians:
     Strict on purpose: one NaN makes every pixel that it reaches NaN, and dropping Gaussians silently would hide a
     broken export.
     """
+    # NaN first: the comparisons below are False for it.
     for name in ("means", "scales", "opacities", "sh", "quats"):
         values = getattr(raw, name)
         _require_none(~np.isfinite(values.reshape(len(values), -1)).all(1), f"non-finite {name}", where)

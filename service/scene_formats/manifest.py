@@ -85,6 +85,7 @@ def numbers(
         result = np.asarray(value, np.float64)
     except (ValueError, TypeError, OverflowError):
         result = np.empty(0)
+    # Another shape would be broadcast silently later.
     if result.shape != shape or not np.all(np.isfinite(result)):
         raise error(f"must be {' x '.join(map(str, shape)) or 'one'} finite number(s).", where=where)
     return result

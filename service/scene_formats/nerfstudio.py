@@ -59,6 +59,7 @@ class TransformsFile:
 
     def training_photos(self) -> list[str]:
         """Return the photos in `train_filenames`; without that list, all but those of the other lists."""
+        # Test photos must not be training cameras: a bench would find its answers in the index.
         listed = self.split("train")
         if listed is not None:
             return [name for name in self.frames if name in set(listed)]

@@ -47,6 +47,7 @@ def read_header(path: Path) -> PlyHeader:
     """Parse the header. Raises CorruptScene, or UnsupportedFormat for a text PLY."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
+    # The data begin after the line's end, whatever stands behind end_header (a "\r").
     end = head.find(b"\nend_header")
     newline = head.find(b"\n", end + 1)
     if not head.startswith(b"ply") or end < 0 or newline < 0:
@@ -62,7 +63,7 @@ def _byte_order(lines: list[str], path: Path) -> str:
     if len(formats) != 1 or len(formats[0]) != 3:
         raise CorruptScene("the header needs exactly one 'format' line.", where=path.name)
     kind = formats[0][1]
-    if kind == "ascii":
+    if kind == "ascii":  # parsing millions of numbers as text would take minutes
         raise UnsupportedFormat("a text PLY is not read.", where=path.name, hint="Save it as binary.")
     if kind not in _BYTE_ORDERS:
         raise CorruptScene(f"unknown PLY format '{kind[:40]}'.", where=path.name)
@@ -86,7 +87,7 @@ def _elements(lines: list[str], order: str, path: Path) -> tuple[PlyElement, ...
 
 
 def _dtype(element: str, properties: list[list[str]], order: str, path: Path) -> np.dtype | None:
-    if any(p[0] == "list" for p in properties):
+    if any(p[0] == "list" for p in properties):  # of meshes; records of no fixed size
         return None
     names = [p[-1] for p in properties]
     unknown = sorted({p[0] for p in properties} - _TYPES.keys())
