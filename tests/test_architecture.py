@@ -33,6 +33,17 @@ LAYERS = [
 FOUNDATIONS = {("types", "errors"), ("results", "types"), ("plugins", "errors"), ("photos", "geometry")}
 """Within a line: only these."""
 
+# Within a package, bottom to top: a folder imports from the lines below its own, and from itself.
+FLOORS = {
+    "pose": [
+        {"features"},
+        {"absolute_pose"},
+        {"matching"},
+        {"refinement"},
+        {"retrieval", "descent", "verification"},
+    ],
+}
+
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
 WRAPPED = {
     "PIL": {"service/photos/images.py"},
@@ -128,8 +139,16 @@ def _may_import(place: Path, module: str) -> bool:
     if len(place.parts) == 2 and place.stem == "__init__":
         return False  # `import service` stays light
     source = place.parts[1].removesuffix(".py")
+    if source == target and source in FLOORS:
+        return _may_import_inside(FLOORS[source], place.parts[2], module.split(".")[2])
     same_line = source == target or (source, target) in FOUNDATIONS
     return same_line or level(target) < level(source)
+
+
+def _may_import_inside(floors: list[set[str]], source: str, target: str) -> bool:
+    """Whether one folder of a package may import from another one; each must be on a floor."""
+    heights = {name: height for height, floor in enumerate(floors) for name in floor}
+    return source == target or heights[target] < heights[source]
 
 
 def test_jobs_know_scenes_through_the_engine_and_databases_through_the_store():
@@ -149,6 +168,30 @@ def test_the_rules_can_fail():
     assert not _may_import(Path("service/web/app.py"), "service.bench.render")
     assert not _may_import(Path("viewer/viewer_server.py"), "service.localize")
     assert _may_import(Path("service/estimators/view_index.py"), "service.pose.verification.gate")
+    # Inside a package: up, sideways, and down.
+    assert not _may_import(Path("service/pose/features/query_images.py"), "service.pose.matching.correspondences")
+    assert not _may_import(Path("service/pose/retrieval/index.py"), "service.pose.verification.gate")
+    assert _may_import(Path("service/pose/retrieval/index.py"), "service.pose.features.rendered_views")
+
+
+def test_every_folder_with_floors_is_on_one():
+    for package, floors in FLOORS.items():
+        folders = {p.parent.name for p in (ROOT / "service" / package).glob("*/__init__.py")}
+        assert folders == set().union(*floors), package
+
+
+def test_no_two_modules_have_one_name():
+    """But for routes, commands and benches, which are named after what they show."""
+    shown = ("service/web/routes", "service/cli", "service/bench")
+    inner = [
+        p.stem
+        for p in SOURCES
+        if p.stem not in ("__init__", "__main__")
+        and p.is_relative_to(ROOT / "service")
+        and not any(p.is_relative_to(ROOT / folder) for folder in shown)
+    ]
+    assert len(inner) > 100
+    assert sorted(inner) == sorted(set(inner))
 
 
 @pytest.mark.parametrize("package", [service, viewer])

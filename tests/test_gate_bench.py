@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from service.bench.gate import GARBAGE, garbage
-from service.bench.gate_fit import Sample, fitted, probabilities, summary
+from service.bench.gate_fit import Sample, fit_model, fitted, probabilities, summary
 from service.pose.verification.gate import VERIFICATION
-from service.pose.verification.model import SHIPPED_MODEL
+from service.pose.verification.model import MODEL_FILE, SHIPPED_MODEL, load_model, write_model
 
 
 def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:
@@ -45,6 +49,48 @@ def test_counts_are_of_scenes_that_were_left_out() -> None:
     top = found["reliability"][-1]
     assert VERIFICATION.min_localized < top["said"] <= 1
     assert found["by_kind"]["clean"]["right"] == 180
+
+
+def scene_samples(scene: str, photos: int, rng: np.random.Generator) -> list[Sample]:
+    return [
+        replace(sample(scene, kind, right, level), photo=str(number))
+        for number in range(photos)
+        for kind, right, low, high in (("clean", True, 0.8, 1.0), ("moved", False, 0.0, 0.3))
+        for level in rng.uniform(low, high, 10)
+    ]
+
+
+def test_the_model_of_a_single_scene_is_tested_on_photos_that_were_left_out(tmp_path: Path) -> None:
+    samples = scene_samples("a", 8, np.random.default_rng(2))
+    assert summary(samples, SHIPPED_MODEL)["photometric"]["wrong_localized"] == 0
+    model = fit_model(samples, SHIPPED_MODEL, {"scenes": [{"name": "a", "sha256": "0", "photos": 8}]})
+    assert (model.fitted_on["poses"], model.fitted_on["right"], model.fitted_on["scenes"][0]["photos"]) == (160, 80, 8)
+    # The file says the same, and a signal below the floors of right poses is in doubt.
+    write_model(model, tmp_path / "model.json")
+    read = load_model(tmp_path / "model.json")
+    right, wrong = (sample("a", "clean", True, level).signals for level in (0.97, 0.1))
+    for signals in (right, wrong):
+        assert read.probability(signals) == model.probability(signals)
+        assert read.below_floor(signals) == model.below_floor(signals)
+    assert read.probability(wrong) < 0.5 < read.probability(right)
+    assert read.below_floor(right) == []
+    assert set(read.below_floor(wrong)) == set(SHIPPED_MODEL.scales)
+
+
+def test_a_photo_that_always_fails_moves_only_its_own_fold() -> None:
+    """Were the test on the samples of the fit, the odd photo's right poses would lower the floors and pass."""
+    rng = np.random.default_rng(3)
+    samples = scene_samples("a", 8, rng)
+    odd = [replace(sample("a", "clean", True, 0.6), photo="0") for _ in range(4)]
+    found = summary(samples + odd, SHIPPED_MODEL)["with_matches"]
+    assert found["right"] - found["right_localized"] >= len(odd)
+
+
+def test_a_model_of_another_version_is_refused(tmp_path: Path) -> None:
+    content = json.loads(MODEL_FILE.read_text())
+    (tmp_path / "model.json").write_text(json.dumps(content | {"version": 99}))
+    with pytest.raises(ValueError, match="version 99"):
+        load_model(tmp_path / "model.json")
 
 
 def test_pictures_of_nothing_are_pictures_and_differ() -> None:

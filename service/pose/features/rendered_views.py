@@ -88,7 +88,10 @@ class ViewRenderer:
 
     def at(self, query: Query, pose: Pose, tolerance_px: float = 1.0, long_side: int | None = None) -> RenderedView:
         """Return a render with the query's intrinsics at most `tolerance_px` from the pose; `long_side` in pixels."""
-        camera = camera_of(query, pose, long_side)
+        return self.near(camera_of(query, pose, long_side), tolerance_px)
+
+    def near(self, camera: Camera, tolerance_px: float = 1.0) -> RenderedView:
+        """Return the latest render if it shows the same within the tolerance, else a new one."""
         if self.latest is not None and self.latest.shows_the_same_as(camera, tolerance_px):
             return self.latest
         return self.render(camera)

@@ -95,50 +95,67 @@ def refine_stage(
     Ends early where the loss exceeds `max_loss`. Where the focal length is estimated and creeps along with the
     distance for too long, the outcome says where to match again.
     """
-    query, trusted = images.query, found.num_inliers >= config.trusted_inliers
-    settled_px = config.free_focal_settled_px if query.focal_sigma else config.settled_px
-    pose, correction = found.pose, found.correction
-    refined: RefinedPose | None = None
-    rendered: RenderedView | None = None
     if config.max_renders == 0:
         return RefineOutcome((yield from _as_matched(found, renderer)))
+    trusted, free_focal = found.num_inliers >= config.trusted_inliers, bool(images.query.focal_sigma)
+    small_px = None if free_focal else config.first_render_px
+    now, refined, rendered = found, None, None
     for round_number in range(config.max_renders):
-        small_px = None if round_number or query.focal_sigma else config.first_render_px
-        camera = camera_of(query.corrected(correction), pose, small_px)
-        if rendered is None:
-            rendered = renderer.at(query.corrected(correction), pose, long_side=small_px)
-        elif rendered.shows_the_same_as(camera, settled_px):
+        following = _next_render(rendered, now, images, renderer, config, small_px)
+        if following is None:
             return RefineOutcome(refined)
-        else:
-            rendered = renderer.render(camera)
+        rendered = following
         levels = config.levels if round_number or trusted else config.first_levels
-        result = _refined_on(rendered, pose, correction, images, levels, bool(small_px), config)
+        result = _refined_on(rendered, now, images, levels, bool(small_px), config)
         diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
-        if diverged or not np.isfinite(result.loss):
+        if diverged or result.loss > max_loss or not np.isfinite(result.loss):
             refined = refined and replace(refined, rendered=rendered, photometric=None)
-            return RefineOutcome(refined, found if trusted else None, diverged=True)
-        if result.loss > max_loss:
-            return RefineOutcome(refined and replace(refined, rendered=rendered, photometric=None))
-        step_deg, step_units = pose_distance(pose, result.pose)
-        pose, correction = result.pose, result.correction
-        inliers = found.num_inliers or None
-        refined = RefinedPose(pose, correction, result.loss, inliers, rendered, result)
-        yield IterationRecord(
-            "refine", pose, correction, result.loss, num_inliers=inliers, step_deg=step_deg, step_units=step_units
-        )
-    if refined is None or rendered is None or not query.focal_sigma:
+            is_astray = diverged or not np.isfinite(result.loss)
+            return RefineOutcome(refined, found if trusted and is_astray else None, is_astray)
+        refined = RefinedPose(result.pose, result.correction, result.loss, found.num_inliers or None, rendered, result)
+        yield _record_of(refined, now.pose)
+        now, small_px = replace(found, pose=result.pose, correction=result.correction), None
+    if refined is None or not free_focal:
         return RefineOutcome(refined)
-    camera = camera_of(query.corrected(correction), pose)
-    if rendered.shows_the_same_as(camera, settled_px):
+    following = _next_render(rendered, now, images, renderer, config, None)
+    if following is None:
         return RefineOutcome(refined)
-    refined = replace(refined, rendered=renderer.render(camera), photometric=None)
-    return RefineOutcome(refined, replace(found, pose=pose, correction=correction))
+    return RefineOutcome(replace(refined, rendered=following, photometric=None), restart=now)
+
+
+def _next_render(
+    last: RenderedView | None,
+    now: AbsolutePose,
+    images: QueryImages,
+    renderer: ViewRenderer,
+    config: RefineStageConfig,
+    long_side: int | None,
+) -> RenderedView | None:
+    """Return a render at the pose; None if the last one shows the same, so that refinement has settled."""
+    query = images.query.corrected(now.correction)
+    camera = camera_of(query, now.pose, long_side)
+    if last is None:
+        return renderer.near(camera)
+    settled_px = config.free_focal_settled_px if query.focal_sigma else config.settled_px
+    return None if last.shows_the_same_as(camera, settled_px) else renderer.render(camera)
+
+
+def _record_of(refined: RefinedPose, before: Pose) -> IterationRecord:
+    step_deg, step_units = pose_distance(before, refined.pose)
+    return IterationRecord(
+        "refine",
+        refined.pose,
+        refined.correction,
+        refined.loss,
+        num_inliers=refined.num_inliers,
+        step_deg=step_deg,
+        step_units=step_units,
+    )
 
 
 def _refined_on(
     rendered: RenderedView,
-    pose: Pose,
-    correction: IntrinsicsCorrection,
+    now: AbsolutePose,
     images: QueryImages,
     levels: int,
     coarse: bool,
@@ -146,14 +163,14 @@ def _refined_on(
 ) -> RefinementResult:
     """Refine the pose and, with an approximate focal length, the intrinsics on one render."""
     size = rendered.camera.intrinsics
-    start = Camera(images.query.intrinsics.resized(size.width, size.height), pose)
+    start = Camera(images.query.intrinsics.resized(size.width, size.height), now.pose)
     return refine_photometric(
         images.resized(size),
         rendered.frame,
         rendered.camera,
         start,
         levels,
-        correction,
+        now.correction,
         images.query.focal_sigma,
         images.valid_mask(size),
         coarse,

@@ -1,4 +1,4 @@
-"""The space of a scene: where its opaque Gaussians are, what is free, and from how far it was photographed."""
+"""The space of a scene: where its opaque Gaussians are, what is free, and from which distance it was photographed."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Space:
         )
 
     def occupied(self, positions: Float64[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
-        """Whether Gaussians are there; outside the grid there are none."""
+        """Return whether Gaussians are there; outside the grid there are none."""
         index = np.floor((positions - self.low) / self.cell).astype(int)
         inside = np.all((index >= 0) & (index < self.filled.shape), axis=-1)
         x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
@@ -76,7 +76,7 @@ class Space:
     def clear(
         self, points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], reach: float
     ) -> Float64[np.ndarray, "n"]:
-        """Return how far one gets from points of surfaces before Gaussians are in the way, at most `reach`."""
+        """Return the free distance from points of surfaces along directions, at most `reach`, in scene units."""
         starts = (points - self.low) / self.cell
         steps = _steps_in_the_clear(
             self.filled, starts, directions, SPACE.skipped_cells, max(0, round(reach / self.cell))
@@ -84,7 +84,7 @@ class Space:
         return np.minimum((SPACE.skipped_cells + steps) * self.cell, reach)
 
     def enclosures(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
-        """Return for each place the share of all directions in which something is met within the grid."""
+        """Return for each position the share of all directions that end at a Gaussian within the grid."""
         starts = np.repeat((positions - self.low) / self.cell, SPACE.enclosure_rays, axis=0)
         directions = np.tile(lattice(SPACE.enclosure_rays), (len(positions), 1))
         most = int(np.linalg.norm(self.filled.shape))
@@ -111,7 +111,7 @@ def _steps_in_the_clear(filled, starts, directions, first, most):
 
 
 def survey(scene: GaussianScene) -> Space:
-    """Return the space of a scene."""
+    """Return the space of a scene, from its Gaussians' places and sizes."""
     opaque = np.flatnonzero(scene.opacities > SPACE.min_opacity)
     opaque = opaque if len(opaque) else np.arange(scene.count)
     opaque = opaque[:: -(-len(opaque) // SPACE.max_points)]

@@ -30,7 +30,7 @@ def retrieval_scores(
     """Return for each view how well the photo's strongest features are found in it; descriptors have unit length.
 
     A feature adds by how much its best similarity in a view exceeds its usual one: that in the few best views, not in
-    the average view, because neither what every room shows nor what the scene lacks tells places apart. (3 million
+    the average view, because neither what every room shows nor what the scene lacks distinguishes places. (3 million
     Gaussians, 13 similar rooms, 374 views: a right view is among the first five for 10 photos of 16; relative to the
     average for 8, by VLAD with 32 words for 3. In the six test scenes and studio each of them finds one for all 58.)
     """

@@ -1,12 +1,12 @@
 """Where to view a scene from when nothing is known of where its photos were taken.
 
     opaque Gaussians -> places in free space that look at some of them -> small renders of its LOD proxy -> good?
-        ^------------ aim at what no good view has seen yet <------------|
+        ^------------ aim at what no good view shows yet <---------------|
     good views -> the few that together see every surface from every side that any of them sees
 
 Three kinds of places: on shells around the middle (objects), anywhere in the volume (rooms), and at the distance
-that a Gaussian's size tells: trainers split and merge until a Gaussian fills about a pixel of the photos, so distance
-= size x focal length, whatever the scene's unit and however far its background is.
+inferred from a Gaussian's size: training splits and merges Gaussians until each fills about a pixel of the photos, so
+distance = size x focal length, whatever the scene's unit and however far its background is.
 
 A view is good if it is solid, free and inside. Solid: most of the image shows one opaque surface, not nearer than a
 floater would be; from behind walls, inside floaters and towards parts never photographed, the depths along a ray
@@ -86,7 +86,7 @@ class Placement:
     coverage: float
     """Share of the opaque Gaussians that the chosen views see."""
     typical_distance: float
-    """From which the Gaussians' sizes say that they were photographed; scene units, median."""
+    """Median distance from which the Gaussians were photographed, by their sizes; scene units."""
     interior: bool
     """The scene surrounds its views."""
 
@@ -94,7 +94,10 @@ class Placement:
 def find_views(
     scene: GaussianScene, rasterizer: Rasterizer, rng: np.random.Generator, config: PlacementConfig = PLACEMENT
 ) -> Placement:
-    """Find places from which the scene looks as it did to the cameras that it was trained with."""
+    """Return views like those of the photos that the scene was trained with; see the module.
+
+    The search is random: `rng` is its only source of randomness.
+    """
     space = survey(scene)
     search = lod_proxy(scene, rasterizer, rng)
     views = _Views(space, search, config)
@@ -168,7 +171,7 @@ def search_camera(long_side: int, fov_deg: float = PLACEMENT.fov_deg) -> Intrins
 
 
 class _Views:
-    """Candidates, how solid each is, and what it sees of the scene."""
+    """Candidate views, how solid each is, and what it sees of the scene."""
 
     def __init__(self, space: Space, rasterizer: Rasterizer, config: PlacementConfig) -> None:
         self.poses: list[Pose] = []
@@ -185,7 +188,7 @@ class _Views:
         self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
 
     def judge(self, poses: Sequence[Pose]) -> None:
-        """Render the candidates small. Those among Gaussians are not worth it, nor those known to be outside."""
+        """Render the candidates small, except those among Gaussians and those known to be outside."""
         positions = np.stack([pose.position_in_world for pose in poses])
         enclosures = self._space.enclosures(positions)
         worth = np.flatnonzero(~self._space.occupied(positions) & (enclosures >= self._least_enclosed))
@@ -213,7 +216,7 @@ class _Views:
             self._surface_ids.append(np.unique(_ids(voxels)))
 
     def good(self) -> Int64[np.ndarray, "k"]:
-        """Return which candidates are solid and, where that tells, inside; and take note whether it does."""
+        """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior."""
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
         solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
         limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
@@ -223,13 +226,13 @@ class _Views:
         return solid[enclosures[solid] >= self._least_enclosed]
 
     def seen(self, chosen: Int64[np.ndarray, "k"]) -> Int64[np.ndarray, "n"]:
-        """Tell of each point of the space how many of the views see its voxel."""
+        """Return for each point of the space how many of the views see its voxel."""
         ids = np.concatenate([*(self._surface_ids[i] for i in chosen), np.empty(0, np.int64)])
         at = np.minimum(np.searchsorted(self._voxels, ids), len(self._voxels) - 1)
         return np.bincount(at[self._voxels[at] == ids], minlength=len(self._voxels))[self._voxel_of]
 
     def cells(self, i: int) -> Int64[np.ndarray, "k"]:
-        """Return what a view sees as (voxel, direction of view, octave of distance): what makes pictures alike."""
+        """Return what a view sees, as ids of (voxel, viewing direction, octave of distance): alike for like images."""
         points = self._surfaces[i]
         rays = points - self.poses[i].position_in_world
         distances = np.linalg.norm(rays, axis=1, keepdims=True)
@@ -240,7 +243,7 @@ class _Views:
 
 
 def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
-    """Return one number for each row of small numbers; chance collisions do no harm."""
+    """Return a hash of each row of small numbers; rare collisions do no harm."""
     result = np.zeros(len(rows), np.uint64)
     for column in rows.T:
         result = (result ^ column.astype(np.uint64)) * np.uint64(0x9E3779B97F4A7C15)
@@ -249,9 +252,9 @@ def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
 
 
 def _choice(cells: Sequence[Int64[np.ndarray, "_"]], config: PlacementConfig) -> Int64[np.ndarray, "k"]:
-    """Take the view that adds most, again and again, until the choice shows what all together show.
+    """Return a greedy set cover: always the view that adds most, until the choice shows what all together show.
 
-    What a single candidate sees counts half: it may be an odd place.
+    A cell that only a single candidate sees counts half: that candidate may be an outlier.
     """
     ids, inverse = np.unique(np.concatenate(cells), return_inverse=True)
     rows = np.split(inverse, np.cumsum([len(c) for c in cells])[:-1])
@@ -276,7 +279,7 @@ def _choice(cells: Sequence[Int64[np.ndarray, "_"]], config: PlacementConfig) ->
 
 
 def _shells(space: Space, config: PlacementConfig) -> list[Pose]:
-    """Look at the middle from all around."""
+    """Return poses all around the middle that look at it."""
     middle, radius = space.middle, space.radius
     directions = lattice(config.shell_candidates)
     return [
@@ -285,7 +288,7 @@ def _shells(space: Space, config: PlacementConfig) -> list[Pose]:
 
 
 def _in_volume(space: Space, rng: np.random.Generator, config: PlacementConfig) -> list[Pose]:
-    """Look from random places in the volume towards random Gaussians."""
+    """Return poses at random places in the volume that look at random Gaussians."""
     low, high = np.quantile(space.points, [0.05, 0.95], axis=0)
     positions = rng.uniform(low, high, (config.volume_candidates, 3))
     targets = space.points[rng.integers(len(space.points), size=config.volume_candidates)]
@@ -295,7 +298,10 @@ def _in_volume(space: Space, rng: np.random.Generator, config: PlacementConfig) 
 def _by_size(
     space: Space, rng: np.random.Generator, count: int, wanted: Bool[np.ndarray, "n"] | None = None
 ) -> list[Pose]:
-    """Look at random Gaussians, of those wanted, from about as far as their sizes tell; rather level than not."""
+    """Return poses that look at random Gaussians, of those wanted, from about the distance that their sizes suggest.
+
+    Directions are horizontal rather than not.
+    """
     among = np.arange(len(space.points)) if wanted is None else np.flatnonzero(wanted)
     taken = rng.choice(among, count)
     directions = rng.standard_normal((count, 3))
@@ -314,7 +320,7 @@ def _looking(
 
 
 def _jittered(pose: Pose, space: Space, rng: np.random.Generator, turn: float = 0.25) -> Pose:
-    """Move a pose a little and turn it, by some 15 degrees if not said otherwise; upright again."""
+    """Return the pose moved a little and rotated, by some 15 degrees with the default `turn`, and upright."""
     reach = 0.3 * min(space.radius, space.distance)
     position = pose.position_in_world + reach * rng.uniform(-1, 1, 3)
     axis = pose.axis_in_world + turn * rng.standard_normal(3)
