@@ -12,7 +12,7 @@ import pytest
 from service.bench.gate import GARBAGE, garbage
 from service.bench.gate_fit import Sample, fit_model, fitted, probabilities, summary
 from service.pose.verification.gate import VERIFICATION
-from service.pose.verification.model import MODEL_FILE, SHIPPED_MODEL, load_model, write_model
+from service.pose.verification.gate_model import MODEL_FILE, SHIPPED_MODEL, load_model, write_model
 
 
 def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:

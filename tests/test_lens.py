@@ -14,8 +14,8 @@ from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearize_reprojection
 from service.pose.features.rendered_views import to_uint8
 from service.pose.refinement import covariance
-from service.pose.refinement.config import REFINEMENT, UncertaintyConfig
 from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.refinement_config import REFINEMENT, UncertaintyConfig
 from service.pose.refinement.uncertainty import pose_uncertainty
 from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose

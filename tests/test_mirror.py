@@ -16,7 +16,7 @@ from service.estimators.search_state import SEARCH
 from service.geometry import project, transformed
 from service.localize import LoadedScene, Request, localize
 from service.pose.features.mirrored_query import mirrored_query
-from service.pose.verification.model import SHIPPED_MODEL
+from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.results import Reason, Status
 from service.types import BoxPrior, Pose, Query
 

@@ -31,7 +31,7 @@ from service.pose.verification.appearance import (
     local_colour_correlation,
 )
 from service.pose.verification.gate import photometric_suffices, verify
-from service.pose.verification.model import SHIPPED_MODEL, Scale
+from service.pose.verification.gate_model import SHIPPED_MODEL, Scale
 from service.results import Reason, Status, Verdict
 from service.types import Camera, GaussianScene, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, Query, SceneInfo
 

@@ -10,13 +10,13 @@ from test_pose import LENS, PaintedWalls, photo_from, true_pose
 
 from service.geometry import moved, pose_distance
 from service.interfaces import Frame
-from service.pose.refinement.config import REFINEMENT, PyramidConfig, UncertaintyConfig
 from service.pose.refinement.covariance import scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.kernels import linearize, normal_equations
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, luma, occluder_depth
 from service.pose.refinement.pyramid_level import NEUTRAL, PyramidLevel, RefinementState, _tukey_weights
+from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig, UncertaintyConfig
 from service.pose.refinement.uncertainty import pose_uncertainty
 from service.types import NO_CORRECTION, Camera, Intrinsics
 

@@ -21,10 +21,10 @@ from service.errors import UnknownName
 from service.estimators import view_index
 from service.estimators.search_state import SEARCH, SearchConfig
 from service.localize import DEFAULT_ESTIMATOR, Request
-from service.pose.refinement.config import REFINEMENT, PyramidConfig
+from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig
 from service.pose.retrieval.scores import ScoreConfig
 from service.pose.verification.appearance import LOCAL_COLOUR
-from service.pose.verification.model import SHIPPED_MODEL
+from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.render import cpu
 
 CONDITIONS = {

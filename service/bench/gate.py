@@ -38,7 +38,7 @@ from service.pose.features.rendered_views import ViewRenderer
 from service.pose.matching.match_stages import MATCHING
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.verification.gate import verify
-from service.pose.verification.model import SHIPPED_MODEL, model_to_json
+from service.pose.verification.gate_model import SHIPPED_MODEL, model_to_json
 from service.results import Reason, Status, Verdict
 from service.tracking import refine_from, verify_tracked
 from service.types import Camera, Intrinsics, Pose, Query

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from service.pose.verification.gate import VERIFICATION
-from service.pose.verification.model import GateModel, Logistic
+from service.pose.verification.gate_model import GateModel, Logistic
 
 
 @dataclass(frozen=True, slots=True)

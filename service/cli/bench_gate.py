@@ -22,7 +22,7 @@ def bench_gate(
     With --model the model that is fitted on all is written; service/pose/verification/model.json is such a file.
     """
     from service.bench.gate import run
-    from service.pose.verification.model import model_from_json, write_model
+    from service.pose.verification.gate_model import model_from_json, write_model
 
     print_machine()
     with progress_bar() as progress:

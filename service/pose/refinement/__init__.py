@@ -2,5 +2,5 @@
 
 `photometric` refines, coarse to fine, with `gauss_newton` on each `pyramid_level`; `uncertainty` linearizes at the
 answer and estimates covariance (by the jackknife of `covariance`) and the last Gauss-Newton step; `kernels` are the
-compiled inner loops, `config` all tuning constants.
+compiled inner loops, `refinement_config` all tuning constants.
 """

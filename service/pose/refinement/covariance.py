@@ -18,8 +18,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from service.pose.refinement.config import UncertaintyConfig
 from service.pose.refinement.kernels import sum_scores_by_cell
+from service.pose.refinement.refinement_config import UncertaintyConfig
 
 
 def scores_by_cell(

@@ -7,9 +7,9 @@ from jaxtyping import Float32, Float64
 
 from service.geometry import se3_exp
 from service.pose.absolute_pose.intrinsics_prior import correction_vector
-from service.pose.refinement.config import RefinementConfig
 from service.pose.refinement.kernels import normal_equations
 from service.pose.refinement.pyramid_level import CORRECTION, PHOTOMETRIC, TWIST, PyramidLevel, RefinementState
+from service.pose.refinement.refinement_config import RefinementConfig
 
 
 def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, config: RefinementConfig) -> float:

@@ -26,9 +26,9 @@ from jaxtyping import Bool, Float64, UInt8
 from service.geometry import moved, se3_log
 from service.interfaces import Frame
 from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
-from service.pose.refinement.config import REFINEMENT, RefinementConfig
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.pyramid_level import NEUTRAL, PyramidLevel, RefinementState, linearized_levels
+from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
 from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose
 
 

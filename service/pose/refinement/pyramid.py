@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from service.interfaces import Frame
-from service.pose.refinement.config import PyramidConfig
+from service.pose.refinement.refinement_config import PyramidConfig
 
 FAR = np.float32(1e30)
 """Depth in the place of none, where the nearest is wanted."""

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.interfaces import Frame
 from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
-from service.pose.refinement.config import RefinementConfig
 from service.pose.refinement.kernels import fill_residuals, linearize
 from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, luma, occluder_depth, pyramid
+from service.pose.refinement.refinement_config import RefinementConfig
 from service.types import Intrinsics, IntrinsicsCorrection
 
 TWIST, PHOTOMETRIC, CORRECTION = slice(0, 6), slice(6, 10), slice(10, 13)

@@ -15,8 +15,8 @@ from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import RenderedView, ViewRenderer, camera_of
 from service.pose.matching.match_stages import MATCHING, MatchingConfig, render_and_rematch
-from service.pose.refinement.config import REFINEMENT, RefinementConfig
 from service.pose.refinement.photometric import RefinementResult, refine_photometric
+from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
 from service.results import IterationRecord
 from service.types import Camera, IntrinsicsCorrection, Pose
 

@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float64, UInt8
 from service.geometry import se3_log
 from service.interfaces import Frame
 from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
-from service.pose.refinement.config import REFINEMENT, RefinementConfig
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale, scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.photometric import RefinementResult
@@ -22,6 +21,7 @@ from service.pose.refinement.pyramid_level import (
     RefinementState,
     linearized_levels,
 )
+from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
 from service.types import NO_CORRECTION, Camera
 
 FOCAL = CORRECTION.start

@@ -5,7 +5,7 @@ whatever the exposure) and its colours, each over most of the photo and over its
 and whether the colours agree where the gradients do (repeated things seen one further, and mirror images, have the
 right edges and the wrong colours; see `appearance.py`); how many fresh matches between photo and render agree with
 the pose, without any fit, what share that is, and how they are spread; and by how much refinement would still move the
-pose. `model.py` computes from them how probably the pose is right (within 5 degrees and 1/80 of the distance), and
+pose. `gate_model.py` computes from them how probably the pose is right (within 5 degrees and 1/80 of the distance), and
 which signals are below their floors.
 """
 
@@ -21,11 +21,11 @@ from service.pose.absolute_pose.prior_region import inside_prior
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import RenderedView
 from service.pose.matching.correspondences import correspondences
-from service.pose.refinement.config import REFINEMENT, RefinementConfig
 from service.pose.refinement.photometric import RefinementResult
+from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import GLOBAL_SIGNALS, appearance, visible_alpha
-from service.pose.verification.model import SHIPPED_MODEL, GateModel
+from service.pose.verification.gate_model import SHIPPED_MODEL, GateModel
 from service.pose.verification.signals import NO_MATCHES, geometry_signals, match_signals
 from service.results import Reason, Status, Verdict
 from service.types import Camera, Pose
