@@ -6,8 +6,9 @@ import platform
 from functools import cache
 from importlib import metadata
 
+from service import __version__
+
 _PACKAGES = (
-    "splatfix",
     "numpy",
     "numba",
     "torch",
@@ -22,4 +23,5 @@ _PACKAGES = (
 @cache
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that a result may depend on, by name."""
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in _PACKAGES}
+    own = {"python": platform.python_version(), "splatfix": __version__}  # the metadata may be of an older install
+    return own | {name: metadata.version(name) for name in _PACKAGES}
