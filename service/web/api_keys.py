@@ -57,6 +57,7 @@ class KeyRing:
         """Read the keys; none if there is no file. Raises InvalidRequest if the file is damaged."""
         self._path = path
         self._temporary: list[StoredKey] = []
+        # New in each process: tokens end with it, and need no storage.
         self._secret = secrets.token_bytes(32)
         self._read_at, self._stamp = 0.0, (0, 0)
         self._stored: list[StoredKey] = []
@@ -77,6 +78,7 @@ class KeyRing:
         """Return the owner of a key; None for an unknown one. The comparison takes constant time."""
         self._refresh()
         digest, found = _digest(key), None
+        # No early exit: the time must not reveal which key comes close.
         for known in (*self._stored, *self._temporary):
             if hmac.compare_digest(known.sha256, digest):
                 found = Caller(known.name, known.role)
@@ -96,6 +98,7 @@ class KeyRing:
         claim = json.loads(base64.urlsafe_b64decode(text))
         caller = Caller(claim["name"], claim["role"])
         self._refresh()
+        # The signature proves who made the token, not that the key still exists with that role.
         living = {(key.name, key.role) for key in (*self._stored, *self._temporary)}
         return caller if claim["until"] > time.time() and (caller.name, caller.role) in living else None
 
@@ -109,6 +112,7 @@ class KeyRing:
         try:
             found = self._path.stat()
         except FileNotFoundError:
+            # Removed with its last key, or not there yet.
             self._stored, self._stamp = [], (0, 0)
             return
         stamp = found.st_mtime_ns, found.st_size
@@ -152,6 +156,7 @@ def _write(path: Path, keys: list[StoredKey]) -> None:
     # Replaced at once: a running service must never read half a file.
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     try:
+        # Mode 600 from the start: a chmod afterwards would leave the file readable for a moment.
         with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
             json.dump([asdict(key) for key in keys], file, indent=1)
         draft.replace(path)

@@ -25,6 +25,7 @@ _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
 def _cores() -> int:
     """Count the processors that this process may use: its CPU affinity, within the CPU quota of its cgroup."""
+    # macOS has no affinities.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     try:
         quota, period = _CPU_QUOTA.read_text().split()
@@ -152,6 +153,7 @@ class Settings(BaseSettings):
     @property
     def loopback_url(self) -> str:
         """URL of the service for clients on this machine."""
+        # Addresses that listen on all interfaces can't be connected to on every system.
         everywhere = self.host in ("0.0.0.0", "::", "")
         host = "127.0.0.1" if everywhere else f"[{self.host}]" if ":" in self.host else self.host
         return f"http://{host}:{self.port}"

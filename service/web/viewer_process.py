@@ -38,6 +38,7 @@ class ViewerChild:
         while True:
             began = time.monotonic()
             await self._run_once()
+            # A viewer that ran for a while crashed by chance; one that ends at once will do so again.
             stayed_up = time.monotonic() - began > _STAYED_UP_S
             pause = _FIRST_PAUSE_S if stayed_up else min(2 * pause, _LONGEST_PAUSE_S)
             await asyncio.sleep(pause)
@@ -68,5 +69,6 @@ async def _end(child: asyncio.subprocess.Process) -> None:
 
 def _free_port() -> int:
     """Return a free port. It is chosen once, so that the relay finds the viewer after a restart."""
+    # It is free again after the block: another process could take it, but hardly does within seconds.
     with socket.create_server(("127.0.0.1", 0)) as listener:
         return listener.getsockname()[1]

@@ -68,14 +68,17 @@ class Authentication:
         """Refuse requests that another site's page sends from a visitor's browser. Raises Forbidden."""
         headers = Headers(scope=scope)
         host = headers.get("host", "").lower()
+        # The port may be a proxy's or a forwarded one, so only the name is compared.
         if self._rules.hosts and re.sub(r":\d+$", "", host) not in (*self._rules.hosts, *_LOOPBACK):
             raise Forbidden(
                 f"the service isn't called '{host[:80]}'.", where="header.host", hint="Set SPLATFIX_ALLOWED_HOSTS."
             )
         origin = headers.get("origin")
+        # A browser lets no page read another site's answer to a GET, but it does send a POST, and opens WebSockets.
         guarded = scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS
         if origin is None or not guarded or origin in self._rules.origins:
             return
+        # The scheme is not compared: behind a TLS proxy the service itself is called by http.
         if urlsplit(origin).netloc.lower() != host:
             raise Forbidden(
                 f"pages of {origin[:80]} may not use this service.",
@@ -88,6 +91,7 @@ class Authentication:
         connection = HTTPConnection(scope)
         keys, given = self._rules.keys, connection.headers.get("authorization", "")
         if given:
+            # Other schemes, e.g. Basic, are refused like a wrong key.
             key = given.partition(" ")[2].strip() if given.lower().startswith("bearer ") else ""
             caller = keys.caller(key) or keys.bearer(key)
         elif query:
@@ -118,7 +122,7 @@ class Authentication:
             self._rules.keys.token(caller, SESSION_S),
             max_age=int(SESSION_S),
             path=f"{root}/",
-            secure=scope.get("scheme") == "https",
+            secure=scope.get("scheme") == "https",  # else a browser would not send it back over http
             httponly=True,
             samesite="lax",
         )

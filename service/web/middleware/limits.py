@@ -50,16 +50,19 @@ class Limits:
         if policy.body is None:
             await self._app(scope, _without_body(receive), send)
             return
+        # No await since the check of `max_uploads`, so no other request can take the place meanwhile.
         self._uploads += 1
         limits = policy.body.max_bytes(self._settings), policy.body.seconds(self._settings)
         body = _Body(receive, *limits, self._release)
         try:
             await self._app(scope, body.receive, send)
         finally:
+            # Also a body that the route did not read to its end gives its place back.
             body.end()
 
     async def _check_head(self, scope: Scope, policy: RoutePolicy) -> None:
         """Check all that is known before the body arrives. Raises RateLimited, QueueFull, HTTPException 413."""
+        # The cheapest check first. The queue's is last but one, since it may read the store.
         if policy.rate_limited:
             self._check_rate(scope)
         if policy.body:
@@ -116,6 +119,7 @@ class _Body:
                 message = await self._receive()
         except TimeoutError:
             raise HTTPException(408, "The body took too long to arrive.") from None
+        # Counted as well as announced: chunked bodies have no Content-Length.
         self._received += len(message.get("body", b""))
         if self._received > self._limit:
             raise too_large(self._limit)
@@ -137,6 +141,7 @@ def client_of(scope: Scope) -> str:
 
 
 def _check_length(scope: Scope, limit: int) -> None:
+    # Malformed lengths are refused by the HTTP server already.
     length = Headers(scope=scope).get("content-length", "")
     if length.isdecimal() and int(length) > limit:
         raise too_large(limit)

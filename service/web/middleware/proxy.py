@@ -78,6 +78,7 @@ class _Response:
     def __init__(self, scope: Scope, send: Send, send_s: float) -> None:
         self._send, self._send_s = send, send_s
         given = Headers(scope=scope).get(REQUEST_ID, "")
+        # A proxy's id is kept, so that its log and ours can be joined, but only if it can't forge log lines.
         self.request_id = given if re.fullmatch(r"[\w.-]{1,64}", given) else secrets.token_hex(8)
         self.status = 499  # as in nginx: the client closed the connection before the response
         self.begun = self.dropped = False
@@ -94,6 +95,7 @@ class _Response:
             headers.setdefault("Cache-Control", "private, no-cache")
             if self._own_page:
                 headers["Content-Security-Policy"] = _PAGES_POLICY
+        # `send` blocks while the socket's buffer is full.
         try:
             async with asyncio.timeout(self._send_s):
                 await self._send(message)
@@ -108,6 +110,7 @@ def _sub_path(scope: Scope, default: str) -> dict[str, str]:
     # A client can send the header: only plain paths are accepted, since it ends up in links.
     root = given if re.fullmatch(r"(/[\w~-][\w.~-]*){1,8}", given) else default
     path = scope["path"]
+    # Some proxies strip the sub-path from requests, others don't; ASGI wants it in `path`.
     if root and path != root and not path.startswith(f"{root}/"):
         path = root + path
     return {"root_path": root, "path": path}

@@ -18,5 +18,6 @@ class RouteLookup:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] in ("http", "websocket"):
+            # Starlette's `request.state` shows the same dictionary to the routes.
             scope.setdefault("state", {})["policy"] = find_policy(self._routes, scope)
         await self._app(scope, receive, send)

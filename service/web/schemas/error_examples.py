@@ -154,6 +154,7 @@ _CHALLENGE = {"WWW-Authenticate": {"schema": {"type": "string"}, "example": "Bea
 def errors(*codes: str, body: bool = False, always: tuple[str, ...] = ALWAYS) -> dict[int | str, dict[str, Any]]:
     """Return the `responses` of an operation for its error codes; `body`: it is no GET."""
     found: dict[int, dict[str, Any]] = {}
+    # Several codes share a status: each is an example of the same response.
     for code in dict.fromkeys((*codes, *(WITH_BODY if body else ()), *always)):
         status = EXAMPLES[code].status
         response = found.setdefault(status, _response(status))

@@ -99,6 +99,7 @@ def _nerfstudio(poses: Sequence[_NamedPose], result: Result) -> str:
 def _nerfstudio_frame(named: _NamedPose, k: IntrinsicsOut) -> dict[str, Any]:
     return {
         "file_path": named.name,
+        # nerfstudio has OpenGL's camera axes.
         "transform_matrix": named.pose.opengl.world_from_camera.matrix,
         "camera_model": "OPENCV_FISHEYE" if "FISHEYE" in k.model else "OPENCV",
         "w": k.width,
@@ -107,6 +108,7 @@ def _nerfstudio_frame(named: _NamedPose, k: IntrinsicsOut) -> dict[str, Any]:
         "fl_y": k.fy,
         "cx": k.cx,
         "cy": k.cy,
+        # strict: a model whose parameters are named here must have as many.
         **dict(zip(_DISTORTION.get(k.model, ()), k.distortion, strict=True)),
     }
 
@@ -117,6 +119,7 @@ def _tum(poses: Sequence[_NamedPose], result: Result) -> str:
 
 
 def _tum_line(named: _NamedPose) -> str:
+    # TUM has the scalar part last.
     w, x, y, z = named.pose.world_from_camera.quaternion_wxyz
     return f"{named.time_s:.6f} {_numbers(*named.pose.position, x, y, z, w)}\n"
 

@@ -22,6 +22,7 @@ _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 def geographic(anchor: GeoAnchor, pose: Pose) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "4"]]:
     """Return a pose on WGS84: (latitude in degrees, longitude in degrees, height in metres), and a quaternion wxyz."""
+    # EPSG:4979 is latitude, longitude and height on WGS84, EPSG:4978 Earth-centred coordinates.
     ecef_from_geodetic = Transformer.from_crs("EPSG:4979", "EPSG:4978")
     origin = np.array(ecef_from_geodetic.transform(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m))
     ecef_from_enu = _ecef_from_enu(anchor.latitude_deg, anchor.longitude_deg)

@@ -110,6 +110,7 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
         raise InvalidIntrinsics(
             f"{params.model} has {expected} parameters, and needs `size`.", where=f"{where}.modelParams"
         )
+    # COLMAP's order: focal lengths, principal point, distortion.
     values, (width, height) = params.modelParams, reading.size
     return {
         **{"model": params.model, "width": width, "height": height, "fx": values[0], "fy": values[focals - 1]},
@@ -121,6 +122,7 @@ def nearest_scene(scenes: Sequence[SceneStatus], request: GeoPoseRequest) -> str
     """Return the id of the scene to localize in. Raises NoGeoAnchor."""
     places = {s.id: s.info.geo_anchor for s in scenes if s.info and s.info.geo_anchor}
     readings = request.sensorReadings.geolocationReadings
+    # One scene needs no geolocation: indoors, phones often have none.
     if len(places) == 1:
         return next(iter(places))
     if not places or not readings:
@@ -145,6 +147,7 @@ def response_of(request: GeoPoseRequest, result: Result, anchor: GeoAnchor) -> G
     accuracy = None
     if result.covariance is not None:
         variance = np.diag(np.array(result.covariance.matrix))
+        # Metres per scene unit: the determinant of a similarity is its scale cubed.
         metres = float(np.cbrt(np.linalg.det(anchor.enu_from_world[:3, :3])))
         accuracy = GeoPoseAccuracy(
             position=metres * float(np.sqrt(variance[3:].mean())),

@@ -19,6 +19,7 @@ _LINKS = {
 
 def add_links(schema: dict[str, Any]) -> None:
     """Add the links to an OpenAPI document."""
+    # Generators of clients and of tests (schemathesis) follow them.
     for operations in schema["paths"].values():
         for operation in operations.values():
             for status, response in operation["responses"].items():
