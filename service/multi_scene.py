@@ -85,14 +85,14 @@ def localize_in_scenes(
         limited = replace(request, budget_s=None if left is None else max(left, 1e-3))
         found.append(SceneEstimate(localize(query, scenes[i], limited), scenes[i]))
     best = max(found, key=lambda f: (f.estimate.verdict.status is Status.LOCALIZED, f.estimate.verdict.score))
-    considered = tuple((scenes[i].scene.info.id, int(inliers[i])) for i in order)
+    scene_ranking = tuple((scenes[i].scene.info.id, int(inliers[i])) for i in order)
     others = tuple(t for f in found if f is not best for t in f.estimate.timings)
     rest = [StageTiming("other_scenes", sum(t.wall_s for t in others), sum(t.cpu_s for t in others))] if others else []
     timings = (ranking, *rest, *best.estimate.timings)
     if on_record:
         for record in best.estimate.records:
             on_record(record)
-    return SceneEstimate(replace(best.estimate, timings=timings, considered=considered), best.loaded)
+    return SceneEstimate(replace(best.estimate, timings=timings, scene_ranking=scene_ranking), best.loaded)
 
 
 def _inliers_by_scene(

@@ -94,17 +94,17 @@ class Status(StrEnum):
 
 
 class Reason(StrEnum):
-    """Why a result has its status: a closed list, part of the API. `HINTS` says what to do about each."""
+    """What decided a result's status. The list is part of the API; `HINTS` has advice for each."""
 
-    AGREES = "agrees"
+    VERIFIED = "verified"
     FEW_FEATURES = "few_features"
     NO_MATCHING_VIEW = "no_matching_view"
-    RENDER_DISAGREES = "render_disagrees"
+    RENDER_MISMATCH = "render_mismatch"
     FEW_INLIERS = "few_inliers"
-    LITTLE_SCENE_IN_VIEW = "little_scene_in_view"
+    LOW_COVERAGE = "low_coverage"
     FOCAL_UNCERTAIN = "focal_uncertain"
-    INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
-    PLACE_UNCERTAIN = "place_uncertain"
+    INTRINSICS_INCONSISTENT = "intrinsics_inconsistent"
+    POSITION_UNCERTAIN = "position_uncertain"
     OUTSIDE_PRIOR = "outside_prior"
     AMBIGUOUS = "ambiguous"
     MIRRORED = "mirrored"
@@ -112,26 +112,26 @@ class Reason(StrEnum):
 
 
 HINTS: dict[Reason, str] = {
-    Reason.AGREES: "",
+    Reason.VERIFIED: "",
     Reason.FEW_FEATURES: "The photo shows almost no texture: take it sharper, brighter or with more of the scene.",
     Reason.NO_MATCHING_VIEW: "Nothing in the photo was recognised: check that it shows this scene, or send a prior.",
-    Reason.RENDER_DISAGREES: (
+    Reason.RENDER_MISMATCH: (
         "The scene rendered at the best pose does not look like the photo: check the intrinsics, and whether the "
         "scene has changed since it was captured."
     ),
     Reason.FEW_INLIERS: (
         "Too few matches agree with the best pose: show more of the captured part, or send intrinsics or a prior."
     ),
-    Reason.LITTLE_SCENE_IN_VIEW: "The best pose sees little of the scene: show the captured part, or send a prior.",
+    Reason.LOW_COVERAGE: "The best pose sees little of the scene: show the captured part, or send a prior.",
     Reason.FOCAL_UNCERTAIN: (
-        "The photo fits the scene, but does not tell its focal length, on which the place depends: send intrinsics."
+        "The photo fits the scene, but does not determine its focal length, hence its position: send intrinsics."
     ),
-    Reason.INTRINSICS_CONTRADICTED: (
+    Reason.INTRINSICS_INCONSISTENT: (
         "The photo fits the scene far better with another focal length: check the intrinsics, or send them with "
         'trust "approximate".'
     ),
-    Reason.PLACE_UNCERTAIN: (
-        "The photo fits the scene, but hardly tells from where it was taken: show more of the scene, or nearer things."
+    Reason.POSITION_UNCERTAIN: (
+        "The photo fits the scene, but hardly determines the camera position: show more of the scene, or nearer things."
     ),
     Reason.OUTSIDE_PRIOR: (
         "The photo fits the scene, but at a place that the prior's Gaussian or box excludes: check it, or send a wider "
@@ -160,7 +160,7 @@ class Verdict:
     inliers: int
     """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
     photo of a sequence that its alignment alone makes clear."""
-    agreement: float
+    gradient_correlation: float
     """Normalized cross-correlation of the gradients of photo and render, -1..1, where they agree best: a quarter
     of the photo may be hidden."""
     coverage: float
@@ -202,7 +202,7 @@ class PoseEstimate:
     timings: tuple[StageTiming, ...]
     warnings: tuple[str, ...]
     records: tuple[IterationRecord, ...]
-    considered: tuple[tuple[str, int], ...] = ()
+    scene_ranking: tuple[tuple[str, int], ...] = ()
     """Where several scenes were searched: each one's id, and how many matches agreed, best first."""
 
     @property

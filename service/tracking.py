@@ -72,7 +72,7 @@ class TrackingConfig:
 
 
 TRACKING = TrackingConfig()
-INTRINSICS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
+INTRINSICS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_INCONSISTENT)
 """Doubts about the intrinsics, not about the pose: no reason to search elsewhere."""
 
 

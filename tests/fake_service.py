@@ -141,7 +141,7 @@ class FakeJob:
             self.attempt, self.records = self.attempt + 1, []
             self.changed.notify_all()
 
-    def finish(self, status: Status = Status.LOCALIZED, reason: Reason = Reason.AGREES) -> None:
+    def finish(self, status: Status = Status.LOCALIZED, reason: Reason = Reason.VERIFIED) -> None:
         verdict = Verdict(status, reason, 0.93, 212, 0.8, 0.9, np.eye(6))
         ending = PoseEstimate(
             pose=self.records[-1].pose,
@@ -204,7 +204,7 @@ class FakeJob:
             name=f"{index}.jpg",
             time_s=index,
             status=status,
-            reason=Reason.AGREES,
+            reason=Reason.VERIFIED,
             score=0.9,
             tracked=index > 0,
             world_from_camera=pose_out(self.records[index].pose).world_from_camera,

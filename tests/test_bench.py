@@ -123,7 +123,7 @@ class TestPhotos:
 
 
 def estimate(pose: Pose, status=Status.LOCALIZED) -> PoseEstimate:
-    verdict = Verdict(status, Reason.AGREES, 0.9, 100, 0.8, 1.0, None)
+    verdict = Verdict(status, Reason.VERIFIED, 0.9, 100, 0.8, 1.0, None)
     return PoseEstimate(pose, verdict, LENS, "given", "s", "0", "fake", "fake", "fake", 0, False, 0, (), (), ())
 
 

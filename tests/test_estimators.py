@@ -278,7 +278,7 @@ def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, t
         assert found.loaded is room
         assert found.estimate.verdict.status is Status.LOCALIZED
         assert_near(found.estimate.pose, unseen_pose())
-        assert len(found.estimate.considered) == 2
+        assert len(found.estimate.scene_ranking) == 2
         assert tuple(told) == found.estimate.records
     noise = np.random.default_rng(0).integers(0, 256, photo.rgb.shape).astype(np.uint8)
     nowhere = localize_in_scenes(replace(photo, rgb=noise), [other, room]).estimate

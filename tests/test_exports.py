@@ -26,7 +26,7 @@ WIDE = Intrinsics(640, 480, 500.0, 510.0, 321.0, 239.0, "OPENCV", (0.1, -0.02, 0
 
 
 def result(intrinsics: Intrinsics = WIDE, anchor: GeoAnchor | None = None) -> Result:
-    verdict = Verdict(Status.LOCALIZED, Reason.AGREES, 0.9, 100, 0.8, 1.0, np.eye(6))
+    verdict = Verdict(Status.LOCALIZED, Reason.VERIFIED, 0.9, 100, 0.8, 1.0, np.eye(6))
     estimate = PoseEstimate(
         POSE, verdict, intrinsics, "given", "room", "0" * 64, "e", "r", "m", 0, False, 0, (), (), ()
     )  # fmt: skip

@@ -385,7 +385,7 @@ def test_the_gate_accepts_the_truth_and_refuses_the_rest() -> None:
     query = photo_from(true_pose(), lens, gain=0.8, bias=0.1)
     verdict = verdict_on(query, true_pose())
     assert verdict.status is Status.LOCALIZED
-    assert verdict.reason is Reason.AGREES
+    assert verdict.reason is Reason.VERIFIED
     assert verdict.score >= 0.8
     assert verdict.coverage > 0.9
     for twist in ([0, 0, 0, 0.5, 0, 0], [0.15, 0, 0, 0, 0, 0], [0, 0, 1.0, 0, 0, 0], [0, 3.0, 0, 0, 0, 0]):

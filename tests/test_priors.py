@@ -94,7 +94,7 @@ def test_a_wrong_guess_costs_nothing_but_time(repeated: LoadedScene) -> None:
 def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(repeated: LoadedScene) -> None:
     strict = replace(SEARCH, verification=replace(SEARCH.verification, max_sigma_share=0.0))
     found = localize(photo_at(repeated, TRUTH), repeated, replace(FAST, config=strict))
-    assert found.verdict.reason is Reason.PLACE_UNCERTAIN
+    assert found.verdict.reason is Reason.POSITION_UNCERTAIN
     assert not stages(found) & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 
 

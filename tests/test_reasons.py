@@ -49,15 +49,15 @@ def grey(query: Query) -> Query:
 
 
 PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
-    Reason.AGREES: lambda room, _: judged(room, photo_at(room, TRUTH)),
+    Reason.VERIFIED: lambda room, _: judged(room, photo_at(room, TRUTH)),
     Reason.FEW_FEATURES: lambda room, _: localize(grey(photo_at(room, TRUTH)), room, FAST).verdict,
     Reason.NO_MATCHING_VIEW: lambda room, _: judged(room, photo_at(room, TRUTH), unseen_pose(4)),
-    Reason.RENDER_DISAGREES: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
+    Reason.RENDER_MISMATCH: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
     Reason.FEW_INLIERS: lambda room, _: judged(room, blurred(photo_at(room, TRUTH), 10.0)),
-    Reason.LITTLE_SCENE_IN_VIEW: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
+    Reason.LOW_COVERAGE: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
     Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room)), BEFORE_A_WALL),
-    Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
-    Reason.PLACE_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
+    Reason.INTRINSICS_INCONSISTENT: lambda room, _: judged(room, *with_a_wrong_lens(room)),
+    Reason.POSITION_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
     Reason.AMBIGUOUS: lambda _, rooms: localize(photo_at(rooms["repeated"], TRUTH), rooms["repeated"], FAST).verdict,
     Reason.MIRRORED: lambda _, rooms: (
@@ -101,5 +101,5 @@ def middle_of_a_wall(room: LoadedScene) -> Query:
 def test_every_reason_is_given_where_it_is_due(reason: Reason, rooms: Rooms) -> None:
     verdict = PROVOKED[reason](rooms["ordinary"], rooms)
     assert verdict.reason is reason, (verdict.score, dict(verdict.signals))
-    assert (verdict.status is Status.LOCALIZED) == (reason is Reason.AGREES)
-    assert bool(HINTS[reason]) == (reason is not Reason.AGREES)
+    assert (verdict.status is Status.LOCALIZED) == (reason is Reason.VERIFIED)
+    assert bool(HINTS[reason]) == (reason is not Reason.VERIFIED)

@@ -312,7 +312,7 @@ def test_without_the_photo_the_render_is_shown(fake: FakeService, viewer: Viewer
         image = next(w for w in browser.widgets.values() if w["type"] == "GuiImageMessage")
         shown = images.decode(bytes(image["_data"])).mean((0, 1))
         assert np.abs(shown - render_rgb(2, matched=False)).max() < 6
-        assert "agrees" in browser.text()
+        assert "verified" in browser.text()
         browser.wait(lambda: "between two, on average" in browser.text(), "the angles")
 
 
@@ -379,7 +379,7 @@ def test_a_view_that_was_set_from_here_is_rendered_at_once_and_its_echo_changes_
 def test_a_browser_without_a_gpu_gets_no_splats_but_pictures_while_it_moves(fake: FakeService, viewer: Viewer) -> None:
     fake.job("j", 3, finished=True)
     with _browser(viewer, "/jobs/j?gl=software") as browser:
-        browser.wait(lambda: "agrees" in browser.text() and _background(browser) == "exact", "the job")
+        browser.wait(lambda: "verified" in browser.text() and _background(browser) == "exact", "the job")
         assert browser.widget("splats")["value"] is False
         browser.wait(lambda: "300 Gaussians, drawn by the service" in browser.text(), "the scene's line")
         count = len(fake.renders)
@@ -553,7 +553,7 @@ def test_a_missing_image_is_reported_and_the_rest_is_shown(
         browser.wait(lambda: "no picture of this step: /render: HTTP 503" in browser.text(), "the message")
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "the numbers")
-        assert "agrees" in browser.text()
+        assert "verified" in browser.text()
 
 
 def _refused(*_: object, **__: object) -> np.ndarray:

@@ -64,9 +64,9 @@ OCCLUDERS = 2
 """Photos of each other scene that rectangles are cut from."""
 OTHER_DOUBTS = (
     Reason.FOCAL_UNCERTAIN,
-    Reason.INTRINSICS_CONTRADICTED,
-    Reason.LITTLE_SCENE_IN_VIEW,
-    Reason.PLACE_UNCERTAIN,
+    Reason.INTRINSICS_INCONSISTENT,
+    Reason.LOW_COVERAGE,
+    Reason.POSITION_UNCERTAIN,
     Reason.AMBIGUOUS,
     Reason.MIRRORED,
 )

@@ -42,7 +42,7 @@ from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import Query
 
 StageResult = Generator[IterationRecord, None, RefinedPose | None]
-CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.PLACE_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
+CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_INCONSISTENT)
 """Doubts about a pose at which photo and render agree: another search would find the same."""
 
 

@@ -155,20 +155,20 @@ def judge(
     doubt, covariance, sigma = _doubt_about_intrinsics(uncertainty, focal_sigma, config)
     little = signals["coverage"] < config.min_coverage
     if little:
-        doubt = Reason.LITTLE_SCENE_IN_VIEW
+        doubt = Reason.LOW_COVERAGE
     elif doubt is None and signals["sigma_share"] > config.max_sigma_share:
-        doubt = Reason.PLACE_UNCERTAIN
+        doubt = Reason.POSITION_UNCERTAIN
     if score < config.min_localized:
         reason = Reason.FEW_FEATURES if few_features else _reason_of_refusal(signals, doubtful, config)
-        if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_DISAGREES):
-            reason = Reason.LITTLE_SCENE_IN_VIEW  # of which the others are consequences
+        if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_MISMATCH):
+            reason = Reason.LOW_COVERAGE  # of which the others are consequences
     elif doubt:
         score, reason = config.doubtful_score, doubt
     else:
-        reason = Reason.AGREES
-    inliers, agreement = int(signals.get("inliers", 0)), signals["gradients"]
+        reason = Reason.VERIFIED
+    inliers, correlation = int(signals.get("inliers", 0)), signals["gradients"]
     status = _status(score, config)
-    return Verdict(status, reason, score, inliers, agreement, signals["coverage"], covariance, sigma, signals)
+    return Verdict(status, reason, score, inliers, correlation, signals["coverage"], covariance, sigma, signals)
 
 
 def _status(score: float, config: VerificationConfig) -> Status:
@@ -186,7 +186,7 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
     pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")] or [1.0])
     if max(matches, pixels) < config.unrecognised:
         return Reason.NO_MATCHING_VIEW
-    return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_DISAGREES
+    return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_MISMATCH
 
 
 def _doubt_about_intrinsics(
@@ -202,4 +202,4 @@ def _doubt_about_intrinsics(
         sigma = max(float(np.sqrt(uncertainty.covariance[6, 6])), off)
         return (Reason.FOCAL_UNCERTAIN if sigma > config.max_focal_sigma else None), covariance, sigma
     contradicted = off > config.focal_contradiction and off > 3 * uncertainty.focal_sigma
-    return (Reason.INTRINSICS_CONTRADICTED if contradicted else None), covariance, 0.0
+    return (Reason.INTRINSICS_INCONSISTENT if contradicted else None), covariance, 0.0
