@@ -79,7 +79,7 @@ def record(stage: str, index: int = 0) -> JobRecord:
 
 
 def result(status: Status = Status.LOCALIZED) -> JobResult:
-    verdict = Verdict(status, Reason.AGREES, 0.75, 100, 0.5, 0.25, np.eye(6) / 3, 0.01, {"inliers": 100.0})
+    verdict = Verdict(status, Reason.VERIFIED, 0.75, 100, 0.5, 0.25, np.eye(6) / 3, 0.01, {"inliers": 100.0})
     pose = Pose(np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]))
     estimate = PoseEstimate(
         pose=pose,
@@ -97,7 +97,7 @@ def result(status: Status = Status.LOCALIZED) -> JobResult:
         timings=(StageTiming("match", 0.1, 0.2),),
         warnings=("beware",),
         records=(IterationRecord("match", pose),),
-        considered=(("s", 5),),
+        scene_ranking=(("s", 5),),
     )
     return JobResult(estimate, StageTiming("decode", 0.3, 0.4), None, {"numpy": "2"})
 
@@ -162,7 +162,7 @@ def test_records_and_results_come_back_exactly(store):
     assert np.array_equal(found.estimate.verdict.covariance, np.eye(6) / 3)
     assert found.estimate.timings == wanted.estimate.timings
     assert (found.decode, found.versions, found.frames) == (wanted.decode, wanted.versions, None)
-    assert (found.estimate.considered, found.estimate.warnings) == ((("s", 5),), ("beware",))
+    assert (found.estimate.scene_ranking, found.estimate.warnings) == ((("s", 5),), ("beware",))
     assert store.result("b") is None
 
 

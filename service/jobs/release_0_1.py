@@ -18,6 +18,13 @@ from service.results import Candidates, IterationRecord, PoseEstimate, Reason, S
 from service.types import BoxPrior, GaussianPosePrior, GeoAnchor, Intrinsics, Pose, PriorRegion
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_RENAMED_REASONS = {
+    "agrees": Reason.VERIFIED,
+    "render_disagrees": Reason.RENDER_MISMATCH,
+    "little_scene_in_view": Reason.LOW_COVERAGE,
+    "intrinsics_contradicted": Reason.INTRINSICS_INCONSISTENT,
+    "place_uncertain": Reason.POSITION_UNCERTAIN,
+}
 
 
 def old_spec(text: str, estimator: str) -> JobSpec:
@@ -67,7 +74,7 @@ def old_result(text: str) -> JobResult:
     )
     verdict = Verdict(
         Status(result["status"]),
-        Reason(result["reason"]),
+        _reason(result["reason"]),
         result["score"],
         result["inliers"],
         result["agreement"],
@@ -92,7 +99,7 @@ def old_result(text: str) -> JobResult:
         timings=tuple(timings),
         warnings=tuple(result["warnings"]),
         records=(IterationRecord(timings[-1].stage, pose, alternatives=alternatives if others else None),),
-        considered=tuple((scene["id"], scene["matches"]) for scene in result["considered"]),
+        scene_ranking=tuple((scene["id"], scene["matches"]) for scene in result["considered"]),
     )
     anchor = _anchor(result["geopose"], pose) if result["geopose"] else None
     frames = result["frames"]
@@ -107,12 +114,16 @@ def _frame(frame: dict[str, Any]) -> SequenceFrame:
         name=frame["name"],
         time_s=frame["time_s"],
         status=Status(frame["status"]),
-        reason=Reason(frame["reason"]),
+        reason=_reason(frame["reason"]),
         score=frame["score"],
         tracked=frame["followed"],
         pose=_pose(frame),
         covariance=_covariance(frame["covariance"]),
     )
+
+
+def _reason(name: str) -> Reason:
+    return _RENAMED_REASONS.get(name) or Reason(name)
 
 
 def _pose(spelled: dict[str, Any]) -> Pose:

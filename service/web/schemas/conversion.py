@@ -148,7 +148,7 @@ def frame_out(frame: SequenceFrame) -> FrameOut:
 
 
 def record_camera(record: IterationRecord, photo: Intrinsics, *, of_matches: bool) -> Camera:
-    """Return the camera that a step is seen by: of the photo's size, or the one that its matches refer to."""
+    """Return a record's camera: its pose in the photo's size, or the camera that its matches refer to."""
     if of_matches and record.matches is not None:
         return record.matches.render_camera
     return Camera(photo.corrected(record.correction), record.pose)
