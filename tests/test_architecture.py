@@ -1,8 +1,9 @@
-"""The import layers of DESIGN, kept by reading every import of the source."""
+"""The floors of CONTRIBUTING, kept by reading every import of the source."""
 
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -16,32 +17,42 @@ import viewer
 ROOT = Path(__file__).parents[1]
 SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).rglob("*.py"))
 
-# Bottom to top: a part imports from the lines below its own, and from itself.
-LAYERS = [
-    {"types", "results", "errors", "plugins", "logs", "versions"},
-    {"interfaces", "geometry", "jit", "photos"},
-    {"scene_formats", "render", "matchers", "pose"},
-    {"estimators"},
-    {"localize"},
-    {"tracking", "multi_scene"},
-    {"scene_manager"},
-    {"jobs"},
-    {"web", "bench"},
-    {"cli"},
-    {"__main__"},
-]
-FOUNDATIONS = {("types", "errors"), ("results", "types"), ("plugins", "errors"), ("photos", "geometry")}
-"""Within a line: only these."""
-
-# Within a package, bottom to top: a folder imports from the lines below its own, and from itself.
+# Package -> its floors, bottom to top: a module imports from the floors below its own, and from itself.
 FLOORS = {
-    "pose": [
+    "service": [
+        {"types", "results", "errors", "plugins", "logs", "versions"},
+        {"interfaces", "geometry", "jit", "photos"},
+        {"scene_formats", "render", "matchers", "pose"},
+        {"estimators"},
+        {"localize"},
+        {"tracking", "multi_scene"},
+        {"scene_manager"},
+        {"jobs"},
+        {"web", "bench"},
+        {"cli"},
+        {"__main__"},
+    ],
+    "service/pose": [
         {"features"},
         {"absolute_pose"},
         {"matching"},
         {"refinement"},
         {"retrieval", "descent", "verification"},
     ],
+    "service/web": [
+        {"api_model", "api_keys", "settings", "metrics", "viewer_process"},
+        {"problems", "route_policy"},
+        {"schemas"},
+        {"middleware"},
+        {"routes", "openapi", "pages", "viewer_relay"},
+        {"app"},
+    ],
+}
+# Within a floor: only these.
+SAME_FLOOR = {
+    "service": {("types", "errors"), ("results", "types"), ("plugins", "errors"), ("photos", "geometry")},
+    "service/pose": set(),
+    "service/web": set(),
 }
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
@@ -107,15 +118,6 @@ def imported(path: Path) -> Iterator[str]:
             yield from names if node.module in ("service", "viewer") else [node.module or ""]
 
 
-def part_of(module: str) -> str:
-    """service.pose.verification.gate -> pose."""
-    return module.split(".")[1] if "." in module else ""
-
-
-def level(part: str) -> int:
-    return next(i for i, layer in enumerate(LAYERS) if part in layer)
-
-
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_imports_go_down_and_libraries_stay_wrapped(path):
     place = path.relative_to(ROOT)
@@ -131,24 +133,46 @@ def test_imports_go_down_and_libraries_stay_wrapped(path):
 
 
 def _may_import(place: Path, module: str) -> bool:
-    target = part_of(module)
-    if target == "__version__":
+    if module == "service.__version__":
         return True
     if place.parts[0] == "viewer":
-        return target in ("types", "results")
+        return module.split(".")[1] in ("types", "results")
     if len(place.parts) == 2 and place.stem == "__init__":
         return False  # `import service` stays light
-    source = place.parts[1].removesuffix(".py")
-    if source == target and source in FLOORS:
-        return _may_import_inside(FLOORS[source], place.parts[2], module.split(".")[2])
-    same_line = source == target or (source, target) in FOUNDATIONS
-    return same_line or level(target) < level(source)
+    return all(_floors_allow(package, place, Path(*module.split("."))) for package in FLOORS)
 
 
-def _may_import_inside(floors: list[set[str]], source: str, target: str) -> bool:
-    """Whether one folder of a package may import from another one; each must be on a floor."""
-    heights = {name: height for height, floor in enumerate(floors) for name in floor}
-    return source == target or heights[target] < heights[source]
+def _floors_allow(package: str, place: Path, target: Path) -> bool:
+    """Whether a package's floors allow an import; one that comes from outside, or leads there, is not their concern."""
+    inner = [path.relative_to(package).parts for path in (place, target) if path.is_relative_to(package)]
+    if len(inner) < 2 or not all(inner):
+        return True
+    source, part = (parts[0].removesuffix(".py") for parts in inner)
+    height = {name: number for number, floor in enumerate(FLOORS[package]) for name in floor}
+    return source == part or (source, part) in SAME_FLOOR[package] or height[part] < height[source]
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_each_module_of_a_package_is_on_one_floor(package):
+    modules = {p.stem for p in (ROOT / package).glob("*.py")} | {p.parent.name for p in (ROOT / package).glob("*/*.py")}
+    floors = FLOORS[package]
+    assert modules - {"__init__"} == set().union(*floors)
+    assert sum(map(len, floors)) == len(modules - {"__init__"})
+
+
+@pytest.mark.parametrize("package", FLOORS)
+def test_contributing_shows_the_same_floors(package):
+    """Its rows: | floor | `module` | what | modules of the same floor that it imports |."""
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    table = re.search(rf"^### Inside `{package}/`\n(.*?)^#", text, re.M | re.S)
+    assert table
+    floors: dict[int, set[str]] = {}
+    same = set()
+    for floor, name, imports in re.findall(r"^\| (\d+) \| `(\w+)` \|.*\| *([^|]*?) *\|$", table[1], re.M):
+        floors.setdefault(int(floor), set()).add(name)
+        same |= {(name, other) for other in re.findall(r"`(\w+)`", imports)}
+    assert [floors[number] for number in sorted(floors)] == FLOORS[package]
+    assert same == SAME_FLOOR[package]
 
 
 def test_jobs_know_scenes_through_the_engine_and_databases_through_the_store():
@@ -172,12 +196,8 @@ def test_the_rules_can_fail():
     assert not _may_import(Path("service/pose/features/query_images.py"), "service.pose.matching.correspondences")
     assert not _may_import(Path("service/pose/retrieval/index.py"), "service.pose.verification.gate")
     assert _may_import(Path("service/pose/retrieval/index.py"), "service.pose.features.rendered_views")
-
-
-def test_every_folder_with_floors_is_on_one():
-    for package, floors in FLOORS.items():
-        folders = {p.parent.name for p in (ROOT / "service" / package).glob("*/__init__.py")}
-        assert folders == set().union(*floors), package
+    assert not _may_import(Path("service/web/schemas/parsing.py"), "service.web.routes.jobs")
+    assert _may_import(Path("service/web/routes/jobs.py"), "service.web.schemas.parsing")
 
 
 def test_no_two_modules_have_one_name():
