@@ -24,7 +24,7 @@ from stand_ins import make_scene
 from service.geometry import look_at
 from service.jobs.release_0_1 import old_result
 from service.jobs.sqlite_store import SqliteJobStore
-from service.results import Reason
+from service.results import HINTS, Reason
 from service.types import GeoAnchor, Pose
 from service.web.api_keys import KeyRing
 from service.web.schemas.conversion import geopose_out, result_out
@@ -41,12 +41,23 @@ RENAMED = {
     "considered": "scene_ranking",
     "followed": "tracked",
 }
+REASONS = {
+    "agrees": "verified",
+    "render_disagrees": "render_mismatch",
+    "little_scene_in_view": "low_coverage",
+    "intrinsics_contradicted": "intrinsics_inconsistent",
+    "place_uncertain": "position_uncertain",
+}
 ENDED = [name for name, job_id in BY_NAME.items() if DOCUMENTS[job_id]["finished"]]
 
 
 def renamed(value: Any) -> Any:
     """Return what 0.1.0's API said in today's names."""
     if isinstance(value, dict):
+        if "reason" in value:
+            value = value | {"reason": REASONS.get(value["reason"], value["reason"])}
+        if "hint" in value and "reason" in value:
+            value = value | {"hint": HINTS[Reason(value["reason"])]}
         return {RENAMED.get(name, name): renamed(item) for name, item in value.items()}
     return [renamed(item) for item in value] if isinstance(value, list) else value
 
@@ -173,4 +184,5 @@ def test_every_reason_of_the_release_is_known():
         "intrinsics_contradicted place_uncertain outside_prior ambiguous mirrored budget_exhausted"
     )
     for reason in reasons.split():
-        assert isinstance(old_result(json.dumps(old | {"reason": reason})).estimate.verdict.reason, Reason)
+        verdict = old_result(json.dumps(old | {"reason": reason})).estimate.verdict
+        assert verdict.reason == REASONS.get(reason, reason)
