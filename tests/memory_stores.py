@@ -164,7 +164,7 @@ class MemoryJobStore:
             row = self._rows.get(job_id)
             return row and row.result
 
-    def stale_photos(self) -> list[str]:
+    def expire_photos(self) -> list[str]:
         with self._lock:
             now = time.time()
             dated = [row for row in self._rows.values() if row.job.ended and row.job.photo_until is not None]
@@ -173,7 +173,7 @@ class MemoryJobStore:
                 self._change(row, photo_until=None, keep_photo=False, photo_bytes=0)
             return [row.job.id for row in stale]
 
-    def forget(self, kept: Retention) -> list[str]:
+    def prune(self, kept: Retention) -> list[str]:
         with self._lock:
             gone, total = [], 0
             for place, row in enumerate([r for r in reversed(self._rows.values()) if r.job.ended], 1):

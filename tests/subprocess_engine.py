@@ -11,6 +11,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
+from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
@@ -236,3 +237,20 @@ def _portable(error: Exception) -> Exception:
         return pickle.loads(pickle.dumps(error))
     except Exception:
         return RuntimeError(f"{type(error).__name__}: {error}")
+
+
+def main() -> None:
+    """Serve scenes with this engine: python tests/subprocess_engine.py PORT SCENE..."""
+    import sys
+
+    import uvicorn
+
+    from service.web.app import create_app
+    from service.web.settings import Settings
+
+    served = Settings(port=int(sys.argv[1]), scenes=[Path(path) for path in sys.argv[2:]])
+    uvicorn.run(create_app(served, SubprocessEngine(served.engine)), port=served.port, ws="websockets-sansio")
+
+
+if __name__ == "__main__":
+    main()

@@ -298,7 +298,7 @@ def test_the_oldest_ended_jobs_are_forgotten(store, kept, left, monkeypatch):
         monkeypatch.undo()
     store.claim(store.accept(new_job("running")), math.inf)
     gone = {"running", "c", "b", "a"} - set(left)
-    assert set(store.forget(kept)) == gone
+    assert set(store.prune(kept)) == gone
     assert [job.id for job in store.page(JobFilter(), 9)] == left
 
 
@@ -307,8 +307,8 @@ def test_photos_are_stale_when_their_time_is_over(store):
         store.claim(store.accept(new_job(name, keep_photo=keep)), math.inf)
         store.finish(name, 1, NONE, Ending("cancelled"), until)
     store.accept(new_job("waiting"))
-    assert store.stale_photos() == ["old"]
-    assert store.stale_photos() == []
+    assert store.expire_photos() == ["old"]
+    assert store.expire_photos() == []
     store.probe()
 
 

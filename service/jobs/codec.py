@@ -77,7 +77,7 @@ def _shape(kind: Any, value: Any) -> tuple[int, ...]:
 
 
 def _member(members: tuple[Any, ...], value: Any) -> Any:
-    """Return the member of a union that a value was written from: told by its JSON type, and its fields."""
+    """Return the member of a union that fits a JSON value by its type and, of an object, its fields."""
     if value is None:
         return type(None)
     for member in members:

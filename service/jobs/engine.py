@@ -19,7 +19,7 @@ from service.types import Query, SceneInfo
 
 
 class EngineLost(Exception):
-    """The engine ended while it worked: its scenes are gone from memory, and the attempt is lost."""
+    """The engine's process ended during the attempt, with its scenes; the attempt is lost."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""An unfinished job in memory: its latest records, and who listens for them. The store has the rest."""
+"""An unfinished job in memory: its decoded photo, the records of its attempt, and listeners for both."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class LiveJob:
         self.photo = photo
         """Decoded; None after a restart, when it is on disk only."""
         self.shown: Query | None = photo and photo.query
-        """What people see as the job's photo: of a sequence, the last that was localized."""
+        """The photo that clients get: of a sequence, the last that was localized."""
         self.held = held
         """Scenes that stay in memory for this job; None after a restart."""
         self.cancelled = threading.Event()
@@ -59,7 +59,7 @@ class LiveJob:
         return self.shown.rgb.nbytes if self.shown else 0
 
     def beat(self) -> None:
-        """Take note that its thread is at work."""
+        """Record that its thread is alive."""
         self._heard = time.monotonic()
 
     def silent_s(self) -> float:

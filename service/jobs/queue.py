@@ -1,7 +1,7 @@
 """A bounded queue of jobs and a fixed number of threads that work it off, watched over.
 
-A thread can't be stopped from outside. One that doesn't come to its next record for too long is abandoned: its job is
-given up, another thread takes its place, and what it may still bring is not wanted any more.
+Python threads can't be stopped from outside. A thread whose job has no new record for `stuck_s` is abandoned: its job
+is ended, another thread replaces it, and the store refuses what it may still write.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class JobQueue:
             self._workers.discard(worker)
             self._stuck += 1
             self._add_worker()
-        _log.error("job %s told nothing for %.0f s: its worker is abandoned", job.id, self._stuck_s)
+        _log.error("job %s had no new record for %.0f s: its worker is abandoned", job.id, self._stuck_s)
         try:
             self._give_up(job)
         except Exception:

@@ -72,20 +72,9 @@ def old_result(text: str) -> JobResult:
         np.array([other["pose"]["world_from_camera"]["matrix"] for other in others], np.float64).reshape(-1, 4, 4),
         np.array([other["probability"] for other in others], np.float64),
     )
-    verdict = Verdict(
-        Status(result["status"]),
-        _reason(result["reason"]),
-        result["score"],
-        result["inliers"],
-        result["agreement"],
-        result["coverage"],
-        _covariance(result["covariance"]),
-        (result["focal_sigma_px"] or 0.0) / intrinsics.fx,
-        result["signals"],
-    )
     estimate = PoseEstimate(
         pose=pose,
-        verdict=verdict,
+        verdict=_verdict(result, intrinsics),
         intrinsics=intrinsics,
         intrinsics_source=result["intrinsics_source"],
         scene_id=result["scene"]["id"],
@@ -105,6 +94,20 @@ def old_result(text: str) -> JobResult:
     frames = result["frames"]
     return JobResult(
         estimate, decode, anchor, result["versions"], None if frames is None else tuple(map(_frame, frames))
+    )
+
+
+def _verdict(result: dict[str, Any], intrinsics: Intrinsics) -> Verdict:
+    return Verdict(
+        Status(result["status"]),
+        _reason(result["reason"]),
+        result["score"],
+        result["inliers"],
+        result["agreement"],
+        result["coverage"],
+        _covariance(result["covariance"]),
+        (result["focal_sigma_px"] or 0.0) / intrinsics.fx,
+        result["signals"],
     )
 
 

@@ -1,10 +1,10 @@
-"""Jobs: their life from acceptance until they are forgotten. Knows engines and stores, not HTTP.
+"""All jobs of a service, from acceptance until they are deleted. Uses an engine and stores; knows no HTTP.
 
     accepted (photo and row on disk) -> queued -> running -> succeeded | failed | cancelled | interrupted
 
-The store is the truth; what runs is in memory besides, so that listeners hear of each record at once. An attempt's
-records go to the store in batches, the last ones together with its end. A worker renews the leases of its attempts;
-one whose lease ends is made again, and its listeners see another attempt.
+The store has the authoritative state. Unfinished jobs are in memory, too, so that listeners get each record at once;
+an attempt's records are stored in batches, the last batch together with its end. The leases of running attempts are
+renewed here; an attempt whose lease has ended is made again, and listeners see the new attempt.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from service.photos.images import encode_image
 
 _log = logging.getLogger(__name__)
 
-_HOUSEKEEPING_S = 2.0
+_MAINTENANCE_S = 2.0
 _RENEWALS = 3
 """Of a lease before it ends."""
 _STUCK_LIMIT = 2
-"""Abandoned threads keep their memory; so many, and it is time for a new process."""
+"""Abandoned threads keep their memory: from this number on the process should be restarted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +84,22 @@ class Jobs:
             stuck_s=config.stuck_s,
         )
         self._renew_at = 0.0
-        self._housekeeper = threading.Thread(target=self._keep_house, name="housekeeper", daemon=True)
+        self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
     def start(self) -> None:
-        """Take up what an ended process left behind: nobody but this service has the store, so all leases are over."""
+        """Queue the unfinished jobs of an earlier process.
+
+        The data folder is locked for this process, so no other worker can be alive: all leases are over.
+        """
         self._reclaim(math.inf)
         for job in self._store.queued():
             if job.id not in self._live:
-                self._take_up(job)
+                self._enqueue_when_ready(job)
         for orphan in self._photos.ids() - self._store.ids():
             self._photos.delete(orphan)
         for job_id in self._photos.unsettled() - self._live.keys():
             self._photos.settle(job_id, None)
-        self._housekeeper.start()
+        self._maintenance.start()
 
     # ------------------------------------------------------------------ from outside
 
@@ -115,7 +118,7 @@ class Jobs:
         except BaseException:
             self._engine.release(held.token)
             raise
-        if job.id != new.id:  # the same key came twice at once
+        if job.id != new.id:  # two requests with the same idempotency key at the same time
             self._engine.release(held.token)
             return job
         live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
@@ -196,11 +199,11 @@ class Jobs:
     def stuck_workers(self) -> int:
         return self._queue.stuck()
 
-    def ailments(self) -> list[str]:
-        """Say what keeps jobs from being done; a supervisor should restart the process."""
+    def problems(self) -> list[str]:
+        """Return what keeps jobs from running, as sentences; a supervisor should restart the process."""
         stuck, storage_error = self._queue.stuck(), self._worker.storage_error
-        told = [f"{stuck} workers are stuck"] if stuck >= _STUCK_LIMIT else []
-        return [*told, *([storage_error] if storage_error else [])]
+        found = [f"{stuck} workers are stuck"] if stuck >= _STUCK_LIMIT else []
+        return [*found, *([storage_error] if storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended."""
@@ -211,7 +214,7 @@ class Jobs:
         self._stop(live)
         if self._store.end_queued(job, Ending("cancelled"), self._worker.photo_until()):
             self._queue.withdraw(live)
-            self._worker.retire(live)
+            self._worker.clean_up(live)
 
     def close(self) -> None:
         """Let what runs finish within the grace period; the rest waits on disk for the next start."""
@@ -222,7 +225,7 @@ class Jobs:
         self._queue.close(1.0)
         for live in tuple(self._live.values()):
             live.end()
-        self._housekeeper.join(_HOUSEKEEPING_S + 1)
+        self._maintenance.join(_MAINTENANCE_S + 1)
         self._store.close()
 
     def _stop(self, live: LiveJob) -> None:
@@ -236,17 +239,17 @@ class Jobs:
             return job
         return replace(job, records=len(live.records), stage=live.stage)
 
-    # ------------------------------------------------------------------ the housekeeper's
+    # ------------------------------------------------------------------ maintenance
 
-    def _keep_house(self) -> None:
-        """Renew leases, make lost attempts again, delete what is over its time."""
+    def _maintain(self) -> None:
+        """Until the service ends: renew leases, repeat lost attempts, delete what exceeds its retention."""
         kept = Retention(self._config.keep_jobs, self._config.keep_days * 86_400, self._config.keep_bytes)
         closing = self._worker.closing
-        while not closing.wait(min(_HOUSEKEEPING_S, self._config.lease_s / _RENEWALS)):
+        while not closing.wait(min(_MAINTENANCE_S, self._config.lease_s / _RENEWALS)):
             try:
-                self._renew()
+                self._renew()  # before `_reclaim`, which must not take attempts that are alive
                 self._reclaim(time.time())
-                for job_id in [*self._store.stale_photos(), *self._store.forget(kept)]:
+                for job_id in [*self._store.expire_photos(), *self._store.prune(kept)]:
                     self._photos.delete(job_id)
                 if self._worker.storage_error:
                     self._store.probe()
@@ -255,7 +258,7 @@ class Jobs:
                 self._worker.note_storage(error)
 
     def _renew(self) -> None:
-        """Keep the attempts of this process; the queue gives up those that are stuck."""
+        """Renew the leases of this process; attempts that are stuck are ended by the queue, not by their lease."""
         if time.monotonic() < self._renew_at:
             return
         if running := tuple(self._worker.running):
@@ -268,12 +271,12 @@ class Jobs:
         for job in self._store.reclaim(before, most, failure):
             _log.warning("job %s: attempt %d was lost; it is %s", job.id, job.attempt, job.state)
             if not job.ended:
-                self._take_up(job)
+                self._enqueue_when_ready(job)
             elif live := self._live.get(job.id):
-                self._worker.retire(live)
+                self._worker.clean_up(live)
 
-    def _take_up(self, job: StoredJob) -> None:
-        """Queue a stored job as soon as its scene can be used; those who listen to it already go on listening."""
+    def _enqueue_when_ready(self, job: StoredJob) -> None:
+        """Queue a stored job as soon as its scene is loaded or has failed to load; keep its listeners."""
         live = self._live.setdefault(job.id, LiveJob(job.id, job.scene))
         self._engine.when_settled(job.scene, partial(self._queue.submit, live, reserved=False))
 

@@ -286,9 +286,9 @@ class SqliteJobStore:
             row = self._reader.execute("SELECT result FROM jobs WHERE id = ?", (job_id,)).fetchone()
         return decode(JobResult, row[0]) if row and row[0] else None
 
-    # ------------------------------------------------------------------ forgetting
+    # ------------------------------------------------------------------ retention
 
-    def stale_photos(self) -> list[str]:
+    def expire_photos(self) -> list[str]:
         with self._transaction() as writer:
             rows = writer.execute(
                 "UPDATE jobs SET photo_until = NULL, keep_photo = 0, bytes = bytes - photo_bytes, photo_bytes = 0 "
@@ -297,7 +297,7 @@ class SqliteJobStore:
             ).fetchall()
         return [job_id for (job_id,) in rows]
 
-    def forget(self, kept: Retention) -> list[str]:
+    def prune(self, kept: Retention) -> list[str]:
         with self._transaction() as writer:
             ended = "SELECT id, finished, row_number() OVER newest AS place, sum(bytes) OVER newest AS total "
             ended += f"FROM jobs WHERE state IN ({_ENDED_SQL}) WINDOW newest AS (ORDER BY number DESC)"

@@ -1,8 +1,8 @@
 """Where jobs are kept, as a protocol; `sqlite_store` is the implementation of the service.
 
-A worker owns an attempt from its claim until its lease ends. While it works it renews the lease; whose lease has ended
-loses the attempt to the next `reclaim`, and whatever it still brings is refused. So a job ends once, however many
-workers, processes or machines share a store.
+A worker owns an attempt from its claim until its lease ends, and renews the lease while it works. `reclaim` takes away
+attempts whose lease has ended; records and results of an attempt that was lost are refused. So a job ends once, however
+many workers, processes or machines share a store.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from service.jobs.model import Batch, Ending, JobFilter, JobRecord, JobResult, J
 class JobStore(Protocol):
     """Jobs with their records and results. Safe to call from several threads.
 
-    A method that changes something has made it last when it returns; it raises StorageFailed if it can't.
+    A change is durable when its method returns; each raises StorageFailed if it can't be.
     """
 
     def accept(self, job: NewJob) -> StoredJob:
@@ -47,8 +47,8 @@ class JobStore(Protocol):
     def reclaim(self, before: float, most_lost: int, failure: Failure) -> list[StoredJob]:
         """Take running attempts away whose lease ended before that time; return their jobs.
 
-        A job waits again; but it is cancelled if somebody wanted that, and interrupted with `failure` when so many of
-        its attempts were lost: it may be what its workers die of.
+        The job is queued again; or it is cancelled if that was requested, or interrupted with `failure` if `most_lost`
+        of its attempts were lost: it may be what crashes its workers.
         """
         ...
 
@@ -96,11 +96,11 @@ class JobStore(Protocol):
         """Return what a job found; None if it has no result."""
         ...
 
-    def stale_photos(self) -> list[str]:
-        """Return the ended jobs whose photo is due for deletion, and take note that it is gone."""
+    def expire_photos(self) -> list[str]:
+        """Return the ended jobs whose photo is to be deleted now, and record that it is gone."""
         ...
 
-    def forget(self, kept: Retention) -> list[str]:
+    def prune(self, kept: Retention) -> list[str]:
         """Delete the oldest ended jobs beyond what shall be kept; return their ids."""
         ...
 

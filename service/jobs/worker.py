@@ -1,4 +1,4 @@
-"""A job's attempt, on a worker's thread: claim it, localize, store the records in batches and the end once."""
+"""One attempt of a job on a worker's thread: claim it, localize, store its records in batches and its end once."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _RETRY_S = 0.5
 
 
 class _AttemptLost(Exception):
-    """Another worker has the job, or it ended: what this attempt finds is not wanted any more."""
+    """The attempt's lease has ended, or the job has: its records and its result would be refused."""
 
 
 class Worker:
@@ -46,9 +46,9 @@ class Worker:
         self.running: set[tuple[str, int]] = set()
         """The attempts (job, number) whose leases are to be renewed."""
         self.closing = threading.Event()
-        """The service ends: what can't be finished waits for the next start."""
+        """Set while the service ends: unfinished jobs are queued again for the next start."""
         self.storage_error = ""
-        """Why nothing can be written to disk; empty while it can."""
+        """Why the stores can't be written; empty while they can."""
 
     # ------------------------------------------------------------------ an attempt
 
@@ -65,7 +65,7 @@ class Worker:
         if self._store.finish(live.id, live.attempt, nothing, end, self.photo_until()):
             live.cancelled.set()
             self._engine.cancel(live.task_id)
-            self.retire(live)
+            self.clean_up(live)
 
     def _run(self, live: LiveJob) -> None:
         job = self._store.get(live.id)
@@ -104,7 +104,7 @@ class Worker:
         if self._persisted(live, lambda: self._store.finish(job.id, attempt, batch, end, until)):
             status = end.result.estimate.verdict.status if end.result else ""
             _log.info("job %s: %s %s", job.id, end.state, status)
-            self.retire(live)
+            self.clean_up(live)
 
     def _attempt(self, live: LiveJob, job: StoredJob, stored: _Stored) -> Ending | None:
         """Localize; None if it was stopped because the service ends."""
@@ -171,8 +171,8 @@ class Worker:
 
     # ------------------------------------------------------------------ its end
 
-    def retire(self, live: LiveJob) -> None:
-        """Let go of an ended job's memory, and of its photo as it was sent."""
+    def clean_up(self, live: LiveJob) -> None:
+        """Free an ended job's memory and scenes, and replace its upload by the image that people are shown."""
         job = self._store.get(live.id)
         took_s = job.finished - job.started if job.finished and job.started else None
         self._observer.ended(job.estimator, job.state, job.status, took_s)
@@ -184,17 +184,17 @@ class Worker:
         live.end()
 
     def photo_until(self) -> float:
-        """Return until when the photo of a job that ends now can be looked at."""
+        """Return when the photo of a job that ends now is deleted."""
         return time.time() + self._config.photo_grace_s
 
     def note_storage(self, error: StorageFailed) -> None:
-        """Take note of a disk that is full or broken."""
+        """Remember that the stores can't be written, and log it once."""
         if not self.storage_error:
             _log.error("%s", error)
         self.storage_error = error.message
 
     def _persisted(self, live: LiveJob, write: Callable[[], _T]) -> _T | None:
-        """Write to the store, again and again while the disk is full. None if the service ends before that."""
+        """Write to the store; retry while the disk is full. Return None if the service ends first."""
         while True:
             try:
                 result = write()
@@ -210,7 +210,7 @@ class Worker:
 
 @dataclass(slots=True)
 class _Stored:
-    """How many records of an attempt are in the store, and since when."""
+    """How many records of an attempt are in the store, and when the last batch was written."""
 
     attempt: int
     count: int = 0

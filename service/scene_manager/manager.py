@@ -4,7 +4,7 @@
                    `-----------`-> failed
 
 A scene that was dropped for want of memory, or isn't in the preload list, is loaded when it is asked for; one that
-somebody unloaded stays away until somebody loads it.
+was unloaded by request stays unloaded until a request loads it.
 """
 
 from __future__ import annotations
@@ -269,7 +269,7 @@ class Scenes:
                     return
                 unexpected = not isinstance(error, SplatfixError)
                 _log.error("scene %s can't be used: %s", entry.id, error, exc_info=unexpected)
-                if isinstance(error, SplatfixError) and entry.path:  # the operator's folders are nobody's business
+                if isinstance(error, SplatfixError) and entry.path:  # clients must not learn the operator's folders
                     error.where = error.where.replace(str(entry.path), entry.id)
                 entry.error, entry.state = error, "failed"
             self._settle(entry)
@@ -290,7 +290,7 @@ class Scenes:
                 self.unload(entry)
 
     def _make_room(self, entry: Entry, needed: int) -> None:
-        """Drop the scenes that were not asked for longest. Raises NoRoom."""
+        """Drop the least recently used scenes until another one fits. Raises NoRoom."""
         if self._memory_bytes is None:
             return
         with self._lock:

@@ -1,6 +1,6 @@
 """The catalogue of scenes: which there are, where their files lie, and what was added to them over HTTP.
 
-An upload is streamed to disk, checked, and only then given a name that others see. An archive is a ZIP of a scene
+An upload is streamed to disk, checked, and only then becomes visible under its name. An archive is a ZIP of a scene
 folder (or of what is in it). Only files that a scene is read from are taken out of it, under their own names; what the
 archive says of paths, links and sizes is not trusted.
 """
@@ -53,9 +53,9 @@ class SceneDraft(Protocol):
         ...
 
     def commit(self, file_name: str) -> StoredScene:
-        """Check what was written and add it to the store under the draft's id. `file_name` tells the format.
+        """Check what was written, and add it to the store under the draft's id.
 
-        Raises InvalidRequest, SceneError, StorageFailed.
+        The suffix of `file_name` decides the format. Raises InvalidRequest, SceneError, StorageFailed.
         """
         ...
 
@@ -189,7 +189,9 @@ class FolderDraft:
         try:
             load_scene(self._folder)
         except SceneError as error:
-            error.where = error.where.replace(str(self._folder), "archive")  # our folders are nobody's business
+            error.where = error.where.replace(
+                str(self._folder), "archive"
+            )  # clients must not learn the service's folders
             raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
 

@@ -44,11 +44,11 @@ async def live() -> Liveness:
 @route_policy(role=None)
 def ready(parts: PartsOf, response: Response) -> Readiness:
     """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work."""
-    scenes, ill = parts.engine.readiness(), parts.jobs.ailments()
+    scenes, problems = parts.engine.readiness(), parts.jobs.problems()
     readiness = Readiness(
-        ready=scenes.ready and not ill,
+        ready=scenes.ready and not problems,
         pending=list(scenes.pending),
-        failed=[*scenes.failed, *ill],
+        failed=[*scenes.failed, *problems],
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
