@@ -13,9 +13,9 @@ from PIL import Image
 
 from service.bench import localize as bench
 from service.bench import render as render_bench
-from service.bench.bench_photos import find_photos, sent
+from service.bench.bench_photos import find_photos, prepare_photo
 from service.bench.miss_images import save_miss_images
-from service.bench.modifications import MODIFICATIONS, Shot, modified
+from service.bench.modifications import MODIFICATIONS, Photo, modify
 from service.bench.pose_metrics import Units, nees, units_of
 from service.bench.start_poses import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
@@ -378,7 +378,7 @@ class TestStarts:
         assert np.all(np.abs(angles) <= 15)
 
 
-def dotted_shot() -> tuple[Shot, np.ndarray]:
+def dotted_photo() -> tuple[Photo, np.ndarray]:
     """A dark photo with a bright dot where each of some points is seen."""
     camera = Intrinsics(160, 120, 130.0, 140.0, 85.0, 57.0)
     pose = poses()[2]
@@ -387,7 +387,7 @@ def dotted_shot() -> tuple[Shot, np.ndarray]:
     rgb = np.zeros((120, 160, 3), np.float32)
     for x, y in project(points_in_camera, camera):
         rgb += np.exp(-((columns + 0.5 - x) ** 2 + (rows + 0.5 - y) ** 2) / 8)[..., None].astype(np.float32)
-    return Shot(rgb, camera, pose), transformed(pose.world_from_camera, points_in_camera)
+    return Photo(rgb, camera, pose), transformed(pose.world_from_camera, points_in_camera)
 
 
 class TestModifications:
@@ -407,13 +407,13 @@ class TestModifications:
     )
     def test_truth_goes_with_the_pixels(self, specs):
         """The dots must lie where the new camera projects the points from the new pose."""
-        shot, points_in_world = dotted_shot()
-        shot = modified(shot, specs, np.random.default_rng(0))
-        assert shot.rgb.shape == (shot.intrinsics.height, shot.intrinsics.width, 3)
-        expected = project(transformed(shot.pose.camera_from_world, points_in_world), shot.intrinsics)
+        original, points_in_world = dotted_photo()
+        photo = modify(original, specs, np.random.default_rng(0))
+        assert photo.rgb.shape == (photo.intrinsics.height, photo.intrinsics.width, 3)
+        expected = project(transformed(photo.pose.camera_from_world, points_in_world), photo.intrinsics)
         for x, y in expected:
             left, top = int(x) - 6, int(y) - 6
-            window = shot.rgb[top : top + 13, left : left + 13, 1].astype(float)
+            window = photo.rgb[top : top + 13, left : left + 13, 1].astype(float)
             window = np.where(window > 0.1, window, 0)
             rows, columns = np.mgrid[top : top + 13, left : left + 13]
             found = [(window * (c + 0.5)).sum() / window.sum() for c in (columns, rows)]
@@ -421,68 +421,68 @@ class TestModifications:
 
     def test_quarter_turns_lose_nothing(self):
         rgb = np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32)
-        shot = Shot(rgb, Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), poses()[0])
+        original = Photo(rgb, Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), poses()[0])
         for spec, turned in (
             ("roll=90", np.rot90(rgb, 1)),
             ("roll=-90", np.rot90(rgb, -1)),
             ("roll=180", rgb[::-1, ::-1]),
         ):
-            found = modified(shot, [spec], np.random.default_rng(0)).rgb
+            found = modify(original, [spec], np.random.default_rng(0)).rgb
             assert np.allclose(found, turned, atol=1e-5), spec
 
     def test_values(self):
         rgb = np.full((40, 60, 3), 0.4, np.float32)
-        shot = Shot(rgb, Intrinsics(60, 40, 50.0, 50.0, 30.0, 20.0), poses()[0])
+        original = Photo(rgb, Intrinsics(60, 40, 50.0, 50.0, 30.0, 20.0), poses()[0])
         rng = np.random.default_rng(0)
-        assert np.allclose(modified(shot, ["gain=1.5"], rng).rgb, 0.6)
-        assert np.allclose(modified(shot, ["gain=4"], rng).rgb, 1.0)
-        assert np.allclose(modified(shot, ["gamma=2"], rng).rgb, 0.16)
-        assert np.allclose(modified(shot, ["blur=3"], rng).rgb, 0.4, atol=1e-6)
-        assert modified(shot, ["noise=0.1"], rng).rgb.std() == pytest.approx(0.1, rel=0.05)
-        warm = modified(shot, ["white_balance=1.25"], rng).rgb
+        assert np.allclose(modify(original, ["gain=1.5"], rng).rgb, 0.6)
+        assert np.allclose(modify(original, ["gain=4"], rng).rgb, 1.0)
+        assert np.allclose(modify(original, ["gamma=2"], rng).rgb, 0.16)
+        assert np.allclose(modify(original, ["blur=3"], rng).rgb, 0.4, atol=1e-6)
+        assert modify(original, ["noise=0.1"], rng).rgb.std() == pytest.approx(0.1, rel=0.05)
+        warm = modify(original, ["white_balance=1.25"], rng).rgb
         assert np.allclose(warm[0, 0], [0.5, 0.4, 0.32])
-        red = replace(shot, rgb=rgb * np.array([1.0, 0.0, 0.0], np.float32))
-        assert np.allclose(modified(red, ["saturation=0"], rng).rgb, 0.299 * 0.4, atol=1e-6)
-        assert np.allclose(modified(red, ["saturation=0.5"], rng).rgb[0, 0], [0.2598, 0.0598, 0.0598], atol=1e-6)
-        assert np.allclose(modified(shot, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
+        red = replace(original, rgb=rgb * np.array([1.0, 0.0, 0.0], np.float32))
+        assert np.allclose(modify(red, ["saturation=0"], rng).rgb, 0.299 * 0.4, atol=1e-6)
+        assert np.allclose(modify(red, ["saturation=0.5"], rng).rgb[0, 0], [0.2598, 0.0598, 0.0598], atol=1e-6)
+        assert np.allclose(modify(original, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
 
     def test_blur_has_its_width(self):
         """A bright point becomes a Gaussian of the given sigma, in pixels of a photo 800 wide."""
         rgb = np.zeros((81, 401, 3), np.float32)
         rgb[40, 200] = 1
-        shot = Shot(rgb, Intrinsics(401, 81, 300.0, 300.0, 200.5, 40.5), poses()[0])
-        row = modified(shot, ["blur=4"], np.random.default_rng(0)).rgb[:, :, 0].sum(0)
+        original = Photo(rgb, Intrinsics(401, 81, 300.0, 300.0, 200.5, 40.5), poses()[0])
+        row = modify(original, ["blur=4"], np.random.default_rng(0)).rgb[:, :, 0].sum(0)
         columns = np.arange(401) - 200
         assert row.sum() == pytest.approx(1, abs=1e-5)
         assert np.sqrt((row * columns**2).sum()) == pytest.approx(4 * 401 / 800, rel=0.03)
 
     @pytest.mark.parametrize("name", MODIFICATIONS)
     def test_all_take_both_ends_of_their_range(self, name):
-        shot, _ = dotted_shot()
+        original, _ = dotted_photo()
         for value in MODIFICATIONS[name][:2]:
-            shot = replace(shot, occluders=(shot.rgb,))
-            found = modified(shot, [f"{name}={value}"], np.random.default_rng(0))
+            original = replace(original, occluders=(original.rgb,))
+            found = modify(original, [f"{name}={value}"], np.random.default_rng(0))
             assert found.rgb.dtype == np.float32
             assert np.isfinite(found.rgb).all()
             assert found.rgb.shape[:2] == (found.intrinsics.height, found.intrinsics.width)
 
     def test_the_file_is_without_loss(self, tmp_path):
         (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
-        cropped = sent(one, ("crop=1",), (0.0, 0.0, 0.0), 0)
-        assert cropped.truth.intrinsics == cropped.told == one.camera.intrinsics
+        cropped = prepare_photo(one, ("crop=1",), (0.0, 0.0, 0.0), 0)
+        assert cropped.truth.intrinsics == cropped.intrinsics == one.camera.intrinsics
         assert np.array_equal(read_query(cropped.data).rgb, read_query(one.path.read_bytes()).rgb)
-        assert sent(one, (), (0.0, 0.0, 0.0), 0).data == one.path.read_bytes()
+        assert prepare_photo(one, (), (0.0, 0.0, 0.0), 0).data == one.path.read_bytes()
 
     def test_padding_is_transparent(self, tmp_path):
         """So it has the scene's background in the query, and none of it is taken for the photo."""
         (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
-        turned = sent(one, ("roll=30",), (0.0, 0.0, 0.0), 0)
+        turned = prepare_photo(one, ("roll=30",), (0.0, 0.0, 0.0), 0)
         size = (turned.truth.intrinsics.width, turned.truth.intrinsics.height)
         assert Image.open(io.BytesIO(turned.data)).size == size
         alpha = np.asarray(Image.open(io.BytesIO(turned.data)).convert("RGBA"))[..., 3]
         assert alpha[0, 0] == 0
         assert (alpha > 0).sum() == pytest.approx(64 * 48 * 60.5**2 / 60 / 61, rel=0.1)  # less the rim
-        shown = read_query(turned.data, intrinsics=turned.told, background_rgb=(0.0, 1.0, 0.0)).rgb
+        shown = read_query(turned.data, intrinsics=turned.intrinsics, background_rgb=(0.0, 1.0, 0.0)).rgb
         assert shown[0, 0].tolist() == [0, 255, 0]
 
     @pytest.mark.parametrize("share", [0.05, 0.2, 0.35, 0.9])
@@ -490,10 +490,10 @@ class TestModifications:
         rng = np.random.default_rng(1)
         rgb = np.full((48, 64, 3), 2.0, np.float32)  # no photo has that
         other = rng.uniform(0, 1, (30, 40, 3)).astype(np.float32)
-        shot = Shot(rgb, LENS, poses()[0], occluders=(other,))
+        original = Photo(rgb, LENS, poses()[0], occluders=(other,))
         places = []
         for seed in range(3):
-            found = modified(shot, [f"occlusion={share}"], np.random.default_rng(seed)).rgb
+            found = modify(original, [f"occlusion={share}"], np.random.default_rng(seed)).rgb
             covered = np.all(found != 2.0, axis=2)
             assert covered.sum() == round(share * 48 * 64)
             known = {tuple(p) for p in other.reshape(-1, 3).tolist()}
@@ -503,9 +503,9 @@ class TestModifications:
 
     def test_a_false_focal_length_is_told_and_the_truth_kept(self, tmp_path):
         (one,) = find_photos(folder_of(tmp_path / "s", "unsplit"))
-        false = sent(one, ("focal=1.1",), (0.0, 0.0, 0.0), 0)
+        false = prepare_photo(one, ("focal=1.1",), (0.0, 0.0, 0.0), 0)
         assert false.truth == one.camera
-        assert (false.told.fx, false.told.fy) == pytest.approx((66.0, 67.1))
+        assert (false.intrinsics.fx, false.intrinsics.fy) == pytest.approx((66.0, 67.1))
         assert np.array_equal(read_query(false.data).rgb, read_query(one.path.read_bytes()).rgb)
 
 

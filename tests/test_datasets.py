@@ -11,7 +11,7 @@ from PIL import Image
 from test_bench import OPENGL, poses, scene_ply
 
 from service.bench import localize as bench
-from service.bench.datasets import LAYOUTS, detected, read_data_set
+from service.bench.datasets import LAYOUTS, detect_layout, read_data_set
 from service.errors import CorruptScene, SceneNotFound, UnknownName
 from service.geometry import moved, quat_from_rotation
 from service.photos.images import photo_size, read_query
@@ -123,7 +123,7 @@ def test_photos_truth_and_split(layout: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("layout", WRITERS)
 def test_the_layout_is_seen(layout: str, tmp_path: Path) -> None:
     """nerfstudio's is our scene folder's as well."""
-    assert detected(WRITERS[layout](tmp_path)) == ("scene" if layout == "nerfstudio" else layout)
+    assert detect_layout(WRITERS[layout](tmp_path)) == ("scene" if layout == "nerfstudio" else layout)
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -134,7 +134,7 @@ def test_query_poses_never_reach_the_scene(layout: str, tmp_path: Path) -> None:
     for wrong in (False, True):
         (tmp_path / str(wrong)).mkdir()
         folder = WRITERS[layout](tmp_path / str(wrong), wrong)
-        seen.append(bench.subject(tmp_path / "scene.ply", folder, layout=layout))
+        seen.append(bench.load_bench_scene(tmp_path / "scene.ply", folder, layout=layout))
     right, spoilt = seen
     assert right.loaded.scene.info.sha256 == spoilt.loaded.scene.info.sha256
     assert right.units.units_per_scene_unit == spoilt.units.units_per_scene_unit
@@ -149,10 +149,10 @@ def test_query_poses_never_reach_the_scene(layout: str, tmp_path: Path) -> None:
 def test_background(background: str, expected: tuple, tmp_path: Path) -> None:
     folder = nerf_synthetic(tmp_path)
     scene_ply(folder / "scene.ply")
-    one = bench.subject(folder, background=background)
+    one = bench.load_bench_scene(folder, background=background)
     assert one.background_rgb == expected
-    (trial,) = bench.trials_of(one, "none", 1, 0)
-    query = read_query(trial.data, intrinsics=trial.told, background_rgb=one.background_rgb)
+    (trial,) = bench.make_trials(one, "none", 1, 0)
+    query = read_query(trial.data, intrinsics=trial.intrinsics, background_rgb=one.background_rgb)
     assert np.all(query.rgb == np.array(expected) * 255)  # the pictures are transparent all over
     assert query.valid_mask is None  # that there is nothing is known
 
@@ -183,12 +183,12 @@ def test_truth_moves_with_the_scene(tmp_path: Path) -> None:
     scene_ply(tmp_path / "scene" / "scene.ply")
     matrix = np.diag([2.0, 2.0, 2.0, 1.0])
     (tmp_path / "scene" / "scene.json").write_text(json.dumps({"world_from_scene": matrix.tolist()}))
-    one = bench.subject(tmp_path / "scene", colmap(tmp_path / "data"), layout="deep_blending")
+    one = bench.load_bench_scene(tmp_path / "scene", colmap(tmp_path / "data"), layout="deep_blending")
     assert np.allclose(one.photos[1].camera.pose.position_in_world, 2 * poses(COUNT)[8].position_in_world)
     assert np.allclose(one.training[0].pose.position_in_world, 2 * poses(COUNT)[1].position_in_world)
 
 
-def test_what_is_no_data_set_is_told(tmp_path: Path) -> None:
+def test_what_is_no_data_set_is_reported(tmp_path: Path) -> None:
     with pytest.raises(UnknownName, match=f"no layout 'tum'; known: auto, {', '.join(LAYOUTS)}"):
         read_data_set(tmp_path, "tum")
     with pytest.raises(SceneNotFound, match="known: nerf_synthetic, llff"):
@@ -197,7 +197,7 @@ def test_what_is_no_data_set_is_told(tmp_path: Path) -> None:
         read_data_set(tmp_path / "none")
     scene_ply(tmp_path / "scene.ply")
     with pytest.raises(SceneNotFound, match="has no photos"):
-        bench.subject(tmp_path / "scene.ply")
+        bench.load_bench_scene(tmp_path / "scene.ply")
     (tmp_path / "poses_bounds.npy").write_bytes(b"no array")
     with pytest.raises(CorruptScene, match="not LLFF's poses"):
         read_data_set(tmp_path)

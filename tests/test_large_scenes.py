@@ -24,18 +24,18 @@ def room() -> GaussianScene:
 
 
 def test_the_mirrored_camera_sees_the_mirror_image(room: GaussianScene) -> None:
-    raw = large_scenes._mirrored(large_scenes._raw(room))
+    raw = large_scenes._mirror(large_scenes._raw(room))
     mirrored = replace(room, means=raw.means, quats=raw.quats, sh=raw.sh)
     for named in room.cameras[:3]:
         (seen,) = CpuRasterizer(room).render([named.camera])
-        (other,) = CpuRasterizer(mirrored).render([large_scenes._mirrored_camera(named.camera)])
+        (other,) = CpuRasterizer(mirrored).render([large_scenes._mirror_camera(named.camera)])
         # float32 and the order of blending: seen 1e-5
         assert np.abs(seen.rgb - other.rgb[:, ::-1]).max() < 1e-3
         assert np.abs(seen.median_depth - other.median_depth[:, ::-1]).mean() < 1e-3
 
 
 def test_copies_stand_apart_and_their_cameras_with_them(room: GaussianScene) -> None:
-    large = large_scenes.tiled(room, 5 * COUNT // 2)
+    large = large_scenes.surround_with_copies(room, 5 * COUNT // 2)
     assert large.count == 5 * COUNT // 2
     assert np.array_equal(large.means[:COUNT], room.means)
     assert np.array_equal(large.sh[:COUNT], room.sh)
@@ -52,18 +52,18 @@ def test_copies_stand_apart_and_their_cameras_with_them(room: GaussianScene) -> 
 
 def test_other_scenes_are_put_around(room: GaussianScene) -> None:
     small = replace(synthetic_room(1000, sh_degree=1), cameras=())
-    large = large_scenes.tiled(room, COUNT + 1500, [replace(small, means=small.means * np.float32(0.1))])
+    large = large_scenes.surround_with_copies(room, COUNT + 1500, [replace(small, means=small.means * np.float32(0.1))])
     assert large.count == COUNT + 1500
     assert large.sh_degree == 1
     spans = np.ptp(large.means[COUNT : COUNT + 1000], axis=0)
     assert spans == pytest.approx(np.ptp(room.means, axis=0), rel=0.05)  # as large as the scene in the middle
     with pytest.raises(ValueError, match="more than"):
-        large_scenes.tiled(room, 10)
+        large_scenes.surround_with_copies(room, 10)
 
 
-def test_thinned_keeps_what_is_seen(room: GaussianScene) -> None:
+def test_the_most_contributing_gaussians_are_kept(room: GaussianScene) -> None:
     rasterizer = CpuRasterizer(room)
-    half = large_scenes.thinned(room, COUNT // 2, rasterizer)
+    half = large_scenes.keep_most_contributing(room, COUNT // 2, rasterizer)
     assert half.count == COUNT // 2
     (whole,), (part,) = (r.render([room.cameras[0].camera]) for r in (rasterizer, CpuRasterizer(half)))
     assert np.abs(whole.rgb - part.rgb).mean() < 0.03

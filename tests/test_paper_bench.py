@@ -28,7 +28,7 @@ def fake_answers(patch, pause_s: float = 0.0) -> list[tuple[str, int]]:
     """Answer every query a little beside its start, or the truth; return the queries asked."""
     asked: list[tuple[str, int]] = []
 
-    def answered(one, trial, request):
+    def localize_trial(one, trial, request):
         asked.append((trial.photo, trial.number))
         time.sleep(pause_s)
         off = 0.01 if request.estimator == "view_index" else 2.0
@@ -38,7 +38,7 @@ def fake_answers(patch, pause_s: float = 0.0) -> list[tuple[str, int]]:
         return FakeLoaded(scene, FakeRasterizer(), FakeMatcher())
 
     patch(bench.LoadedScene, "of", of)
-    patch(runs, "answered", answered)
+    patch(runs, "localize_trial", localize_trial)
     patch(runs, "_warm", lambda one: None)
     patch(runs, "_curve", lambda estimate, trial, one, points: [(0, 30.0, 1.0), (7, 0.1, 0.001)])
     return asked

@@ -202,8 +202,8 @@ class TestBench:
         assert np.median(steps) > 0.95
         for station in stations:
             nearest = min(pose_distance(station, pose) for pose in poses)
-            assert nearest[0] < bench.STEP_DEG
-            assert nearest[1] < bench.STEP_UNITS
+            assert nearest[0] < bench.SEQUENCE.step_deg
+            assert nearest[1] < bench.SEQUENCE.step_units
 
     def test_the_outcome_counts_what_happened(self, folder):
         outcome = bench.run(folder, frames=8, seed=3)

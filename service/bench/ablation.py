@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from service.bench.localize import Subject, Trial, answered, subject, trials_of
+from service.bench.localize import BenchScene, Trial, load_bench_scene, localize_trial, make_trials
 from service.bench.pose_metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
@@ -128,12 +128,12 @@ def run(
     chosen = {part: known[part] for part in parts or known}
     outcomes: dict[tuple[str, str], list[Outcome]] = {(p, c): [] for p in chosen for c in CONDITIONS}
     for number, folder in enumerate(folders):
-        with_cameras = subject(folder, cache_dir=cache_dir)
-        bare = subject(folder, cameras="ignored", cache_dir=cache_dir)
+        with_cameras = load_bench_scene(folder, cache_dir=cache_dir)
+        bare = load_bench_scene(folder, cameras="ignored", cache_dir=cache_dir)
         for i, (condition, modify) in enumerate(CONDITIONS.items()):
             one = bare if condition == BARE else with_cameras
             one.loaded.prepare(DEFAULT_ESTIMATOR)
-            trials = list(trials_of(one, "none", len(one.photos), 0, modify, folders[(number + 1) % len(folders)]))
+            trials = list(make_trials(one, "none", len(one.photos), 0, modify, folders[(number + 1) % len(folders)]))
             for part, removal in chosen.items():
                 outcomes[part, condition] += _outcomes(one, trials, removal, condition)
             if progress:
@@ -154,14 +154,14 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _outcomes(one: Subject, trials: Sequence[Trial], removal: Removal, condition: str) -> list[Outcome]:
+def _outcomes(one: BenchScene, trials: Sequence[Trial], removal: Removal, condition: str) -> list[Outcome]:
     request = Request(options=removal.options, config=removal.config)
     trust = "approximate" if condition == APPROXIMATE and not removal.exact_focal else "given"
     outcomes = []
     with _unscaled_dilation() if removal.unscaled_dilation else nullcontext():
         for trial in trials:
             wall, cpu_s = time.perf_counter(), time.process_time()
-            estimate = answered(one, trial, request, trust)
+            estimate = localize_trial(one, trial, request, trust)
             spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu_s)
             error = errors(estimate.pose, trial.truth.pose, one.units)
             outcomes.append(Outcome(estimate.verdict.status, *error, *spent))

@@ -1,4 +1,4 @@
-"""The photos of a scene folder that a bench localizes, with their truth."""
+"""The test photos of a scene folder with their true cameras, and how they are modified before they are sent."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from service.bench.modifications import Shot, modified
+from service.bench.modifications import Photo, modify
 from service.errors import CorruptScene, SceneNotFound, SplatfixError
 from service.photos.images import encode_image, read_query
 from service.photos.intrinsics import intrinsics_from
@@ -23,31 +23,34 @@ from service.scene_formats.similarity import moved_pose
 from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 HOLD_OUT_EVERY = 8
-"""Where nothing says which photos are for testing: every eighth by name, LLFF's custom. The scene was then trained
-on them, too; only their cameras are held back."""
+"""Without a list of test photos, every eighth by name is one, as is usual with LLFF's data. The scene may have been
+trained on them, too; only their cameras are held back."""
 
 
 @dataclass(frozen=True, slots=True)
 class BenchPhoto:
+    """A test photo."""
+
     name: str
-    """As in the truth file."""
+    """As the file with the true poses has it."""
     path: Path
     camera: Camera
-    """The truth, in the world frame."""
+    """The true camera, in the world frame."""
     aliases: tuple[str, ...] = ()
-    """Other names under which the same view may stand among the scene's cameras."""
+    """Other names that the same view may have among the scene's training cameras."""
     flatten: bool = False
-    """Its transparent parts show the background, not the unknown."""
+    """Whether its transparent parts are filled with the background; else they are unknown."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """All names of the view, whose cameras are held back."""
         return (self.name, *self.aliases)
 
 
 def find_photos(folder: Path) -> list[BenchPhoto]:
     """Return the test photos of a scene folder. Raises SceneError.
 
-    The first of these that is there: truth.json (scenes/studio); transforms_test.json (Blender); the
+    From the first of these that exists: truth.json (scenes/studio); transforms_test.json (Blender); the
     `test_filenames` of transforms.json (nerfstudio); every eighth photo of transforms.json or sparse/0.
     """
     if not folder.is_dir():
@@ -69,36 +72,42 @@ def find_photos(folder: Path) -> list[BenchPhoto]:
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
-    """What an estimator gets of a photo, and what it is compared with."""
+class SentPhoto:
+    """A photo as it is sent to be localized, and its truth."""
 
     data: bytes
-    """The file: as it is, or spoilt and stored without loss and without EXIF."""
-    told: Intrinsics
-    """The intrinsics sent with it: the truth's, unless the `focal` modification falsifies them."""
+    """The file: unaltered, or modified and stored as a PNG without EXIF."""
+    intrinsics: Intrinsics
+    """Sent with it: the true ones, unless the modification `focal` changes them."""
     truth: Camera
 
 
-def sent(
+def prepare_photo(
     photo: BenchPhoto,
-    modify: tuple[str, ...],
+    modifications: tuple[str, ...],
     background_rgb: tuple[float, float, float],
     seed: int,
     occluders: Sequence[Float32[np.ndarray, "h w 3"]] = (),
-) -> Sent:
-    """Return the photo, modified; `occluders` are photos of another scene. Raises UnknownName, InvalidOptions."""
+) -> SentPhoto:
+    """Return a photo after its modifications, and its true camera, which changes with them.
+
+    `occluders` are photos of another scene. Raises UnknownName, InvalidOptions.
+    """
     data = photo.path.read_bytes()
-    if not modify and not photo.flatten:
-        return Sent(data, photo.camera.intrinsics, photo.camera)
+    if not modifications and not photo.flatten:
+        return SentPhoto(data, photo.camera.intrinsics, photo.camera)
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background_rgb)
-    shot = Shot(query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose, occluders=tuple(occluders))
-    shot = modified(shot, modify, np.random.default_rng(seed))
-    told = replace(shot.intrinsics, fx=shot.intrinsics.fx * shot.told_focal, fy=shot.intrinsics.fy * shot.told_focal)
-    return Sent(encode_image(shot.pixels(), "png"), told, Camera(shot.intrinsics, shot.pose))
+    undistorted = Photo(
+        query.rgb.astype(np.float32) / 255, query.intrinsics, photo.camera.pose, occluders=tuple(occluders)
+    )
+    modified = modify(undistorted, modifications, np.random.default_rng(seed))
+    k, factor = modified.intrinsics, modified.sent_focal_factor
+    sent = replace(k, fx=k.fx * factor, fy=k.fy * factor)
+    return SentPhoto(encode_image(modified.pixels(), "png"), sent, Camera(k, modified.pose))
 
 
 def _from_truth(folder: Path) -> list[BenchPhoto]:
-    """A list of {photo, original, intrinsics, world_from_camera}; OpenCV axes, world frame."""
+    """Read a list of {photo, original, intrinsics, world_from_camera}; OpenCV axes, world frame."""
     path = folder / "truth.json"
     try:
         entries = json.loads(path.read_text("utf-8"))
@@ -134,7 +143,7 @@ def _photo(folder: Path, file: str, named: NamedCamera, aliases: tuple[str, ...]
 
 
 def moved_camera(camera: Camera, world_from_scene: Float64[np.ndarray, "4 4"] | None) -> Camera:
-    """Return a camera of the scene file's frame in the world, where the scene is moved to."""
+    """Return a camera in the world frame from one in the scene file's; None: the frames are the same."""
     if world_from_scene is None:
         return camera
     return Camera(camera.intrinsics, moved_pose(camera.pose, world_from_scene))

@@ -1,15 +1,15 @@
-"""Data sets in the layouts that they are published in: photos to localize with their truth, and training cameras.
+"""Data sets in their published layouts: test photos with true cameras, and training cameras.
 
-    nerf_synthetic  transforms_train.json, transforms_test.json (Blender); cut-out photos over white
+    nerf_synthetic  transforms_train.json, transforms_test.json (Blender); transparent photos over white
     llff            poses_bounds.npy and images*/; every eighth photo by name is a test photo
     mipnerf360      sparse/0 (COLMAP) and images*/; likewise
     deep_blending   sparse/0 and images/; likewise
     nerfstudio      transforms.json; its test_filenames, else a tenth of the photos, evenly spread
     scene           our scene folder, see `find_photos`
 
-The trained scene lies in the folder, too, or elsewhere; it must be in the data set's world frame. Where photos come
-in several sizes (images, images_2, ...), the smallest with a long side of 800 px or more are taken: the supplement's
-size, and what scenes of these data sets are trained at.
+The trained scene is in the same folder or in another one, in the data set's world frame. Where photos come in several
+sizes (images, images_2, ...), the smallest with a long side of 800 px or more are taken: the size of the paper's
+supplement, at which scenes of these data sets are usually trained.
 """
 
 from __future__ import annotations
@@ -31,25 +31,29 @@ from service.scene_formats.nerfstudio import TransformsFile
 from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 WHITE = (1.0, 1.0, 1.0)
-NERFSTUDIO_TRAINS_ON = 0.9
-LEAST_LONG_SIDE_PX = 800
+NERFSTUDIO_TRAINING_SHARE = 0.9
+"""Of the photos without a split; nerfstudio's default."""
+MIN_LONG_SIDE_PX = 800
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic")
 OPENCV_FROM_LLFF = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""LLFF's camera axes are down, right, backwards."""
+"""LLFF's camera axes are down, right, backward."""
 
 
 @dataclass(frozen=True, slots=True)
 class DataSet:
+    """Test photos and training cameras of a data set."""
+
     layout: str
     test: tuple[BenchPhoto, ...]
-    """With their truth in the world frame."""
+    """With their true cameras in the world frame."""
     training: tuple[NamedCamera, ...] | None
-    """In the scene file's frame; None: those that the scene folder has, less the test photos."""
+    """In the scene file's frame; None: the scene folder's, without the test photos."""
     background_rgb: tuple[float, float, float] | None = None
-    """The layout's own; None: the scene's."""
+    """Given by the layout; None: the scene's."""
 
     @property
     def held_back(self) -> list[str]:
+        """Names of the views whose cameras must not be among the scene's."""
         return [name for photo in self.test for name in photo.names]
 
 
@@ -60,7 +64,10 @@ class _Photo:
 
 
 def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None) -> DataSet:
-    """Read a data set; `scene` is the folder or file of its trained scene. Raises UnknownName, SceneError."""
+    """Return the data set in a folder; `scene` is the folder or file of its trained scene.
+
+    Raises UnknownName, SceneError.
+    """
     if layout not in ("auto", *LAYOUTS):
         raise UnknownName(f"there is no layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
     if folder.is_file():
@@ -68,7 +75,7 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
     if not folder.is_dir():
         raise SceneNotFound("there is no such folder.", where=str(folder))
     if layout == "auto":
-        layout = detected(folder)
+        layout = detect_layout(folder)
     if layout == "scene":
         return DataSet(layout, tuple(find_photos(folder)), None)
     test, training = LAYOUTS[layout](folder)
@@ -76,17 +83,17 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
         raise SceneNotFound(f"there are no test photos in layout '{layout}'.", where=str(folder))
     place = scene if scene is not None and scene.is_dir() else folder
     world_from_scene = read_manifest(place).world_from_scene
-    cut_out = layout == "nerf_synthetic"
+    transparent = layout == "nerf_synthetic"
     photos = [
-        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), flatten=cut_out)
+        BenchPhoto(p.camera.name, p.file, moved_camera(p.camera.camera, world_from_scene), flatten=transparent)
         for p in test
     ]
-    background = WHITE if cut_out else None
+    background = WHITE if transparent else None
     return DataSet(layout, tuple(photos), tuple(p.camera for p in training), background)
 
 
-def detected(folder: Path) -> str:
-    """Return the layout that the folder's files tell. Raises SceneNotFound."""
+def detect_layout(folder: Path) -> str:
+    """Return a folder's layout by the files in it. Raises SceneNotFound."""
     has = {name: (folder / name).exists() for name in ("truth.json", MANIFEST, "poses_bounds.npy", "transforms.json")}
     if has["truth.json"] or has[MANIFEST]:
         return "scene"
@@ -103,7 +110,7 @@ def detected(folder: Path) -> str:
 
 def _nerf_synthetic(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
     return tuple(  # type: ignore[return-value]
-        _of_transforms(TransformsFile.open(folder / f"transforms_{part}.json"), None) for part in ("test", "train")
+        _from_transforms(TransformsFile.open(folder / f"transforms_{part}.json"), None) for part in ("test", "train")
     )
 
 
@@ -111,13 +118,15 @@ def _nerfstudio(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
     file = TransformsFile.open(folder / "transforms.json")
     names, listed = sorted(file.frames), file.split("test")
     if listed is None:
-        count = int(np.ceil(NERFSTUDIO_TRAINS_ON * len(names)))
+        count = int(np.ceil(NERFSTUDIO_TRAINING_SHARE * len(names)))
         kept = {names[i] for i in np.linspace(0, len(names) - 1, count, dtype=int)}
-        return _of_transforms(file, [n for n in names if n not in kept]), _of_transforms(file, sorted(kept))
-    return _of_transforms(file, listed), _of_transforms(file, [n for n in file.training_photos() if n not in listed])
+        return _from_transforms(file, [n for n in names if n not in kept]), _from_transforms(file, sorted(kept))
+    return _from_transforms(file, listed), _from_transforms(
+        file, [n for n in file.training_photos() if n not in listed]
+    )
 
 
-def _of_transforms(file: TransformsFile, names: Sequence[str] | None) -> list[_Photo]:
+def _from_transforms(file: TransformsFile, names: Sequence[str] | None) -> list[_Photo]:
     folder = file.path.parent
     manifest = read_manifest(folder)
     return [
@@ -126,7 +135,7 @@ def _of_transforms(file: TransformsFile, names: Sequence[str] | None) -> list[_P
 
 
 def _llff(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
-    """Rows of 17 numbers: a 3 x 5 matrix (camera axes, position, height-width-focal), near and far."""
+    """Read rows of 17 numbers: a 3 x 5 matrix (camera axes, position, height-width-focal), near and far."""
     path = folder / "poses_bounds.npy"
     try:
         rows = np.load(path, allow_pickle=False)
@@ -136,7 +145,7 @@ def _llff(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
         raise CorruptScene(f"not LLFF's poses: {error}.", where=path.name) from None
     files = _photo_files(folder, len(rows))
     photos = [_Photo(file, _llff_camera(file, row[:15].reshape(3, 5))) for file, row in zip(files, rows, strict=True)]
-    return _held_out(photos)
+    return _split_by_name(photos)
 
 
 def _llff_camera(file: Path, values: Float64[np.ndarray, "3 5"]) -> NamedCamera:
@@ -146,7 +155,7 @@ def _llff_camera(file: Path, values: Float64[np.ndarray, "3 5"]) -> NamedCamera:
     height, width, focal = values[:, 4]
     try:
         camera = Intrinsics(int(width), int(height), focal, focal, width / 2, height / 2)
-        return NamedCamera(file.name, Camera(_at_size_of(file, camera), Pose(matrix)))
+        return NamedCamera(file.name, Camera(_resized_to(file, camera), Pose(matrix)))
     except InvalidPrior as error:
         raise CorruptScene(str(error), where=f"poses_bounds.npy, {file.name}") from None
 
@@ -157,18 +166,18 @@ def _colmap(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
     photos = []
     for named in cameras:
         file = files.get(Path(named.name).stem, folder / "images" / named.name)
-        camera = Camera(_at_size_of(file, named.camera.intrinsics), named.camera.pose)
+        camera = Camera(_resized_to(file, named.camera.intrinsics), named.camera.pose)
         photos.append(_Photo(file, NamedCamera(named.name, camera)))
-    return _held_out(photos)
+    return _split_by_name(photos)
 
 
-def _held_out(photos: list[_Photo]) -> tuple[list[_Photo], list[_Photo]]:
-    """Every eighth by name, from the first."""
+def _split_by_name(photos: list[_Photo]) -> tuple[list[_Photo], list[_Photo]]:
+    """Split into test and training photos: every eighth by name, from the first on, is a test photo."""
     return photos[::HOLD_OUT_EVERY], [p for i, p in enumerate(photos) if i % HOLD_OUT_EVERY]
 
 
 def _photo_files(folder: Path, count: int | None) -> list[Path]:
-    """Return the photos of the size to use, by name. Raises SceneNotFound, CorruptScene."""
+    """Return the photos of the smallest sufficient size, by name. Raises SceneNotFound, CorruptScene."""
     sizes = {}
     for place in sorted(folder.glob("images*")):
         files = sorted(p for p in place.iterdir() if p.suffix.lower() in PHOTO_SUFFIXES) if place.is_dir() else []
@@ -177,11 +186,11 @@ def _photo_files(folder: Path, count: int | None) -> list[Path]:
     if not sizes:
         number = "" if count is None else f"{count} "
         raise SceneNotFound(f"there is no images folder with {number}photos.", where=str(folder))
-    enough = [size for size in sizes if size >= LEAST_LONG_SIDE_PX]
+    enough = [size for size in sizes if size >= MIN_LONG_SIDE_PX]
     return sizes[min(enough) if enough else max(sizes)]
 
 
-def _at_size_of(file: Path, intrinsics: Intrinsics) -> Intrinsics:
+def _resized_to(file: Path, intrinsics: Intrinsics) -> Intrinsics:
     return intrinsics.resized(*_size_of(file))
 
 
@@ -200,4 +209,4 @@ LAYOUTS: dict[str, Callable[[Path], tuple[list[_Photo], list[_Photo]]]] = {
     "nerfstudio": _nerfstudio,
     "scene": lambda folder: ([], []),
 }
-"""Name -> test and training photos, in the scene file's frame."""
+"""Name -> function that returns test and training photos, in the scene file's frame."""

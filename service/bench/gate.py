@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from service.bench.bench_photos import BenchPhoto, sent
+from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.gate_fit import Sample, fit_model, summary
-from service.bench.localize import Subject, subject
+from service.bench.localize import BenchScene, load_bench_scene
 from service.bench.pose_metrics import COARSE, errors, nees
 from service.estimators.view_index import Options
 from service.geometry import moved
@@ -80,7 +80,7 @@ def run(
     cache_dir: Path | None = None,
 ) -> dict[str, Any]:
     """Return the object that `--json` writes; its `model` is what `model.json` holds. Raises SceneError."""
-    subjects = [subject(Path(folder), cache_dir=cache_dir) for folder in folders]
+    subjects = [load_bench_scene(Path(folder), cache_dir=cache_dir) for folder in folders]
     samples: list[Sample] = []
     total = sum(len(one.photos) for one in subjects)
     done = 0
@@ -104,7 +104,7 @@ def run(
     }
 
 
-def _scene_line(one: Subject) -> dict[str, Any]:
+def _scene_line(one: BenchScene) -> dict[str, Any]:
     info = one.loaded.scene.info
     return {"name": info.name, "sha256": info.sha256, "photos": len(one.photos)}
 
@@ -119,12 +119,12 @@ def _pixels(photo: BenchPhoto) -> Float32[np.ndarray, "h w 3"]:
 
 
 def _of_photo(
-    one: Subject, photo: BenchPhoto, occluders: Sequence[Float32[np.ndarray, "_ _ 3"]], rng: np.random.Generator
+    one: BenchScene, photo: BenchPhoto, occluders: Sequence[Float32[np.ndarray, "_ _ 3"]], rng: np.random.Generator
 ) -> Iterator[Sample]:
     """Yield the samples of one test photo."""
     for modify in (*WITHIN_REASON, *BEYOND):
-        file = sent(photo, modify, one.background_rgb, int(rng.integers(1 << 30)), occluders)
-        query = read_query(file.data, intrinsics=file.told, background_rgb=one.background_rgb)
+        file = prepare_photo(photo, modify, one.background_rgb, int(rng.integers(1 << 30)), occluders)
+        query = read_query(file.data, intrinsics=file.intrinsics, background_rgb=one.background_rgb)
         kind = ("beyond " if modify in BEYOND else "") + ("clean" if not modify else modify[0])
         yield _localized(one, kind, photo.name, query, file.truth.pose)
     data = photo.path.read_bytes()
@@ -135,7 +135,9 @@ def _of_photo(
         yield from _of_moved_pose(one, photo, images, rng)
 
 
-def _of_moved_pose(one: Subject, photo: BenchPhoto, images: QueryImages, rng: np.random.Generator) -> Iterator[Sample]:
+def _of_moved_pose(
+    one: BenchScene, photo: BenchPhoto, images: QueryImages, rng: np.random.Generator
+) -> Iterator[Sample]:
     """Yield samples of poses moved from the truth: near, moved, tracked from there, and refined from there."""
     truth, rasterizer = photo.camera.pose, one.loaded.rasterizer
     pose = _moved(truth, one, *NEAR, rng)
@@ -152,7 +154,7 @@ def _of_moved_pose(one: Subject, photo: BenchPhoto, images: QueryImages, rng: np
         yield _sample(one, "drifted", photo.name, truth, found.pose, verdict)
 
 
-def _tracked(one: Subject, photo: BenchPhoto, images: QueryImages, expected: Pose) -> Iterator[Sample]:
+def _tracked(one: BenchScene, photo: BenchPhoto, images: QueryImages, expected: Pose) -> Iterator[Sample]:
     """Yield what the tracker makes of a camera that isn't where it is expected."""
     found = refine_from(images, expected, None, one.loaded.rasterizer)
     if found is None:
@@ -163,7 +165,7 @@ def _tracked(one: Subject, photo: BenchPhoto, images: QueryImages, expected: Pos
     yield replace(sample, tracked=by_pixels is not None and by_pixels.status is Status.LOCALIZED)
 
 
-def _foreign(one: Subject, others: Sequence[Subject]) -> Iterator[Sample]:
+def _foreign(one: BenchScene, others: Sequence[BenchScene]) -> Iterator[Sample]:
     """Yield what becomes of photos that don't show the scene."""
     for other in others:
         for photo in other.photos[:FOREIGN]:
@@ -203,7 +205,9 @@ def garbage(number: int) -> np.ndarray:
     return np.clip(picture, 0, 1).astype(np.float32)
 
 
-def _moved(pose: Pose, one: Subject, between: tuple[float, float], most_deg: float, rng: np.random.Generator) -> Pose:
+def _moved(
+    pose: Pose, one: BenchScene, between: tuple[float, float], most_deg: float, rng: np.random.Generator
+) -> Pose:
     """Return the pose turned and shifted in a random direction, by a distance even on a logarithmic scale."""
     turn, shift = rng.standard_normal((2, 3))
     turn *= np.radians(rng.uniform(0, most_deg)) / np.linalg.norm(turn)
@@ -212,7 +216,7 @@ def _moved(pose: Pose, one: Subject, between: tuple[float, float], most_deg: flo
     return moved(pose, np.concatenate([turn, shift]))
 
 
-def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | None) -> Sample:
+def _localized(one: BenchScene, kind: str, photo: str, query: Query, truth: Pose | None) -> Sample:
     estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
     weighed = nees(estimate, truth) if truth else None
     images = QueryImages(query, one.loaded.matcher)
@@ -224,7 +228,13 @@ def _localized(one: Subject, kind: str, photo: str, query: Query, truth: Pose | 
 
 
 def _sample(
-    one: Subject, kind: str, photo: str, truth: Pose | None, pose: Pose, verdict: Verdict, weighed: float | None = None
+    one: BenchScene,
+    kind: str,
+    photo: str,
+    truth: Pose | None,
+    pose: Pose,
+    verdict: Verdict,
+    weighed: float | None = None,
 ) -> Sample:
     right = False
     if truth is not None:

@@ -1,8 +1,8 @@
-"""`splatfix bench localize`: localize a data set's test photos in its scene and compare with the truth.
+"""`splatfix bench localize`: accuracy and time of localizing a data set's test photos in its scene.
 
-The test photos' cameras are taken out before the scene is loaded, whatever layout it has, so that no index view
-and no unit rests on them. Latency is wall time from the photo's bytes to the result, decoding included, with the
-estimator's index ready and one localization done before; CPU time is the whole process's in the same span.
+The test photos' cameras are removed before the scene is loaded, whatever its layout, so that neither index views nor
+units depend on them. Latency is wall time from the photo's bytes to the result, decoding included, with the estimator's
+index ready and one localization done before; CPU time is the whole process's in the same interval.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
-from service.bench.bench_photos import BenchPhoto, sent
+from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.datasets import PHOTO_SUFFIXES, DataSet, read_data_set
 from service.bench.modifications import require_modifications
 from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
@@ -34,34 +34,37 @@ from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 MAX_OCCLUDERS = 20
+"""Photos read of a folder of occluders, evenly spaced."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One thing to send, and its truth."""
+    """One localization: photo, intrinsics and start pose to send, and the true camera."""
 
     photo: str
     number: int
+    """Among the trials of this photo."""
     data: bytes
-    told: Intrinsics
-    """Those sent with it."""
+    intrinsics: Intrinsics
+    """Sent with the photo."""
     truth: Camera
     start: Pose | None
 
 
 @dataclass(frozen=True, slots=True)
-class Subject:
-    """A scene to localize in, the photos to localize, and its units."""
+class BenchScene:
+    """A scene in memory, its test photos, and its units."""
 
     loaded: LoadedScene
     photos: tuple[BenchPhoto, ...]
     training: tuple[Camera, ...]
-    """Never a test photo's."""
+    """Without those of the test photos."""
     units: Units
     layout: str
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
+        """Colour of rays that meet no Gaussian; 0..1."""
         return self.loaded.scene.info.background_rgb
 
 
@@ -84,48 +87,49 @@ def run(
     budget: Budget | None = None,
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
-    on_miss: Callable[[Subject, Trial, PoseEstimate], dict[str, Any]] | None = None,
+    on_miss: Callable[[BenchScene, Trial, PoseEstimate], dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
-    `folder` has the scene; `data` the photos, if they are elsewhere. `occluders` is a folder with photos of another
-    scene. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is used
-    without its training cameras; they still define the units. What `on_miss` tells of a query that isn't a success at
-    1 deg and 0.01 units is added to its line.
+    `folder` has the scene; `data` the photos, if they are in another folder. `occluders` is a folder with photos of
+    another scene. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is
+    used without its training cameras, which still define the units. `on_miss` is called for each photo that isn't a
+    success at 1 deg and 0.01 units; what it returns is added to the photo's line.
     """
     require_kind(start)
     require_modifications(modify)
-    chosen, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
-    one = subject(
+    chosen_options, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
+    bench_scene = load_bench_scene(
         Path(folder), data, layout=layout, background=background, cameras=cameras, matcher=matcher, cache_dir=cache_dir
     )
     began = time.perf_counter()
-    one.loaded.prepare(estimator)
+    bench_scene.loaded.prepare(estimator)
     prepare_s = time.perf_counter() - began
-    todo = list(trials_of(one, start, trials * len(one.photos), seed, tuple(modify), occluders))
+    todo = list(make_trials(bench_scene, start, trials * len(bench_scene.photos), seed, tuple(modify), occluders))
     limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
-    request = Request(estimator=estimator, options=chosen, seed=seed, **limits)
+    request = Request(estimator=estimator, options=chosen_options, seed=seed, **limits)
 
-    def answer(trial: Trial) -> PoseEstimate:
-        return answered(one, trial, request, intrinsics)
+    def localize_one(trial: Trial) -> PoseEstimate:
+        return localize_trial(bench_scene, trial, request, intrinsics)
 
-    def told_of(trial: Trial, estimate: PoseEstimate) -> dict[str, Any]:
-        return on_miss(one, trial, estimate) if on_miss else {}
+    def describe_miss(trial: Trial, estimate: PoseEstimate) -> dict[str, Any]:
+        return on_miss(bench_scene, trial, estimate) if on_miss else {}
 
-    outcomes, per_query = measure(todo, answer, one.units, progress, told_of)
-    asked = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
-    asked |= {"layout": one.layout, "background_rgb": list(one.background_rgb)}
-    asked |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
-    asked |= {"options": dataclasses.asdict(chosen), "budget": dataclasses.asdict(budget)}
-    facts = {"photos": len(one.photos), "training_cameras": len(one.training), "gaussians": one.loaded.scene.count}
-    facts |= {"forward_facing": one.units.forward_facing, "units_per_scene_unit": one.units.units_per_scene_unit}
-    facts |= {"prepare_s": prepare_s}
-    return {"scene": one.loaded.scene.info.name, **asked, **facts, **summary(outcomes), "per_query": per_query}
+    outcomes, per_query = measure(todo, localize_one, bench_scene.units, progress, describe_miss)
+    settings = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
+    settings |= {"layout": bench_scene.layout, "background_rgb": list(bench_scene.background_rgb)}
+    settings |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
+    settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
+    scene, units = bench_scene.loaded.scene, bench_scene.units
+    facts = {"photos": len(bench_scene.photos), "training_cameras": len(bench_scene.training)}
+    facts |= {"gaussians": scene.count, "forward_facing": units.forward_facing}
+    facts |= {"units_per_scene_unit": units.units_per_scene_unit, "prepare_s": prepare_s}
+    return {"scene": scene.info.name, **settings, **facts, **summary(outcomes), "per_query": per_query}
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """When an estimator is stopped; its best so far is then the answer."""
+    """Limits at which an estimator is stopped; its best pose so far is then the estimate."""
 
     seconds: float | None = None
     renders: int | None = None
@@ -133,21 +137,24 @@ class Budget:
 
 def measure(
     todo: Sequence[Trial],
-    answer: Callable[[Trial], PoseEstimate],
+    localize_one: Callable[[Trial], PoseEstimate],
     units: Units,
     progress: Callable[[int, int], None] | None = None,
     on_miss: Callable[[Trial, PoseEstimate], dict[str, Any]] | None = None,
 ) -> tuple[list[Outcome], list[dict[str, Any]]]:
-    """Answer every trial and compare; the first one is answered twice, and only the second time counts."""
+    """Localize every trial; return errors and times, and the lines of the result file.
+
+    The first trial is localized twice, of which the first time, with compilation and allocation, isn't counted.
+    """
     outcomes, lines = [], []
-    answer(todo[0])
+    localize_one(todo[0])
     for done, trial in enumerate(todo, 1):
         wall, cpu = time.perf_counter(), time.process_time()
-        estimate = answer(trial)
+        estimate = localize_one(trial)
         latency_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
         outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, units), latency_ms, cpu_ms)
         outcomes.append(outcome)
-        lines.append(line_of(trial, estimate, outcome, units))
+        lines.append(trial_result(trial, estimate, outcome, units))
         if on_miss and not outcome.success(FINE):
             lines[-1] |= on_miss(trial, estimate)
         if progress:
@@ -155,7 +162,7 @@ def measure(
     return outcomes, lines
 
 
-def subject(
+def load_bench_scene(
     folder: Path,
     data: Path | None = None,
     *,
@@ -164,54 +171,55 @@ def subject(
     cameras: str = "given",
     matcher: str = DEFAULT_MATCHER,
     cache_dir: Path | None = None,
-) -> Subject:
-    """Read a data set and its scene without the test photos. Raises SceneError, UnknownName."""
-    found = read_data_set(data or folder, layout, folder)
-    scene = _scene(folder, found, background)
-    training = [named.camera for named in scene.cameras] or [photo.camera for photo in found.test]
+) -> BenchScene:
+    """Return a data set's test photos, and its scene without their cameras. Raises SceneError, UnknownName."""
+    data_set = read_data_set(data or folder, layout, folder)
+    scene = _load_scene(folder, data_set, background)
+    training = [named.camera for named in scene.cameras] or [photo.camera for photo in data_set.test]
     if cameras == "ignored":
-        scene = _scene(folder, found, background, cameras=False)
+        scene = _load_scene(folder, data_set, background, cameras=False)
     loaded = LoadedScene.of(scene, cache_dir=cache_dir, matcher=matcher)
     units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
-    return Subject(loaded, found.test, tuple(training), units, found.layout)
+    return BenchScene(loaded, data_set.test, tuple(training), units, data_set.layout)
 
 
-def _scene(folder: Path, found: DataSet, background: str, cameras: bool = True) -> GaussianScene:
-    scene = load_scene(folder, without_photos=found.held_back, cameras=cameras, training=found.training)
+def _load_scene(folder: Path, data_set: DataSet, background: str, cameras: bool = True) -> GaussianScene:
+    scene = load_scene(folder, without_photos=data_set.held_back, cameras=cameras, training=data_set.training)
     rgb = BACKGROUNDS.get(background)
     if rgb is None and not (folder.is_dir() and read_manifest(folder).background):
-        rgb = found.background_rgb
+        rgb = data_set.background_rgb
     if rgb is None or rgb == scene.info.background_rgb:
         return scene
-    # The digest is the key of cached view indexes: a render over another background is another one.
+    # The digest is the key of cached view indexes, whose views depend on the background.
     return replace(scene, info=replace(scene.info, background_rgb=rgb, sha256=f"{scene.info.sha256}-{rgb}"))
 
 
-def trials_of(
-    one: Subject,
+def make_trials(
+    bench_scene: BenchScene,
     start: str,
     count: int,
     seed: int,
-    modify: tuple[str, ...] = (),
+    modifications: tuple[str, ...] = (),
     occluders: Path | None = None,
 ) -> Iterator[Trial]:
-    """Yield `count` trials, photo after photo: as many for each as go round, each with its own start.
+    """Yield `count` trials, distributed evenly over the photos, photo by photo, each with a start pose of its own.
 
-    They are the same in every run with this seed, and the first ones also for a larger count.
+    A trial depends only on the seed, the photo and its number, not on `count`.
     """
-    cut = _pictures(occluders) if occluders else ()
-    for index, photo in enumerate(one.photos):
-        numbers = range(len(range(index, count, len(one.photos))))
-        one_sent = sent(photo, modify, one.background_rgb, seed, cut) if numbers else None
+    others = _read_occluders(occluders) if occluders else ()
+    for index, photo in enumerate(bench_scene.photos):
+        numbers = range(len(range(index, count, len(bench_scene.photos))))
+        if not numbers:
+            continue
+        sent = prepare_photo(photo, modifications, bench_scene.background_rgb, seed, others)
         for number in numbers:
-            assert one_sent is not None
             rng = np.random.default_rng([seed, index, number])
-            begin = start_pose(start, one_sent.truth.pose, one.units, one.training, rng)
-            yield Trial(photo.name, number, one_sent.data, one_sent.told, one_sent.truth, begin)
+            begin = start_pose(start, sent.truth.pose, bench_scene.units, bench_scene.training, rng)
+            yield Trial(photo.name, number, sent.data, sent.intrinsics, sent.truth, begin)
 
 
-def _pictures(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
-    """Return photos of a folder, at most MAX_OCCLUDERS. Raises SceneNotFound."""
+def _read_occluders(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
+    """Return at most MAX_OCCLUDERS photos of a folder; 0..1. Raises SceneNotFound."""
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES) if folder.is_dir() else []
     if not files:
         raise SceneNotFound("there are no photos to cut occluders from.", where=str(folder))
@@ -219,19 +227,20 @@ def _pictures(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
     return [read_query(file.read_bytes()).rgb.astype(np.float32) / 255 for file in files[::step]]
 
 
-def answered(one: Subject, trial: Trial, request: Request, intrinsics: str = "given") -> PoseEstimate:
-    """Localize one trial as the service would."""
-    told = None if intrinsics == "withheld" else trial.told
-    if told and intrinsics == "approximate":
-        told = replace(told, trust="approximate")
-    query = read_query(trial.data, intrinsics=told, prior=trial.start, background_rgb=one.background_rgb)
-    return localize(query, one.loaded, request)
+def localize_trial(bench_scene: BenchScene, trial: Trial, request: Request, intrinsics: str = "given") -> PoseEstimate:
+    """Localize one trial as the service does; `intrinsics`: given, approximate or withheld."""
+    sent = None if intrinsics == "withheld" else trial.intrinsics
+    if sent and intrinsics == "approximate":
+        sent = replace(sent, trust="approximate")
+    background = bench_scene.background_rgb
+    query = read_query(trial.data, intrinsics=sent, prior=trial.start, background_rgb=background)
+    return localize(query, bench_scene.loaded, request)
 
 
-def line_of(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) -> dict[str, Any]:
-    """Return what the result file has of one trial."""
+def trial_result(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units) -> dict[str, Any]:
+    """Return one trial's line of the result file."""
     verdict = estimate.verdict
-    begun = errors(trial.start, trial.truth.pose, units) if trial.start else (None, None)
+    start_errors = errors(trial.start, trial.truth.pose, units) if trial.start else (None, None)
     return {
         "photo": trial.photo,
         "trial": trial.number,
@@ -244,8 +253,8 @@ def line_of(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: Units
         "rotation_deg": outcome.rotation_deg,
         "translation_units": outcome.translation_units,
         "start_world_from_camera": trial.start.world_from_camera.tolist() if trial.start else None,
-        "start_rotation_deg": begun[0],
-        "start_translation_units": begun[1],
+        "start_rotation_deg": start_errors[0],
+        "start_translation_units": start_errors[1],
         "intrinsics_source": estimate.intrinsics_source,
         "renders": estimate.renders,
         "latency_ms": outcome.latency_ms,

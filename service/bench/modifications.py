@@ -1,10 +1,10 @@
-"""Ways to spoil a bench's photos: `--modify NAME=VALUE`. Geometry changes carry camera and truth along.
+"""Modifications of the benches' photos: `--modify NAME=VALUE`. Where geometry changes, camera and truth change with it.
 
 gain, gamma     of the sRGB values              occlusion  rectangles of another scene's photos over this share
-white_balance   red times it, blue over it      scale      resampled by this factor
+white_balance   red times, blue divided by it    scale      resampled by this factor
 blur            sigma in px at 800 px           roll       about the optical axis, degrees; padding transparent
 noise           sigma, in 0..1                  crop       the middle: this share of width and height
-jpeg            quality                         focal      the focal length told is this many times the true one
+jpeg            quality                         focal      the focal length sent is the true one times this
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from service.types import Intrinsics, Pose
 
 
 @dataclass(frozen=True, slots=True)
-class Shot:
+class Photo:
     """A photo with its pinhole camera and its true pose."""
 
     rgb: Float32[np.ndarray, "h w 3"]
@@ -30,34 +30,34 @@ class Shot:
     intrinsics: Intrinsics
     pose: Pose
     mask: Bool[np.ndarray, "h w"] | None = None
-    """Which pixels are of the photo; the others are transparent in the file. None: all."""
-    told_focal: float = 1.0
-    """What the focal length is multiplied with when it is sent along."""
+    """Pixels that belong to the photo; the others are transparent in the file. None: all belong to it."""
+    sent_focal_factor: float = 1.0
+    """The focal length sent with the photo, divided by the true one."""
     occluders: tuple[Float32[np.ndarray, "_ _ 3"], ...] = ()
-    """Photos of another scene."""
+    """Photos of another scene, from which `occlusion` cuts rectangles."""
 
     def pixels(self) -> Float32[np.ndarray, "h w c"]:
-        """Return what a file has to hold: RGB, or RGBA with the mask."""
+        """Return the pixels of a file: RGB, or RGBA with the mask as alpha; 0..1."""
         if self.mask is None:
             return self.rgb
         return np.concatenate([self.rgb, self.mask[..., None].astype(np.float32)], 2)
 
 
-def modified(shot: Shot, specs: Sequence[str], rng: np.random.Generator) -> Shot:
-    """Apply 'NAME=VALUE' one after the other. Raises UnknownName, InvalidOptions."""
+def modify(photo: Photo, specs: Sequence[str], rng: np.random.Generator) -> Photo:
+    """Return the photo after modifications 'NAME=VALUE', in their order. Raises UnknownName, InvalidOptions."""
     for spec in specs:
-        change, value = _parsed(spec)
-        shot = change(shot, value, rng)
-    return shot
+        change, value = _parse(spec)
+        photo = change(photo, value, rng)
+    return photo
 
 
 def require_modifications(specs: Sequence[str]) -> None:
-    """Raise UnknownName or InvalidOptions for the first that can't be done."""
+    """Raise UnknownName or InvalidOptions for the first modification that doesn't exist or has a wrong value."""
     for spec in specs:
-        _parsed(spec)
+        _parse(spec)
 
 
-def _parsed(spec: str) -> tuple[_Change, float]:
+def _parse(spec: str) -> tuple[_Change, float]:
     name, _, text = spec.partition("=")
     if name not in MODIFICATIONS:
         raise UnknownName(
@@ -73,28 +73,28 @@ def _parsed(spec: str) -> tuple[_Change, float]:
     return change, value
 
 
-def _gain(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
-    """Multiplies the sRGB values, as exposure roughly does."""
-    return replace(shot, rgb=np.clip(shot.rgb * np.float32(factor), 0, 1))
+def _gain(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
+    # Of the sRGB values: an approximation of another exposure, which would multiply linear light.
+    return replace(photo, rgb=np.clip(photo.rgb * np.float32(factor), 0, 1))
 
 
-def _gamma(shot: Shot, exponent: float, rng: np.random.Generator) -> Shot:
-    return replace(shot, rgb=(shot.rgb ** np.float32(exponent)).astype(np.float32))
+def _gamma(photo: Photo, exponent: float, rng: np.random.Generator) -> Photo:
+    return replace(photo, rgb=(photo.rgb ** np.float32(exponent)).astype(np.float32))
 
 
-def _noise(shot: Shot, sigma: float, rng: np.random.Generator) -> Shot:
-    """Gaussian, independent in every channel."""
-    noise = rng.normal(0.0, sigma, shot.rgb.shape).astype(np.float32)
-    return replace(shot, rgb=np.clip(shot.rgb + noise, 0, 1))
+def _noise(photo: Photo, sigma: float, rng: np.random.Generator) -> Photo:
+    """Add independent Gaussian noise to every channel."""
+    noise = rng.normal(0.0, sigma, photo.rgb.shape).astype(np.float32)
+    return replace(photo, rgb=np.clip(photo.rgb + noise, 0, 1))
 
 
-def _blur(shot: Shot, sigma: float, rng: np.random.Generator) -> Shot:
-    """Gaussian; sigma in pixels of a photo with a long side of 800."""
-    sigma = sigma * shot.intrinsics.long_side / 800
+def _blur(photo: Photo, sigma: float, rng: np.random.Generator) -> Photo:
+    """Blur by a separable Gaussian; sigma in pixels of a photo with a long side of 800."""
+    sigma = sigma * photo.intrinsics.long_side / 800
     reach = max(1, int(np.ceil(3 * sigma)))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
     kernel = (kernel / kernel.sum()).astype(np.float32)
-    rgb = shot.rgb
+    rgb = photo.rgb
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (reach, reach)
@@ -103,22 +103,25 @@ def _blur(shot: Shot, sigma: float, rng: np.random.Generator) -> Shot:
         rgb = np.zeros_like(rgb)
         for offset, weight in enumerate(kernel):
             rgb += weight * padded.take(range(offset, offset + size), axis)
-    return replace(shot, rgb=rgb)
+    return replace(photo, rgb=rgb)
 
 
-def _jpeg(shot: Shot, quality: float, rng: np.random.Generator) -> Shot:
-    query = read_query(encode_image(shot.rgb, quality=round(quality)), intrinsics=shot.intrinsics)
-    return replace(shot, rgb=query.rgb.astype(np.float32) / 255, intrinsics=query.intrinsics)
+def _jpeg(photo: Photo, quality: float, rng: np.random.Generator) -> Photo:
+    query = read_query(encode_image(photo.rgb, quality=round(quality)), intrinsics=photo.intrinsics)
+    return replace(photo, rgb=query.rgb.astype(np.float32) / 255, intrinsics=query.intrinsics)
 
 
-def _occlusion(shot: Shot, share: float, rng: np.random.Generator) -> Shot:
-    """Rectangles of a tenth to a half of each side, the last one cut short: the share is exact to the pixel."""
-    if not shot.occluders:
+def _occlusion(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
+    """Cover a share of the photo by rectangles of a tenth to a half of each side.
+
+    The last rectangle is cut short, so that the share is exact to the pixel.
+    """
+    if not photo.occluders:
         raise InvalidOptions(
             "'occlusion' needs photos of another scene to cut from.", where="modify", hint="Name a folder of some."
         )
-    rgb, covered = shot.rgb.copy(), np.zeros(shot.rgb.shape[:2], bool)
-    height, width = shot.rgb.shape[:2]
+    rgb, covered = photo.rgb.copy(), np.zeros(photo.rgb.shape[:2], bool)
+    height, width = photo.rgb.shape[:2]
     wanted = round(share * covered.size)
     while (left := wanted - int(covered.sum())) > 0:
         tall, wide = (max(1, int(side * rng.uniform(0.1, 0.5))) for side in (height, width))
@@ -127,86 +130,86 @@ def _occlusion(shot: Shot, share: float, rng: np.random.Generator) -> Shot:
         new = np.zeros_like(covered)
         new[area] = ~covered[area]
         new.ravel()[np.flatnonzero(new)[left:]] = False
-        piece = _piece(shot.occluders[int(rng.integers(len(shot.occluders)))], tall, wide, rng)
+        piece = _random_crop(photo.occluders[int(rng.integers(len(photo.occluders)))], tall, wide, rng)
         rgb[area] = np.where(new[area][..., None], piece, rgb[area])
         covered |= new
-    return replace(shot, rgb=rgb)
+    return replace(photo, rgb=rgb)
 
 
-def _piece(
+def _random_crop(
     photo: Float32[np.ndarray, "h w 3"], tall: int, wide: int, rng: np.random.Generator
 ) -> Float32[np.ndarray, "tall wide 3"]:
-    """Cut a piece out; a photo that is too small is continued by its mirror image."""
+    """Return a random crop; a photo that is too small is padded by reflection."""
     height, width = photo.shape[:2]
     photo = np.pad(photo, ((0, max(0, tall - height)), (0, max(0, wide - width)), (0, 0)), mode="symmetric")
     top, left = int(rng.integers(0, photo.shape[0] - tall + 1)), int(rng.integers(0, photo.shape[1] - wide + 1))
     return photo[top : top + tall, left : left + wide]
 
 
-def _white_balance(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
-    """Warmer above 1, colder below."""
-    return replace(shot, rgb=np.clip(shot.rgb * np.array([factor, 1.0, 1.0 / factor], np.float32), 0, 1))
+def _white_balance(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
+    # Warmer above 1, colder below.
+    return replace(photo, rgb=np.clip(photo.rgb * np.array([factor, 1.0, 1.0 / factor], np.float32), 0, 1))
 
 
-def _saturation(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
-    """Of the colours, by luma (ITU-R BT.601); 0 leaves a gray picture."""
-    luma = shot.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32)
-    return replace(shot, rgb=np.clip(luma + factor * (shot.rgb - luma), 0, 1).astype(np.float32))
+def _saturation(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
+    """Scale the distance of colours from their luma (ITU-R BT.601); 0 gives a grey photo."""
+    luma = photo.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32)
+    return replace(photo, rgb=np.clip(luma + factor * (photo.rgb - luma), 0, 1).astype(np.float32))
 
 
-def _scale(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
-    """Every pixel of the new size is the mean over what it covers, or interpolated where it grows."""
-    old = shot.intrinsics
+def _scale(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
+    """Resample: by the mean over each new pixel's area, or by interpolation where the photo is enlarged."""
+    old = photo.intrinsics
     camera = old.resized(max(2, round(old.width * factor)), max(2, round(old.height * factor)))
-    rgb, mask = resized(shot.rgb, camera.width, camera.height), shot.mask
+    rgb, mask = resized(photo.rgb, camera.width, camera.height), photo.mask
     if mask is not None:
         grown = np.repeat(mask[..., None], 3, 2).astype(np.float32)
         mask = resized(grown, camera.width, camera.height)[..., 0] > 0.999
-    return replace(shot, rgb=rgb, mask=mask, intrinsics=camera)
+    return replace(photo, rgb=rgb, mask=mask, intrinsics=camera)
 
 
-def _focal(shot: Shot, factor: float, rng: np.random.Generator) -> Shot:
-    return replace(shot, told_focal=shot.told_focal * factor)
+def _focal(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
+    return replace(photo, sent_focal_factor=photo.sent_focal_factor * factor)
 
 
-def _crop(shot: Shot, share: float, rng: np.random.Generator) -> Shot:
-    """Keeps the middle: `share` of width and height."""
-    old = shot.intrinsics
+def _crop(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
+    """Keep the middle: `share` of width and height."""
+    old = photo.intrinsics
     width, height = max(1, round(old.width * share)), max(1, round(old.height * share))
     left, top = (old.width - width) // 2, (old.height - height) // 2
     camera = replace(old, width=width, height=height, cx=old.cx - left, cy=old.cy - top)
     area = np.s_[top : top + height, left : left + width]
-    mask = None if shot.mask is None else shot.mask[area].copy()
-    return replace(shot, rgb=shot.rgb[area].copy(), mask=mask, intrinsics=camera)
+    mask = None if photo.mask is None else photo.mask[area].copy()
+    return replace(photo, rgb=photo.rgb[area].copy(), mask=mask, intrinsics=camera)
 
 
-def _roll(shot: Shot, degrees: float, rng: np.random.Generator) -> Shot:
-    """Turns the camera about its axis; the picture grows so that nothing is cut off, and the padding is masked."""
-    old = shot.intrinsics
+def _roll(photo: Photo, degrees: float, rng: np.random.Generator) -> Photo:
+    """Roll the camera; the image is enlarged so that nothing is cut off, and the padding is masked."""
+    old = photo.intrinsics
     camera_from_rolled = so3_exp(np.array([0.0, 0.0, np.radians(degrees)]))
     focal = float(np.sqrt(old.fx * old.fy))
     corners = np.array([[0, 0], [old.width, 0], [0, old.height], [old.width, old.height]], float)
     rays = np.concatenate([(corners - [old.cx, old.cy]) / [old.fx, old.fy], np.ones((4, 1))], 1)
     extent = focal * (rays @ camera_from_rolled)[:, :2]
-    low = extent.min(0)  # not rounded: quarter turns then take pixel centres to pixel centres
+    low = extent.min(0)  # not rounded, so that quarter turns map pixel centres onto pixel centres
     width, height = (int(v) for v in np.ceil(extent.max(0) - low - 1e-6))
     camera = Intrinsics(width, height, focal, focal, float(-low[0]), float(-low[1]))
     rows, columns = np.mgrid[:height, :width]
     x, y = (columns + 0.5 - camera.cx) / focal, (rows + 0.5 - camera.cy) / focal
     rays = np.stack([x, y, np.ones_like(x)], -1) @ camera_from_rolled.T
     at = rays[..., 0] * old.fx + old.cx, rays[..., 1] * old.fy + old.cy
-    before = np.ones(shot.rgb.shape[:2], bool) if shot.mask is None else shot.mask
-    mask = _sampled(np.repeat(before[..., None], 3, 2).astype(np.float32), *at)[..., 0] > 0.999
-    matrix = shot.pose.world_from_camera.copy()
+    before = np.ones(photo.rgb.shape[:2], bool) if photo.mask is None else photo.mask
+    mask = _sample(np.repeat(before[..., None], 3, 2).astype(np.float32), *at)[..., 0] > 0.999
+    matrix = photo.pose.world_from_camera.copy()
     matrix[:3, :3] = matrix[:3, :3] @ camera_from_rolled
-    turned = replace(shot, rgb=_sampled(shot.rgb, *at), intrinsics=camera, pose=Pose(matrix))
-    return replace(turned, mask=None if mask.all() else mask)
+    rolled = replace(photo, rgb=_sample(photo.rgb, *at), intrinsics=camera, pose=Pose(matrix))
+    return replace(rolled, mask=None if mask.all() else mask)
 
 
-def _sampled(
+def _sample(
     rgb: Float32[np.ndarray, "h w 3"], x: Float64[np.ndarray, "a b"], y: Float64[np.ndarray, "a b"]
 ) -> Float32[np.ndarray, "a b 3"]:
-    """Bilinear; black outside."""
+    """Sample bilinearly at pixels (x, y); black outside."""
     height, width = rgb.shape[:2]
     inside = (x > 0) & (x < width) & (y > 0) & (y < height)
     x, y = np.clip(x - 0.5, 0, width - 1), np.clip(y - 0.5, 0, height - 1)
@@ -217,7 +220,7 @@ def _sampled(
     return ((upper * (1 - v) + lower * v) * inside[..., None]).astype(np.float32)
 
 
-_Change = Callable[[Shot, float, np.random.Generator], Shot]
+_Change = Callable[[Photo, float, np.random.Generator], Photo]
 MODIFICATIONS: dict[str, tuple[float, float, _Change]] = {
     "gain": (0.05, 20.0, _gain),
     "gamma": (0.1, 10.0, _gamma),
@@ -232,4 +235,4 @@ MODIFICATIONS: dict[str, tuple[float, float, _Change]] = {
     "crop": (0.1, 1.0, _crop),
     "roll": (-180.0, 180.0, _roll),
 }
-"""Name -> least value, greatest value, what it does."""
+"""Name -> smallest value, largest value, function."""

@@ -1,4 +1,4 @@
-"""What the bench counts: errors in normalized units, joint success, and what is falsely called localized."""
+"""Metrics of the benches: pose errors in normalized units, success within bounds, false localizations."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from service.types import Camera, Pose
 FOCUS_DISTANCE = 4.0
 """Median distance of the training cameras from the focus, in normalized units."""
 COARSE = (5.0, 0.05)
-"""Degrees and normalized units."""
+"""Bounds of a success: degrees and normalized units. A localized photo outside of these is false."""
 FINE = (1.0, 0.01)
+"""Bounds of an accurate success."""
 
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """The normalized frame of a scene: origin in the focus, median camera at distance 4."""
+    """The normalized frame of a scene: origin at its focus, median distance of the training cameras 4."""
 
     focus_in_world: Float64[np.ndarray, "3"]
     units_per_scene_unit: float
     forward_facing: bool
 
     def normalized_from_world(self) -> Float64[np.ndarray, "4 4"]:
-        """Shift and even scale; the axes stay the scene's."""
+        """Return the similarity transform into the normalized frame, whose axes are the world's."""
         matrix = np.diag([self.units_per_scene_unit] * 3 + [1.0])
         matrix[:3, 3] = -self.units_per_scene_unit * self.focus_in_world
         return matrix
@@ -43,7 +44,7 @@ def units_of(cameras: Sequence[Camera], depth_of: Callable[[Camera], float]) -> 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """One answered query."""
+    """Errors and times of one localized photo."""
 
     status: Status
     rotation_deg: float
@@ -53,14 +54,16 @@ class Outcome:
     cpu_ms: float
 
     def success(self, bound: tuple[float, float]) -> bool:
-        """Called localized, and within both bounds: a right pose that is called uncertain is a miss."""
+        """Whether the status is localized and both errors are within bounds; a correct but uncertain pose is a miss."""
         return self.status is Status.LOCALIZED and self.within(bound)
 
     def within(self, bound: tuple[float, float]) -> bool:
+        """Whether both errors are within bounds, whatever the status."""
         return self.rotation_deg <= bound[0] and self.translation_units <= bound[1]
 
     @property
     def false(self) -> bool:
+        """Whether the status is localized though the pose is wrong."""
         return self.status is Status.LOCALIZED and not self.within(COARSE)
 
 
@@ -71,9 +74,9 @@ def errors(estimate: Pose, truth: Pose, units: Units) -> tuple[float, float]:
 
 
 def nees(estimate: PoseEstimate, truth: Pose) -> float | None:
-    """Return the normalized error squared: 6 on average if the covariance is true.
+    """Return the normalized estimation error squared, e^T C^-1 e, of the pose's twist: 6 on average if C is consistent.
 
-    None without a covariance, or where it is singular: with little to see at a wrong pose, few residuals made it.
+    None without a covariance, or where it is singular, which happens when few residuals contribute.
     """
     covariance = estimate.verdict.covariance
     if covariance is None or np.linalg.matrix_rank(covariance, hermitian=True) < len(covariance):
@@ -83,7 +86,7 @@ def nees(estimate: PoseEstimate, truth: Pose) -> float | None:
 
 
 def summary(outcomes: Sequence[Outcome]) -> dict[str, float | int]:
-    """Return the aggregate figures of `splatfix bench localize`; medians are over all answers, good and bad."""
+    """Return the aggregate figures of `splatfix bench localize`; medians are over all photos, whatever their status."""
     latencies = [o.latency_ms for o in outcomes]
     return {
         "queries": len(outcomes),

@@ -1,12 +1,12 @@
-"""`splatfix bench render`: time the renderer on a synthetic room, always the same one.
+"""`splatfix bench render`: times of the renderer on a synthetic room that is the same in every run.
 
-The room imitates what a 3DGS trainer makes of an interior: flat Gaussians on walls, floor, ceiling and boxes, sized so
-that they overlap, and a tenth of loose ones in the air. Six cameras inside, 4:3, see 7 to 10 % of them. A pixel
-evaluates about 40 at 800 px and 100 at 100 px (200 of 500,000), counting every Gaussian that touches the pixel's 4x4
-block until the block is opaque.
+The room imitates an interior reconstructed by a 3DGS trainer: flat Gaussians on walls, floor, ceiling and boxes, sized
+so that they overlap, and a tenth of them free in the air. Each of six cameras inside, 4:3, sees 7 to 10 % of them. A
+pixel evaluates about 40 Gaussians at 800 px and 100 at 100 px (200 of 500,000), counting each that touches the pixel's
+4x4 block until the block is opaque.
 
-Each size is rendered as if the scene had been trained at it, with the full dilation of 0.3 px^2: the figures to
-demand were measured so. A scene trained at a larger size has less overlap in a small render, and is faster.
+Each size is rendered as if the scene had been trained at it, with the full dilation of 0.3 px^2. A scene trained at a
+larger size has less overlap in a small render, and is faster.
 """
 
 from __future__ import annotations
@@ -27,11 +27,15 @@ from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
 
 CASES = ((20_000, 200), (100_000, 100), (100_000, 200), (100_000, 400), (100_000, 800), (500_000, 200), (500_000, 800))
-"""Gaussians and width in pixels."""
+"""Pairs of the number of Gaussians and the image width in px."""
 ROOM = np.array([8.0, 6.0, 3.0])
-"""Width, depth and height of the room in units; its centre is the origin, z is up."""
-FIELD_OF_VIEW = np.radians(60.0)
+"""Width, depth and height of the room in scene units; its centre is the origin, z is up."""
+FIELD_OF_VIEW_RAD = np.radians(60.0)
 """Horizontal."""
+_LOOSE_SHARE = 0.1
+"""Of the Gaussians: free in the air."""
+_SCALE_OVER_SPACING = 0.8
+"""Median scale of a Gaussian over the distance of neighbours; gives the overlap that the module's docstring states."""
 
 
 def run(
@@ -40,11 +44,11 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     cases: Sequence[tuple[int, int]] = CASES,
 ) -> list[dict[str, Any]]:
-    """Return the list that `--json` writes: a row per case, stage and number of threads, in ms per picture.
+    """Return the list that `--json` writes: a row per case, stage and number of threads, in ms per image.
 
-    Least and median time are over `repeats`, averaged over the six cameras. The stages pose_gradient and
-    all_gradients are what their calls take after a render of the same camera, of which the renderer keeps the
-    lists: the time in addition to the forward. With more than one thread the six are rendered in one call.
+    Minimum and median are over `repeats`, then averaged over the six cameras. The stages pose_gradient and
+    all_gradients are timed after a render of the same camera, whose lists the renderer keeps: they are the time in
+    addition to the forward pass. With more than one thread the six cameras are rendered in one call.
     """
     rows = []
     scenes: dict[int, GaussianScene] = {}
@@ -76,9 +80,9 @@ def run(
 def _times(
     rasterizer: Rasterizer, cameras: Sequence[Camera], repeats: int
 ) -> dict[tuple[str, int], Float64[np.ndarray, "2 r c"]]:
-    """Seconds of wall and CPU time, by stage and threads, for every repeat and camera.
+    """Return seconds of wall and CPU time, by stage and threads, for each repeat and camera.
 
-    A first repeat, which touches the memory, is not counted.
+    A first repeat, which allocates the memory, is not counted.
     """
     each = [_stage_times(rasterizer, camera, repeats) for camera in cameras]
     times = {(stage, 1): np.stack([e[stage] for e in each], 2) for stage in each[0]}
@@ -111,21 +115,20 @@ def _seconds(call: Callable[[], object]) -> tuple[float, float]:
 
 
 def synthetic_room(count: int, sh_degree: int = 3, seed: int = 0) -> GaussianScene:
-    """Return a room of `count` Gaussians; the same for the same arguments."""
+    """Return a room of `count` Gaussians, which depends on the arguments only."""
     rng = np.random.default_rng(seed)
-    loose = count // 10
+    loose = int(count * _LOOSE_SHARE)
     means, normals, area = _on_surfaces(count - loose, rng)
     means = np.concatenate([means, rng.uniform(-0.48, 0.48, (loose, 3)) * ROOM])
     normals = np.concatenate([normals, _directions(loose, rng)])
-    # 0.8 of the distance between neighbours sets the overlap; measured as in the module's docstring.
     spacing = np.sqrt(area / count)
-    scales = 0.8 * spacing * np.exp(rng.normal(0.0, 0.35, (count, 3)))
+    scales = _SCALE_OVER_SPACING * spacing * np.exp(rng.normal(0.0, 0.35, (count, 3)))
     scales[:, 2] *= 0.1
     sh = rng.normal(0.0, 0.05, (count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = 1.2 * np.sin(means[:, None, :] * [1.3, 1.7, 2.1] + means[:, :1, None])[:, 0]
     return GaussianScene(
         means=means.astype(np.float32),
-        quats=_facing(normals, rng).astype(np.float32),
+        quats=_rotations_to(normals, rng).astype(np.float32),
         scales=scales.astype(np.float32),
         opacities=(1 / (1 + np.exp(-rng.normal(1.0, 1.5, count)))).astype(np.float32),
         sh=sh.astype(np.float32),
@@ -134,9 +137,9 @@ def synthetic_room(count: int, sh_degree: int = 3, seed: int = 0) -> GaussianSce
 
 
 def room_cameras(width: int) -> list[Camera]:
-    """Return six cameras inside the room, 4:3."""
+    """Return six cameras inside the room with images of this width, 4:3."""
     height = width * 3 // 4
-    focal = width / (2 * np.tan(FIELD_OF_VIEW / 2))
+    focal = width / (2 * np.tan(FIELD_OF_VIEW_RAD / 2))
     intrinsics = Intrinsics(width, height, focal, focal, width / 2, height / 2)
     cameras = []
     for index, distance in enumerate((2.8, 2.8, 2.2, 2.5, 2.7, 2.1)):
@@ -150,9 +153,9 @@ def room_cameras(width: int) -> list[Camera]:
 def _on_surfaces(
     count: int, rng: np.random.Generator
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"], float]:
-    """Points spread evenly over the walls and the furniture, with normals, and the area in square units."""
+    """Return points uniform on walls and furniture, their normals, and the total area in square scene units."""
     boxes = [(np.zeros(3), ROOM)]
-    # Furniture along the walls, so that no camera is inside of it.
+    # Furniture along the walls, where no camera is.
     for x, y, w, d, h in (
         (-3.2, 1.8, 1.2, 1.8, 1.1),
         (3.2, -1.5, 1.0, 2.2, 1.9),
@@ -180,9 +183,9 @@ def _directions(count: int, rng: np.random.Generator) -> Float64[np.ndarray, "n 
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def _facing(normals: Float64[np.ndarray, "n 3"], rng: np.random.Generator) -> Float64[np.ndarray, "n 4"]:
-    """Quaternions wxyz that turn the thin axis (z) to the normal, after a random turn about it."""
-    # From z to n: (1 + n_z, z x n), not normalized yet; a half turn about x where n points to -z.
+def _rotations_to(normals: Float64[np.ndarray, "n 3"], rng: np.random.Generator) -> Float64[np.ndarray, "n 4"]:
+    """Return quaternions wxyz that rotate the thin axis (z) to the normal, after a random rotation about z."""
+    # From z to n: (1 + n_z, z x n), not yet normalized; a half turn about x where n is -z.
     tilt = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], 1)
     tilt[tilt[:, 0] < 1e-6] = [0.0, 1.0, 0.0, 0.0]
     tilt /= np.linalg.norm(tilt, axis=1, keepdims=True)

@@ -1,8 +1,9 @@
-"""`splatfix bench scale`: what a scene costs as it grows, from the file to its localized photos.
+"""`splatfix bench scale`: time and memory by the size of a scene, from its file to its localized photos.
 
-Each size is a scene folder of its own (see `tiles`), measured in a process of its own. Loading is timed twice: from the
-file, which leaves the form that is mapped, and from that. Memory is the process's: `peak` up to the end of loading and
-indexing; `resident` when the photos are done, of which `anonymous` is what no file backs and the kernel can't drop.
+Each size is a scene folder of its own (see `large_scenes`), measured in a process of its own. Loading is timed twice:
+from the file, which writes the cached memory-mapped form, and from that form. Memory is the process's: `peak` up to the
+end of loading and indexing; `resident` after the photos, of which `anonymous` is not backed by a file, so that the
+kernel can't drop it.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from service.bench.bench_photos import find_photos
-from service.bench.pose_metrics import COARSE, FINE, Outcome, errors, units_of
+from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, units_of
 from service.errors import BackendMissing, InvalidRequest
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
 from service.photos.images import read_query
@@ -29,6 +30,7 @@ from service.scene_formats import load_scene
 from service.types import Camera, GaussianScene
 
 SIZES = (100_000, 300_000, 1_000_000, 3_000_000)
+"""Numbers of Gaussians."""
 _STATUS = Path("/proc/self/status")
 
 
@@ -42,10 +44,10 @@ def run(
     work: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Return the list that `--json` writes, a row per size. Raises SceneError, InvalidRequest.
+    """Return the list that `--json` writes, a row per size in Gaussians. Raises SceneError, InvalidRequest.
 
-    `others` are the scenes around the one whose photos are localized; without any, varied copies of it. `cameras` as in
-    `bench localize`. `work` is where the large scenes are written; by default a temporary folder.
+    `others` are put around the scene whose photos are localized; without any, varied copies of it. `cameras` as in
+    `bench localize`. The large scenes are written to a temporary folder, in `work` if it is given.
     """
     if find_spec("gsply") is None:
         raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
@@ -56,20 +58,20 @@ def run(
     held_back = [name for photo in find_photos(folder) for name in photo.names]
     scene = load_scene(folder, without_photos=held_back)
     if not scene.cameras:
-        raise InvalidRequest("the scene needs training cameras: its units and its small sizes rest on them.")
+        raise InvalidRequest("the scene needs training cameras, from which its units and its small sizes are computed.")
     around = [load_scene(other) for other in others]
     units = units_of([n.camera for n in scene.cameras], _depth_of(scene))
     rows = []
     for done, count in enumerate(sizes, 1):
         with tempfile.TemporaryDirectory(dir=work) as temporary:
             at = Path(temporary, f"{count}")
-            large = _sized(scene, count, around)
+            large = _resize(scene, count, around)
             file = write_folder(large, at, folder, cameras=cameras == "given", compressed=compressed)
             facts = {"gaussians": large.count, "sh_degree": large.sh_degree, "file": file.name}
             facts |= {"cameras": cameras, "file_bytes": file.stat().st_size}
             del large
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                rows.append(facts | process.submit(measured, at, units).result())
+                rows.append(facts | process.submit(measure_folder, at, units).result())
         if progress:
             progress(done, len(sizes))
     return rows
@@ -80,16 +82,19 @@ def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:
     return lambda camera: centre_depth(rasterizer, camera)
 
 
-def _sized(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
-    from service.bench.large_scenes import thinned, tiled
+def _resize(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
+    from service.bench.large_scenes import keep_most_contributing, surround_with_copies
 
     if count < scene.count:
-        return thinned(scene, count, LoadedScene.of(scene).rasterizer)
-    return tiled(scene, count, others)
+        return keep_most_contributing(scene, count, LoadedScene.of(scene).rasterizer)
+    return surround_with_copies(scene, count, others)
 
 
-def measured(folder: Path, units: Any) -> dict[str, Any]:
-    """Load, index and localize a scene folder; the first localization isn't counted. For a fresh process."""
+def measure_folder(folder: Path, units: Units) -> dict[str, Any]:
+    """Return times, memory and accuracy of loading, indexing and localizing in a scene folder.
+
+    To be called in a new process. The first localization isn't counted.
+    """
     cache = folder / "cache"
     seconds: dict[str, float] = {}
 
@@ -99,7 +104,7 @@ def measured(folder: Path, units: Any) -> dict[str, Any]:
         seconds[f"{name}_s"], seconds[f"{name}_cpu_s"] = time.perf_counter() - wall, time.process_time() - cpu
         return result
 
-    timed("warm_up", _warm)
+    timed("warm_up", _warm_up)
     before = _memory()
     loaded = timed("load", lambda: LoadedScene.load(folder, cache_dir=cache))
     index = timed("index", lambda: loaded.prepare(DEFAULT_ESTIMATOR))
@@ -125,8 +130,8 @@ def measured(folder: Path, units: Any) -> dict[str, Any]:
     }
 
 
-def _warm() -> None:
-    """Load the libraries and compile the kernels on a scene of nothing much."""
+def _warm_up() -> None:
+    """Load the libraries and compile the kernels, with a small scene."""
     from service.bench.render import room_cameras, synthetic_room
 
     loaded = LoadedScene.of(synthetic_room(2000))
@@ -134,7 +139,7 @@ def _warm() -> None:
     loaded.matcher.extract(np.zeros((96, 128, 3), np.uint8), 10)
 
 
-def _outcomes(folder: Path, loaded: LoadedScene, units: Any) -> list[Outcome]:
+def _outcomes(folder: Path, loaded: LoadedScene, units: Units) -> list[Outcome]:
     outcomes = []
     photos = find_photos(folder)
     for photo in [photos[0], *photos]:
@@ -150,6 +155,6 @@ def _outcomes(folder: Path, loaded: LoadedScene, units: Any) -> list[Outcome]:
 
 
 def _memory() -> dict[str, int]:
-    """Return what Linux counts for this process, in bytes."""
+    """Return the counters of /proc/self/status for this process, in bytes."""
     found = re.findall(r"(\w+):\s+(\d+) kB", _STATUS.read_text())
     return {name: 1024 * int(value) for name, value in found}

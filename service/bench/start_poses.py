@@ -1,12 +1,12 @@
-"""Start poses for estimators that need one, seeded; the paper's protocol and our own.
+"""Seeded start poses for estimators that need one, by the paper's protocols and others.
 
 near, easy, hard: the perturbation of iComMa and the paper, start = T Rz Ry Rx gt, acting in the normalized *world*
-frame (origin in the focus), so that its rotations carry the camera round the scene. Per axis |angle| is in 0..30
+frame (origin in the focus), so that its rotations orbit the camera about the scene. Per axis |angle| is in 0..30
 degrees and |t| in 0..0.5 units (easy), 30..60 and 0.5..1.0 (hard), signs at random. `near` is for the losses
-(Table 1), of which the paper says no more than "near the truth": 0..2 and 0..0.05, about what DO leaves over.
-pnerf: turned in place, per world axis -15..15 degrees, and shifted, per axis -0.25..0.25 units.
-inplace: 15 to 40 degrees about a random axis through the camera, which stays where it is.
-random: a place within the box of the training cameras, any rotation.
+(Table 1), for which the paper says only "near the truth": 0..2 and 0..0.05, about the error after DO.
+pnerf: rotated about the camera's centre, per world axis -15..15 degrees, and translated, per axis -0.25..0.25 units.
+inplace: rotated by 15 to 40 degrees about a random axis through the camera's centre.
+random: a position in the bounding box of the training cameras, with a uniformly random rotation.
 """
 
 from __future__ import annotations
@@ -21,14 +21,19 @@ from service.errors import UnknownName
 from service.geometry import rotation_from_quat, so3_exp
 from service.types import Camera, Pose
 
-_WORLD = {"near": ((0.0, 2.0), (0.0, 0.05)), "easy": ((0.0, 30.0), (0.0, 0.5)), "hard": ((30.0, 60.0), (0.5, 1.0))}
-"""Range of degrees and of normalized units, per axis."""
+_WORLD_PERTURBATIONS = {
+    "near": ((0.0, 2.0), (0.0, 0.05)),
+    "easy": ((0.0, 30.0), (0.0, 0.5)),
+    "hard": ((30.0, 60.0), (0.5, 1.0)),
+}
+"""Ranges of the angle in degrees and the translation in normalized units, per axis."""
 PNERF_DEG, PNERF_UNITS = 15.0, 0.25
-KINDS = ("none", *_WORLD, "pnerf", "inplace", "random")
+INPLACE_DEG = (15.0, 40.0)
+KINDS = ("none", *_WORLD_PERTURBATIONS, "pnerf", "inplace", "random")
 
 
 def require_kind(kind: str) -> None:
-    """Raise UnknownName unless there is such a start."""
+    """Raise UnknownName unless `kind` is one of `KINDS`."""
     if kind not in KINDS:
         raise UnknownName(f"there is no start '{kind}'; known: {', '.join(KINDS)}.", where="start")
 
@@ -36,19 +41,22 @@ def require_kind(kind: str) -> None:
 def start_pose(
     kind: str, truth: Pose, units: Units, cameras: Sequence[Camera], rng: np.random.Generator
 ) -> Pose | None:
-    """Return the pose to start from; None for kind 'none'. Raises UnknownName."""
+    """Return a start pose in the world frame; None for kind 'none'.
+
+    `cameras` are the training cameras, for kind 'random'. Raises UnknownName.
+    """
     require_kind(kind)
     if kind == "none":
         return None
-    if kind in _WORLD:
-        return _perturbed_in_world(truth, units, *_WORLD[kind], rng)
+    if kind in _WORLD_PERTURBATIONS:
+        return _perturbed_in_world(truth, units, *_WORLD_PERTURBATIONS[kind], rng)
     matrix = truth.world_from_camera.copy()
     if kind == "inplace":
         axis = rng.normal(size=3)
-        angle = np.radians(rng.uniform(15.0, 40.0))
+        angle = np.radians(rng.uniform(*INPLACE_DEG))
         matrix[:3, :3] = matrix[:3, :3] @ so3_exp(angle * axis / np.linalg.norm(axis))
     elif kind == "pnerf":
-        matrix[:3, :3] = _turn(np.radians(rng.uniform(-PNERF_DEG, PNERF_DEG, 3))) @ matrix[:3, :3]
+        matrix[:3, :3] = _rotation_xyz(np.radians(rng.uniform(-PNERF_DEG, PNERF_DEG, 3))) @ matrix[:3, :3]
         matrix[:3, 3] += rng.uniform(-PNERF_UNITS, PNERF_UNITS, 3) / units.units_per_scene_unit
     else:
         positions = np.stack([camera.pose.position_in_world for camera in cameras])
@@ -66,7 +74,7 @@ def _perturbed_in_world(
 ) -> Pose:
     signs = rng.choice([-1.0, 1.0], 6)
     angles = np.radians(rng.uniform(*degrees, 3)) * signs[:3]
-    rotation = _turn(angles)
+    rotation = _rotation_xyz(angles)
     shift: Float64[np.ndarray, "3"] = rng.uniform(*lengths, 3) * signs[3:]
     matrix = np.eye(4)
     matrix[:3, :3] = rotation @ truth.world_from_camera[:3, :3]
@@ -76,8 +84,8 @@ def _perturbed_in_world(
     return Pose(matrix)
 
 
-def _turn(angles: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Rz Ry Rx; in rad."""
+def _rotation_xyz(angles: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return Rz Ry Rx; angles in rad."""
     rotation = np.eye(3)
     for axis in range(3):
         rotation = so3_exp(angles[axis] * np.eye(3)[axis]) @ rotation

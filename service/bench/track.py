@@ -1,9 +1,8 @@
-"""`splatfix bench track`: follow a camera along a smooth path through a scene, frame by frame.
+"""`splatfix bench track`: tracking of a camera along a smooth path through a scene.
 
-The path goes through the training cameras, from one to the nearest that wasn't visited yet, on splines, at a steady
-pace: per frame at most STEP_DEG and STEP_UNITS, which at 30 frames a second is a walk with a phone. Its frames are
-rendered in the training cameras' size and stored as JPEG, with noise, and with an exposure that goes up and down. The
-truth is exact then, and the scene is as good as it can be: real photos are `bench localize`'s.
+The path is a spline through the training cameras, from each to the nearest not yet visited, at a constant speed. Its
+frames are rendered from the scene, with noise and a changing exposure, and compressed as JPEG. The true poses are
+therefore exact and the scene has no errors; `bench localize` measures real photos.
 """
 
 from __future__ import annotations
@@ -31,17 +30,28 @@ from service.scene_formats import load_scene
 from service.tracking import Tracker
 from service.types import Camera, Intrinsics, Pose
 
-STEP_DEG, STEP_UNITS = 0.7, 0.02
-LONG_SIDE = 800
-NOISE = 0.03
-"""Standard deviation, of values 0..1."""
-GAIN = 1.35
-"""The exposure swings by this factor up and down..."""
-GAIN_PERIOD = 90
-"""...once in so many frames."""
-QUALITY = 90
-KNOTS_DENSITY = 64
-"""Places looked at between two cameras, to keep the pace."""
+
+@dataclass(frozen=True, slots=True)
+class SequenceConfig:
+    """The synthetic image sequence; the defaults resemble a phone carried by a walking person at 30 frames a second."""
+
+    step_deg: float = 0.7
+    """Largest rotation per frame."""
+    step_units: float = 0.02
+    """Largest translation per frame, normalized units."""
+    long_side_px: int = 800
+    noise_sigma: float = 0.03
+    """Standard deviation of the noise, of values 0..1."""
+    gain: float = 1.35
+    """Largest exposure gain; the smallest is its inverse."""
+    gain_period: int = 90
+    """Frames of one cycle of the exposure."""
+    jpeg_quality: int = 90
+    samples_per_knot: int = 64
+    """Points of the spline between two training cameras at which its length is measured."""
+
+
+SEQUENCE = SequenceConfig()
 
 
 def run(
@@ -52,8 +62,9 @@ def run(
     intrinsics: Literal["given", "withheld"] = "given",
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
+    config: SequenceConfig = SEQUENCE,
 ) -> dict[str, Any]:
-    """Return the object that `--json` writes. Raises SceneError."""
+    """Return the object that `--json` writes: aggregate figures, and a line per frame. Raises SceneError."""
     loaded = LoadedScene.of(load_scene(Path(folder)), cache_dir=cache_dir)
     training = [named.camera for named in loaded.scene.cameras]
     if len(training) < 2:
@@ -61,40 +72,43 @@ def run(
     request = Request(seed=seed)
     loaded.prepare(request.estimator)
     units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
-    path = smooth_path([camera.pose for camera in training], units, frames)
-    lens = replace(training[0].intrinsics.with_long_side(LONG_SIDE), model="PINHOLE", distortion=())
-    given = lens if intrinsics == "given" else None
+    path = smooth_path([camera.pose for camera in training], units, frames, config)
+    camera = replace(training[0].intrinsics.with_long_side(config.long_side_px), model="PINHOLE", distortion=())
+    given = camera if intrinsics == "given" else None
     tracker = Tracker(loaded, request)
     steps = []
-    warm = next(_photos(path, lens, loaded.rasterizer, seed))
-    Tracker(loaded, request).track(read_query(warm, intrinsics=given, long_side=PHOTO_LONG_SIDE))
-    for number, data in enumerate(_photos(path, lens, loaded.rasterizer, seed)):
-        steps.append(_step(tracker, data, given, path[number], units))
+    # The first localization compiles and allocates; its time isn't counted.
+    first = next(_render_frames(path, camera, loaded.rasterizer, seed, config))
+    Tracker(loaded, request).track(read_query(first, intrinsics=given, long_side=PHOTO_LONG_SIDE))
+    for number, data in enumerate(_render_frames(path, camera, loaded.rasterizer, seed, config)):
+        steps.append(_track_frame(tracker, data, given, path[number], units))
         if progress:
             progress(number + 1, len(path))
     facts = {"scene": loaded.scene.info.name, "gaussians": loaded.scene.count, "seed": seed, "intrinsics": intrinsics}
-    facts |= {"width": lens.width, "height": lens.height, "noise": NOISE, "gain": GAIN, "jpeg": QUALITY}
+    facts |= {"width": camera.width, "height": camera.height}
+    facts |= {"noise": config.noise_sigma, "gain": config.gain, "jpeg": config.jpeg_quality}
     moves = [errors(a, b, units) for a, b in pairwise(path)]
     facts |= {"step_deg_p50": _median(m[0] for m in moves), "step_units_p50": _median(m[1] for m in moves)}
-    return facts | summary(steps) | {"per_frame": [_line(step, lens) for step in steps]}
+    return facts | summary(steps) | {"per_frame": [_frame_result(step, camera) for step in steps]}
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One frame's answer."""
+    """Estimate and errors of one frame."""
 
     estimate: PoseEstimate
     outcome: Outcome
-    """Its latency is from the JPEG's bytes on."""
+    """With the latency from the JPEG's bytes to the estimate."""
     decode_ms: float
     nees: float | None
 
     @property
     def followed(self) -> bool:
+        """Whether the pose was tracked from the frames before, without a search in the whole scene."""
         return self.estimate.records[-1].stage == "track"
 
 
-def _step(tracker: Tracker, data: bytes, given: Intrinsics | None, truth: Pose, units: Units) -> Step:
+def _track_frame(tracker: Tracker, data: bytes, given: Intrinsics | None, truth: Pose, units: Units) -> Step:
     wall, cpu = time.perf_counter(), time.process_time()
     query = read_query(data, intrinsics=given, long_side=PHOTO_LONG_SIDE)
     decode_ms = 1e3 * (time.perf_counter() - wall)
@@ -105,9 +119,9 @@ def _step(tracker: Tracker, data: bytes, given: Intrinsics | None, truth: Pose, 
 
 
 def summary(steps: Sequence[Step]) -> dict[str, Any]:
-    """Return the aggregate figures; latencies are of the frames after the first, which nothing precedes.
+    """Return the aggregate figures; latencies are of the frames after the first, which can't be tracked.
 
-    `drift`: how much larger the median error of the last tenth of the frames is than that of the first.
+    drift: median error of the last tenth of the frames minus that of the first tenth.
     """
     outcomes = [step.outcome for step in steps]
     later = outcomes[1:] or outcomes
@@ -133,35 +147,38 @@ def summary(steps: Sequence[Step]) -> dict[str, Any]:
     }
 
 
-def smooth_path(stations: Sequence[Pose], units: Units, frames: int) -> list[Pose]:
-    """Return poses on a spline through the stations, nearest first, at a steady pace; back and forth if need be."""
-    tour = _tour(stations, units)
+def smooth_path(stations: Sequence[Pose], units: Units, frames: int, config: SequenceConfig = SEQUENCE) -> list[Pose]:
+    """Return poses at a constant speed on a Catmull-Rom spline through the stations, in nearest-neighbour order.
+
+    A path of more frames than the spline's length goes back and forth.
+    """
+    tour = _nearest_neighbour_order(stations, units, config)
     knots = np.stack([_vector(pose) for pose in tour])
     for i in range(1, len(knots)):  # a quaternion and its negative are one rotation
         if knots[i, 3:] @ knots[i - 1, 3:] < 0:
             knots[i, 3:] *= -1
-    at = np.linspace(0, len(knots) - 1, KNOTS_DENSITY * (len(knots) - 1) + 1)
+    at = np.linspace(0, len(knots) - 1, config.samples_per_knot * (len(knots) - 1) + 1)
     dense = [_pose(_spline(knots, t)) for t in at]
-    ways = [_pace(a, b, units) for a, b in pairwise(dense)]
-    along = np.concatenate([[0.0], np.cumsum(ways)])
-    there = np.arange(frames) % max(1.0, 2 * along[-1])
-    there = np.where(there > along[-1], 2 * along[-1] - there, there)
-    return [_pose(_spline(knots, t)) for t in np.interp(there, along, at)]
+    lengths = [_frames_between(a, b, units, config) for a, b in pairwise(dense)]
+    along = np.concatenate([[0.0], np.cumsum(lengths)])
+    position = np.arange(frames) % max(1.0, 2 * along[-1])
+    position = np.where(position > along[-1], 2 * along[-1] - position, position)
+    return [_pose(_spline(knots, t)) for t in np.interp(position, along, at)]
 
 
-def _tour(stations: Sequence[Pose], units: Units) -> list[Pose]:
+def _nearest_neighbour_order(stations: Sequence[Pose], units: Units, config: SequenceConfig) -> list[Pose]:
     left = list(stations)
     tour = [left.pop(0)]
     while left:
-        nearest = min(range(len(left)), key=lambda i: _pace(tour[-1], left[i], units))
+        nearest = min(range(len(left)), key=lambda i: _frames_between(tour[-1], left[i], units, config))
         tour.append(left.pop(nearest))
     return tour
 
 
-def _pace(a: Pose, b: Pose, units: Units) -> float:
-    """Return in how many frames one gets from one pose to the other."""
-    degrees, way = pose_distance(a, b)
-    return max(degrees / STEP_DEG, way * units.units_per_scene_unit / STEP_UNITS)
+def _frames_between(a: Pose, b: Pose, units: Units, config: SequenceConfig) -> float:
+    """Return the number of frames between two poses at the largest steps."""
+    degrees, distance = pose_distance(a, b)
+    return max(degrees / config.step_deg, distance * units.units_per_scene_unit / config.step_units)
 
 
 def _vector(pose: Pose) -> Float64[np.ndarray, "7"]:
@@ -175,23 +192,25 @@ def _pose(vector: Float64[np.ndarray, "7"]) -> Pose:
 
 
 def _spline(knots: Float64[np.ndarray, "n 7"], t: float) -> Float64[np.ndarray, "7"]:
-    """Catmull and Rom's: through all knots, with a steady direction; `t` counts knots."""
+    """Return the Catmull-Rom spline through the knots at `t`, in knots."""
     i = min(int(t), len(knots) - 2)
     u = t - i
     a, b, c, d = (knots[min(max(j, 0), len(knots) - 1)] for j in range(i - 1, i + 3))
     return 0.5 * (2 * b + u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * b - 3 * c + d - a))))
 
 
-def _photos(path: Sequence[Pose], lens: Intrinsics, rasterizer: Rasterizer, seed: int) -> Iterator[bytes]:
+def _render_frames(
+    path: Sequence[Pose], intrinsics: Intrinsics, rasterizer: Rasterizer, seed: int, config: SequenceConfig
+) -> Iterator[bytes]:
     rng = np.random.default_rng(seed)
     for number, pose in enumerate(path):
-        rgb = rasterizer.render([Camera(lens, pose)])[0].rgb
-        gain = np.float32(GAIN ** np.sin(2 * np.pi * number / GAIN_PERIOD))
-        noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(NOISE)
-        yield encode_image(rgb * gain + noise, quality=QUALITY)
+        rgb = rasterizer.render([Camera(intrinsics, pose)])[0].rgb
+        gain = np.float32(config.gain ** np.sin(2 * np.pi * number / config.gain_period))
+        noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(config.noise_sigma)
+        yield encode_image(rgb * gain + noise, quality=config.jpeg_quality)
 
 
-def _line(step: Step, lens: Intrinsics) -> dict[str, Any]:
+def _frame_result(step: Step, camera: Intrinsics) -> dict[str, Any]:
     verdict, outcome = step.estimate.verdict, step.outcome
     return {
         "status": str(verdict.status),
@@ -200,7 +219,7 @@ def _line(step: Step, lens: Intrinsics) -> dict[str, Any]:
         "followed": step.followed,
         "rotation_deg": outcome.rotation_deg,
         "translation_units": outcome.translation_units,
-        "focal_error": step.estimate.intrinsics.fx / lens.fx - 1.0,
+        "focal_error": step.estimate.intrinsics.fx / camera.fx - 1.0,
         "focal_sigma": verdict.focal_sigma,
         "nees": step.nees,
         "latency_ms": outcome.latency_ms,

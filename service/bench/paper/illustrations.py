@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from service.bench.localize import Subject, Trial, trials_of
+from service.bench.localize import BenchScene, Trial, make_trials
 from service.bench.paper import figures
 from service.bench.paper.plan import MAIN
 from service.bench.paper.tables import Line
@@ -42,9 +42,9 @@ class FigureConfig:
 FIGURES = FigureConfig()
 
 
-def figure_1(one: Subject, config: FigureConfig = FIGURES) -> bytes:
+def figure_1(one: BenchScene, config: FigureConfig = FIGURES) -> bytes:
     """Return Figure 1 as PNG: DO and, without decoupling, iComMa from the same start on the first test photo."""
-    trial = next(trials_of(one, "none", 1, 0))
+    trial = next(make_trials(one, "none", 1, 0))
     truth = trial.truth.pose
     turned = _moved(one, truth, np.radians([0.0, config.rotation_deg, 0.0]), np.zeros(3))
     sidewards = config.translation_units * truth.world_from_camera[:3, 0]
@@ -72,7 +72,7 @@ def figure_1(one: Subject, config: FigureConfig = FIGURES) -> bytes:
     return figures.vectors_and_paths(rows, paths, truth.position_in_world * one.units.units_per_scene_unit)
 
 
-def _moved(one: Subject, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> Pose:
+def _moved(one: BenchScene, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> Pose:
     """Rotate the camera about the focus by angles (rad) per axis, then translate it (normalized units); world axes."""
     rotation = np.eye(3)
     for axis in range(3):
@@ -84,17 +84,17 @@ def _moved(one: Subject, pose: Pose, angles: np.ndarray, shift: np.ndarray) -> P
     return Pose(matrix)
 
 
-def _run(one: Subject, trial: Trial, start: Pose, estimator: str, changed: Mapping[str, Any]) -> PoseEstimate:
+def _run(one: BenchScene, trial: Trial, start: Pose, estimator: str, changed: Mapping[str, Any]) -> PoseEstimate:
     options = ESTIMATORS.load(estimator).Options(**changed)
     return localize(replace(_query(one, trial), prior=start), one.loaded, Request(estimator, options))
 
 
-def _query(one: Subject, trial: Trial) -> Query:
-    return read_query(trial.data, intrinsics=trial.told, background_rgb=one.background_rgb)
+def _query(one: BenchScene, trial: Trial) -> Query:
+    return read_query(trial.data, intrinsics=trial.intrinsics, background_rgb=one.background_rgb)
 
 
 def _shown(
-    title: str, trial: Trial, one: Subject, records: Sequence[IterationRecord], count: int
+    title: str, trial: Trial, one: BenchScene, records: Sequence[IterationRecord], count: int
 ) -> list[figures.Vectors]:
     """Return the match vectors of `count` steps, geometrically spread: most changes in the first ones."""
     photo = _query(one, trial).rgb
@@ -114,14 +114,14 @@ def _shown(
     return found
 
 
-def _path(name: str, estimate: PoseEstimate, truth: Pose, one: Subject) -> figures.Path3D:
+def _path(name: str, estimate: PoseEstimate, truth: Pose, one: BenchScene) -> figures.Path3D:
     poses = [record.pose for record in estimate.records]
     positions = np.stack([pose.position_in_world for pose in poses]) * one.units.units_per_scene_unit
     return figures.Path3D(name, positions, np.array([max(pose_distance(p, truth)[0], 1e-3) for p in poses]))
 
 
 def figures_2_and_3(
-    subjects: Mapping[str, Subject], lines: Sequence[Line], config: FigureConfig = FIGURES
+    subjects: Mapping[str, BenchScene], lines: Sequence[Line], config: FigureConfig = FIGURES
 ) -> tuple[bytes, bytes] | None:
     """Return two PNGs: each method's answer to one query of each scene, blended with the photo, and as it is."""
     blended, plain, names = [], [], []
@@ -130,7 +130,7 @@ def figures_2_and_3(
         if not of_query:
             continue
         trial = next(
-            t for t in trials_of(one, "none", len(one.photos), 0) if t.photo == next(iter(of_query.values()))["photo"]
+            t for t in make_trials(one, "none", len(one.photos), 0) if t.photo == next(iter(of_query.values()))["photo"]
         )
         photo, camera = _photo_and_camera(one, trial, config.picture_px)
         start = next(iter(of_query.values()))["start_world_from_camera"]
@@ -155,14 +155,14 @@ def _most_answered(lines: Sequence[Line]) -> dict[str, Line]:
     return max(queries.values(), key=len, default={})
 
 
-def _photo_and_camera(one: Subject, trial: Trial, long_side_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
+def _photo_and_camera(one: BenchScene, trial: Trial, long_side_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
     query = _query(one, trial)
     intrinsics = query.intrinsics.with_long_side(long_side_px)
     photo = resized(query.rgb.astype(np.float32), intrinsics.width, intrinsics.height)
     return np.rint(photo).astype(np.uint8), Camera(intrinsics, trial.truth.pose)
 
 
-def _rendered(one: Subject, camera: Camera, world_from_camera: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+def _rendered(one: BenchScene, camera: Camera, world_from_camera: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
     (frame,) = one.loaded.rasterizer.render([replace(camera, pose=Pose(world_from_camera))])
     return np.rint(255 * np.clip(frame.rgb, 0, 1)).astype(np.uint8)
 

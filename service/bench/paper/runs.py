@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from service.bench.localize import Subject, Trial, answered, line_of, subject, trials_of
+from service.bench.localize import BenchScene, Trial, load_bench_scene, localize_trial, make_trials, trial_result
 from service.bench.paper.plan import SLOW, STEP_CURVES, Cell
 from service.bench.pose_metrics import Outcome, errors
 from service.errors import InvalidRequest
@@ -132,20 +132,20 @@ def read_lines(file: Path, repair: bool = False) -> list[dict[str, Any]]:
         raise InvalidRequest(f"a line is not JSON: {error}", where=str(file)) from None
 
 
-def load(spec: RunSpec, name: str) -> Subject:
+def load(spec: RunSpec, name: str) -> BenchScene:
     """Load a scene of the run with its test photos and truth. Raises SceneError."""
     scene, data = spec.scenes[name]
     settings = {"layout": spec.layout, "background": spec.background, "matcher": spec.matcher}
-    return subject(scene, data, **settings, cache_dir=spec.cache_dir)
+    return load_bench_scene(scene, data, **settings, cache_dir=spec.cache_dir)
 
 
-def _warm(one: Subject) -> None:
+def _warm(one: BenchScene) -> None:
     """Answer one query untimed: the first one loads kernels and networks."""
-    for trial in trials_of(one, "none", 1, 0):
-        answered(one, trial, Request())
+    for trial in make_trials(one, "none", 1, 0):
+        localize_trial(one, trial, Request())
 
 
-def _check_config(spec: RunSpec, subjects: Mapping[str, Subject]) -> None:
+def _check_config(spec: RunSpec, subjects: Mapping[str, BenchScene]) -> None:
     """Write the configuration, merged with the folder's. Raises InvalidRequest if the two contradict each other."""
     file = spec.out / "config.json"
     stored = json.loads(file.read_text("utf-8")) if file.is_file() else {}
@@ -177,7 +177,7 @@ def _difference(before: Any, now: Any) -> str:
     return f"{before!r} there, {now!r} now"[:300]
 
 
-def _scene_facts(one: Subject) -> dict[str, Any]:
+def _scene_facts(one: BenchScene) -> dict[str, Any]:
     scene = one.loaded.scene
     facts = {"sha256": scene.info.sha256, "gaussians": scene.count, "layout": one.layout}
     facts |= {"background_rgb": list(scene.info.background_rgb), "megabytes": scene.nbytes / 1e6}
@@ -186,13 +186,13 @@ def _scene_facts(one: Subject) -> dict[str, Any]:
     return facts | {"trajectory_radius_units": trajectory_radius(one)}
 
 
-def trajectory_radius(one: Subject) -> float:
+def trajectory_radius(one: BenchScene) -> float:
     """Return the training cameras' mean distance from their centroid, in normalized units."""
     positions = np.stack([camera.pose.position_in_world for camera in one.training])
     return float(np.linalg.norm(positions - positions.mean(0), axis=1).mean() * one.units.units_per_scene_unit)
 
 
-def _todo(spec: RunSpec, subjects: Mapping[str, Subject]) -> Iterator[tuple[str, Cell, Trial]]:
+def _todo(spec: RunSpec, subjects: Mapping[str, BenchScene]) -> Iterator[tuple[str, Cell, Trial]]:
     """Yield all queries: a few of every cell and scene first, then more (see `waves`)."""
     for fast, slow in spec.waves:
         for cell in spec.cells:
@@ -200,11 +200,11 @@ def _todo(spec: RunSpec, subjects: Mapping[str, Subject]) -> Iterator[tuple[str,
             for scene, one in subjects.items():
                 chosen = _photos_of_cell(one, cell)
                 count = spec.count(cell, len(chosen.photos))
-                for trial in trials_of(chosen, cell.protocol, min(count, most or count), spec.seed):
+                for trial in make_trials(chosen, cell.protocol, min(count, most or count), spec.seed):
                     yield scene, cell, trial
 
 
-def _photos_of_cell(one: Subject, cell: Cell) -> Subject:
+def _photos_of_cell(one: BenchScene, cell: Cell) -> BenchScene:
     if cell.photos is None or cell.photos >= len(one.photos):
         return one
     # Evenly spread over the sequence, for neighbouring photos are alike.
@@ -212,13 +212,13 @@ def _photos_of_cell(one: Subject, cell: Cell) -> Subject:
     return replace(one, photos=tuple(one.photos[int(i * step)] for i in range(cell.photos)))
 
 
-def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, spec: RunSpec) -> dict[str, Any]:
+def _answer(scene: str, one: BenchScene, cell: Cell, trial: Trial, spec: RunSpec) -> dict[str, Any]:
     """Answer one query; return its line."""
     method = cell.method
     # Indexes are made before the clock starts: their time is a scene's, not a query's.
     one.loaded.prepare(method.estimator)
     wall, cpu = time.perf_counter(), time.process_time()
-    estimate = answered(one, trial, Request(method.estimator, method.options, spec.seed))
+    estimate = localize_trial(one, trial, Request(method.estimator, method.options, spec.seed))
     spent = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
     outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, one.units), *spent)
     line: dict[str, Any] = {
@@ -228,7 +228,7 @@ def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, spec: RunSpec) -
         "method": method.name,
         "protocol": cell.protocol,
     }
-    line |= line_of(trial, estimate, outcome, one.units)
+    line |= trial_result(trial, estimate, outcome, one.units)
     line |= {"profile": method.profile, "within_5deg_0p05": outcome.within((5.0, 0.05))}
     line |= {"within_1deg_0p01": outcome.within((1.0, 0.01))}
     line |= {"stages_cpu_ms": {timing.stage: 1e3 * timing.cpu_s for timing in estimate.timings}}
@@ -238,7 +238,7 @@ def _answer(scene: str, one: Subject, cell: Cell, trial: Trial, spec: RunSpec) -
     return line
 
 
-def _curve(estimate: PoseEstimate, trial: Trial, one: Subject, points: int) -> list[tuple[int, float, float]]:
+def _curve(estimate: PoseEstimate, trial: Trial, one: BenchScene, points: int) -> list[tuple[int, float, float]]:
     """Return errors at evenly spread records of the trace: number, degrees, normalized units."""
     records = estimate.records
     stride = max(1, -(-len(records) // points))
@@ -250,7 +250,7 @@ def _curve(estimate: PoseEstimate, trial: Trial, one: Subject, points: int) -> l
     return found
 
 
-def _progress_so_far(spec: RunSpec, subjects: Mapping[str, Subject], lines: Sequence[Mapping[str, Any]]) -> Progress:
+def _progress_so_far(spec: RunSpec, subjects: Mapping[str, BenchScene], lines: Sequence[Mapping[str, Any]]) -> Progress:
     progress = Progress()
     for cell in spec.cells:
         for scene, one in subjects.items():
