@@ -197,7 +197,7 @@ class TestBench:
         stations = [place(a, 0.3 * np.cos(a)) for a in (0.0, 0.9, 0.4, 1.5)]
         poses = bench.smooth_path(stations, self.UNITS, 400)
         assert len(poses) == 400
-        steps = [bench._pace(a, b, self.UNITS) for a, b in pairwise(poses)]
+        steps = [bench._frames_between(a, b, self.UNITS, bench.SEQUENCE) for a, b in pairwise(poses)]
         assert max(steps) < 1.05  # frames; where it turns back, less
         assert np.median(steps) > 0.95
         for station in stations:

@@ -184,7 +184,7 @@ def _row(part: str, condition: str, outcomes: Sequence[Outcome]) -> dict[str, An
 def _unscaled_dilation() -> Iterator[None]:
     scaled = cpu.dilation_for
     try:
-        cpu.dilation_for = lambda camera, info: cpu.DILATION
+        cpu.dilation_for = lambda camera, info: cpu.DEFAULTS.dilation_px2
         yield
     finally:
         cpu.dilation_for = scaled
