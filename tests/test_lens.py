@@ -1,4 +1,4 @@
-"""Approximate lenses, and what the pixels say of a pose: against planted truths, differences and simulations."""
+"""Approximate intrinsics, and the uncertainty of a pose: against planted truths, differences and simulations."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_focal_length_is_found_among_wrong_matches(factor: float) -> None:
     assert found.num_inliers >= 75
 
 
-def test_what_a_wall_seen_straight_on_hides_is_told_by_what_was_known() -> None:
+def test_the_prior_decides_where_a_wall_seen_straight_on_leaves_the_focal_length_open() -> None:
     """A plane parallel to the image: any focal length fits as well with another distance."""
     rng = np.random.default_rng(0)
     pose = Pose(np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0] * 4, [0] * 4, [0, 0, 0, 3.0], [0] * 4]))
@@ -74,7 +74,7 @@ def test_linearized_is_the_derivative_by_differences(column: int) -> None:
     assert np.allclose(jacobian[..., column], difference, rtol=1e-4, atol=1e-4)
 
 
-def test_alignment_finds_the_lens_with_the_pose() -> None:
+def test_refinement_estimates_the_intrinsics_with_the_pose() -> None:
     truth, lens = true_pose(2), IntrinsicsCorrection(1.06, 0.008, -0.005)
     rgb = photo_from(truth, LENS.corrected(lens)).rgb
     pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), NO_CORRECTION
@@ -102,12 +102,12 @@ def bent(rgb: np.ndarray, soft_px: float, rng: np.random.Generator) -> np.ndarra
 @pytest.mark.parametrize(
     ("soft_px", "noise", "least", "most"),
     [
-        (0, 0.1, 2.0, 8.0),  # seen: 3.2; independent residuals don't ask for quarters, whose moves exceed errors
+        (0, 0.1, 2.0, 8.0),  # seen: 3.2; independent residuals need no quarters, whose moves exceed errors
         (8, 0.02, 4.0, 9.0),  # seen: 6.8
         (20, 0.02, 6.0, 14.0),  # seen: 10.3; alike over a third of the image: quarters are too small
     ],
 )
-def test_the_covariance_predicts_how_alignments_scatter(
+def test_the_covariance_predicts_how_refinements_scatter(
     soft_px: float, noise: float, least: float, most: float
 ) -> None:
     """Against a simulation: many photos from one planted pose, each with noise and a bend of its own."""
@@ -161,7 +161,7 @@ def test_the_spread_of_independent_parts_is_theirs() -> None:
     assert np.mean(found) == pytest.approx(2.5 * 4 / 3, rel=0.1)
 
 
-def test_the_pull_tells_how_far_a_pose_is_off() -> None:
+def test_the_last_step_measures_how_far_a_pose_is_off() -> None:
     truth = true_pose()
     off = np.array([0.004, -0.003, 0.002, 0.01, 0.005, -0.01])
     camera = Camera(LENS, moved(truth, off))
@@ -172,7 +172,7 @@ def test_the_pull_tells_how_far_a_pose_is_off() -> None:
 
 @pytest.mark.parametrize("factor", [1.0, 1.05])
 def test_another_focal_length_than_given_shows(factor: float) -> None:
-    """The pose is the best one for the focal length given; the pixels still ask for another one."""
+    """The pose is the best one for the focal length given; the pixels still show another one."""
     truth = true_pose(1)
     rgb = photo_from(truth, LENS.corrected(IntrinsicsCorrection(factor))).rgb
     pose = truth

@@ -133,11 +133,11 @@ def photo_from(pose: Pose, lens: Intrinsics = LENS, gain: float = 1.0, bias: flo
     return Query(to_uint8(gain * frame.rgb + bias), lens, "given", lens)
 
 
-# --- resection
+# --- absolute pose
 
 
 @given(st.integers(0, 10_000), st.floats(0.0, 0.6))
-def test_resection_finds_the_planted_pose_among_wrong_matches(seed: int, wrong_share: float) -> None:
+def test_absolute_pose_finds_the_planted_pose_among_wrong_matches(seed: int, wrong_share: float) -> None:
     rng = np.random.default_rng(seed)
     pose = look_at(rng.uniform(-1, 1, 3), rng.uniform(3, 5, 3), UP)
     points = transformed(pose.world_from_camera, rng.uniform([-2, -2, 4], [2, 2, 9], (150, 3)))
@@ -153,7 +153,7 @@ def test_resection_finds_the_planted_pose_among_wrong_matches(seed: int, wrong_s
     assert np.allclose(reprojection_error_px(px, points, LENS, pose)[~wrong], 0, atol=1e-6)
 
 
-def test_resection_of_too_few_or_no_agreeing_points_is_none() -> None:
+def test_absolute_pose_of_too_few_or_no_agreeing_points_is_none() -> None:
     assert estimate_absolute_pose(np.zeros((3, 2)), np.zeros((3, 3)), LENS, 4.0, 100) is None
     rng = np.random.default_rng(0)
     found = estimate_absolute_pose(rng.uniform(0, 150, (40, 2)), rng.normal(size=(40, 3)), LENS, 0.01, 100)
@@ -281,11 +281,11 @@ def test_a_vote_needs_no_features_and_only_one_view() -> None:
     assert retrieval_scores(clustered(rng, 0), [clustered(rng, 9), clustered(rng, 0)]).tolist() == [0.0, 0.0]
 
 
-# --- alignment
+# --- photometric refinement
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
+def test_refinement_returns_to_the_planted_pose(seed: int) -> None:
     """From 1.5 degrees and 4 % of the distance away, through a gain and a bias, on two renders."""
     rng = np.random.default_rng(seed)
     truth = true_pose(seed)
@@ -302,7 +302,7 @@ def test_alignment_returns_to_the_planted_pose(seed: int) -> None:
     assert result.loss < 0.002  # 8 bits: seen 0.0003
 
 
-def test_alignment_at_the_truth_stays_there() -> None:
+def test_refinement_at_the_truth_stays_there() -> None:
     truth = true_pose()
     camera = Camera(LENS, truth)
     result = refine_photometric(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 2)
@@ -311,7 +311,7 @@ def test_alignment_at_the_truth_stays_there() -> None:
     assert distance < 0.0003
 
 
-def test_alignment_ignores_what_a_fifth_of_the_photo_hides() -> None:
+def test_refinement_ignores_what_a_fifth_of_the_photo_hides() -> None:
     truth = true_pose(3)
     rgb = photo_from(truth).rgb.copy()
     rgb[20:90, 30:120] = [250, 20, 20]
@@ -324,7 +324,7 @@ def test_alignment_ignores_what_a_fifth_of_the_photo_hides() -> None:
     assert distance < 0.03  # of 3.2
 
 
-def test_alignment_starts_from_any_pose_near_the_render() -> None:
+def test_refinement_starts_from_any_pose_near_the_render() -> None:
     """The frame may be a render from elsewhere: `start` and the camera's pose are different things."""
     truth = true_pose(4)
     camera = Camera(LENS, moved(truth, np.array([0.01, 0.01, 0, 0.02, 0, 0])))
@@ -339,8 +339,8 @@ def test_alignment_starts_from_any_pose_near_the_render() -> None:
 
 
 @pytest.mark.parametrize("spoil", ["gamma 0.5", "gamma 2", "blurred", "cut off", "masked"])
-def test_alignment_sees_through_the_look_of_a_photo(spoil: str) -> None:
-    """Seen: up to 0.06 degrees and 0.003 of a distance of 3.2; without the look's terms up to ten times that."""
+def test_refinement_compensates_for_a_photos_exposure_and_blur(spoil: str) -> None:
+    """Seen: up to 0.06 degrees and 0.003 of 3.2; without the photometric parameters up to ten times that."""
     truth = true_pose(2)
     lens = LENS.resized(384, 320)
     rgb = PaintedWalls().render([Camera(lens, truth)])[0].rgb
@@ -368,7 +368,7 @@ def test_alignment_sees_through_the_look_of_a_photo(spoil: str) -> None:
     assert distance < 0.006
 
 
-def test_alignment_without_overlap_has_infinite_loss() -> None:
+def test_refinement_without_overlap_has_infinite_loss() -> None:
     camera = Camera(LENS, true_pose())
     frame = PaintedWalls().render([camera])[0]
     away = moved(camera.pose, np.array([0.0, 2.5, 0, 0, 0, 0]))

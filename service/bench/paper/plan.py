@@ -105,7 +105,7 @@ MAIN = (
     ),
 )
 ABLATION = {"": ("loss",), "mc": ("mc",), "do": ("do",), "mc+do": ("mc", "do"), "mc+do+loss": ("mc", "do", "loss")}
-"""Table 5's rows. The supplement doesn't say which stage its first one has; here it is the descent alone."""
+"""Table 5's rows. The supplement names no stage for its first one; here it is the descent alone."""
 
 
 @cache

@@ -3,7 +3,7 @@
 Minimal solvers for pose and focal length (P3.5Pf, P4Pf) degenerate on the planes that rooms are made of. So the focal
 length is sampled on a grid around the one given, with PnP-RANSAC at each sample; the best samples are refined together
 with focal length and principal point. The prior on the intrinsics enters as one observation each, which decides where
-the correspondences can't: a wall seen straight on looks the same from nearer with a shorter focal length.
+the correspondences can't: a wall seen straight on gives the same image from nearer with a shorter focal length.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from service.errors import UnknownName
 
 @dataclass(frozen=True, slots=True)
 class LossConfig:
-    """Weights and sizes; from the supplement where nothing else is said."""
+    """Weights and sizes; from the supplement unless stated otherwise."""
 
     relative_floor: float = 0.01
     """Added to the squared render in the relative loss; Instant-NGP's."""

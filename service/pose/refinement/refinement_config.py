@@ -27,7 +27,7 @@ class PyramidConfig:
     exposure_block_px: int = 16
     """Side of the blocks whose means give the exposure between photo and render."""
     min_exposed: float = 0.05
-    """Darker blocks of either have no part in the exposure: a black rim says nothing."""
+    """Darker blocks of either have no part in the exposure: a black rim is no measurement."""
     max_exposed: float = 0.9
     """Brighter blocks of the photo neither: they may be clipped."""
 
@@ -51,7 +51,7 @@ class UncertaintyConfig:
     focal_inflation: float = 2.5
     """Times the standard deviation of the focal length from the cells' residuals."""
     suspicious_focal_step: float = 0.004
-    """Of log focal: from this last step on a focal length said to be exact is set free, to see how far it goes."""
+    """Of log focal: from this step on an exact focal length is estimated after all, to measure how far off it is."""
     free_focal_sigma: float = 0.15
     """Prior standard deviation of log focal in that test."""
 
