@@ -204,6 +204,14 @@ def test_the_twist_columns_are_derivatives_by_moving_the_render(unknown: int) ->
     assert np.allclose(jacobian[unknown], change / step, atol=1e-3)
 
 
+def test_residuals_from_the_floor_on_have_no_curvature() -> None:
+    residuals = np.array([0.4999, 0.5, -0.4999, -0.5], np.float32)
+    one = np.ones((1, 4), np.float32)
+    scores, hessians, _ = scores_by_cell(one, one[0], residuals, np.arange(4), (1, 4), 0.5, 16)
+    assert hessians[0, 0, 0] == 2
+    assert scores[0, 0] == pytest.approx(0, abs=1e-6)
+
+
 # --- the whole
 
 
