@@ -72,6 +72,7 @@ def se3_log(transform: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
 def moved(pose: Pose, twist: Float64[np.ndarray, "6"]) -> Pose:
     """Return world_from_camera @ exp(twist), re-orthonormalized so that long chains of steps stay rigid."""
     matrix = pose.world_from_camera @ se3_exp(twist)
+    # The nearest rotation in the Frobenius norm.
     u, _, vt = np.linalg.svd(matrix[:3, :3])
     matrix[:3, :3] = u @ vt
     return Pose(matrix)
@@ -138,6 +139,7 @@ def reprojection_error_px(
     """Return the distances in pixels between observations and projected points; infinite behind the camera."""
     points = transformed(pose.camera_from_world, points_in_world)
     distance = np.linalg.norm(project(points, intrinsics) - photo_px, axis=1)
+    # Points behind the camera project, too, but are not seen.
     return np.where(points[:, 2] > 1e-9, distance, np.inf)
 
 

@@ -96,6 +96,7 @@ class LoadedScene:
         if isinstance(images, ImageMatcher):
             features = MATCHERS.load(DEFAULT_MATCHER).create()
         else:
+            # It extracts features, which every method can use.
             images = None
         renderer, passed_over, warnings = _renderer(scene, rasterizer)
         return cls(scene, renderer, features, images, cache_dir, passed_over, warnings)
@@ -188,7 +189,9 @@ def localize(
         answer = _drive(steps, trace, request, tally)
     if not trace.records:
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
+    # Before verification: its renders are not the estimator's.
     renders, last = tally.count, trace.records[-1]
+    # The intrinsics belong to the pose, in the result and in its verification.
     query = query.corrected(last.correction)
     verdict = (
         answer.verdict if answer else render_and_verify(QueryImages(query, loaded.matcher), last.pose, tools.rasterizer)
@@ -230,6 +233,7 @@ def _drive(
             record = next(steps)
         except StopIteration as end:
             return end.value
+        # Between two records: the estimator isn't interrupted in the middle of a step.
         if request.cancel is not None and request.cancel.is_set():
             raise Cancelled
         trace.add(record)
@@ -300,6 +304,7 @@ def _assumed_training_px(query: Query, loaded: LoadedScene) -> int | None:
     info = loaded.scene.info
     if info.training_focal_px or info.training_long_side_px:
         return None
+    # Photos are often trained on at a smaller size than they are sent in.
     low, high = ASSUMED_TRAINING_PX
     return min(max(query.photo_intrinsics.long_side, low), high)
 

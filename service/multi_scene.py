@@ -77,13 +77,16 @@ def localize_in_scenes(
     found: list[SceneEstimate] = []
     for i in order[: config.max_searched]:
         localized = any(f.estimate.verdict.status is Status.LOCALIZED for f in found)
+        # Similar rooms are distinguished by verification, not by the number of matches.
         if localized and inliers[i] < config.similar_share * inliers[order[0]]:
             break
         left = None if request.budget_s is None else request.budget_s - (time.perf_counter() - wall)
         if found and left is not None and left <= 0:
             break
+        # A budget of 0 would end before the first record.
         limited = replace(request, budget_s=None if left is None else max(left, 1e-3))
         found.append(SceneEstimate(localize(query, scenes[i], limited), scenes[i]))
+    # Every localized answer ranks before those that aren't, whatever their scores.
     best = max(found, key=lambda f: (f.estimate.verdict.status is Status.LOCALIZED, f.estimate.verdict.score))
     scene_ranking = tuple((scenes[i].scene.info.id, int(inliers[i])) for i in order)
     others = tuple(t for f in found if f is not best for t in f.estimate.timings)
@@ -99,6 +102,7 @@ def _inliers_by_scene(
     query: Query, scenes: Sequence[LoadedScene], config: SceneRankingConfig
 ) -> Int64[np.ndarray, "scenes"]:
     """Return how many matches with a view of each scene agree; rotated photos are tried if none has enough."""
+    # Features depend on the matcher, and are the same for all scenes that share one.
     images: dict[str, QueryImages] = {}
     for loaded in scenes:
         images.setdefault(loaded.matcher.name, QueryImages(query, loaded.matcher))

@@ -38,6 +38,7 @@ class MatchVectors:
         render_camera: Camera,
     ) -> MatchVectors:
         """Keep an evenly spread choice of at most LIMIT matches, in their order."""
+        # Evenly over their order, from the most to the least certain.
         keep = np.unique(np.linspace(0, max(len(inlier) - 1, 0), min(len(inlier), cls.LIMIT)).astype(int))
         return cls(
             frozen(photo_px[keep], np.float32),

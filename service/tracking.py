@@ -127,10 +127,12 @@ class Tracker:
         """
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled
+        # Equal intervals of 1: only their ratios matter.
         if time_s is None:
             time_s = self._past[-1][0] + 1.0 if self._past else 0.0
         shared, expected = self._intrinsics.applied_to(query), self._expected(time_s)
         estimate = self._followed(shared, expected) if expected else None
+        # Tracking failed or is in doubt: the photo is localized like any other.
         if estimate is None or not _is_placed(estimate.verdict):
             estimate = self._localized(shared, expected, estimate)
         self._renders += estimate.renders
@@ -154,6 +156,7 @@ class Tracker:
             return self._past[-1][1] if self._past else None
         (before_s, before), (last_s, last) = self._past
         intervals = (time_s - last_s) / max(last_s - before_s, 1e-9)
+        # In the camera's own frame, so that a steady turn stays one.
         motion = se3_log(before.camera_from_world @ last.world_from_camera)
         return moved(last, motion * float(np.clip(intervals, 0.0, self._config.max_intervals)))
 
@@ -171,6 +174,7 @@ class Tracker:
         renders = tally.count
         self._unverified += 1
         if verdict is None or self._unverified >= self._config.verify_every:
+            # The whole gate, on a render in its own size.
             verdict, self._unverified = render_and_verify(images, found.pose, rasterizer), 0
             timings.append(StageTiming("verify", clock.wall_s - timings[0].wall_s, clock.cpu_s - timings[0].cpu_s))
         step_deg, step_units = pose_distance(self._past[-1][1], found.pose)
@@ -187,6 +191,7 @@ class Tracker:
         found = localize(replace(query, prior=expected or query.prior), self._loaded, request)
         if followed is not None:
             spent = {"timings": followed.timings + found.timings, "renders": followed.renders + found.renders}
+            # Both were verified by the same gate, so their scores compare.
             if followed.verdict.score >= found.verdict.score:
                 return replace(followed, budget_exhausted=found.budget_exhausted, **spent)
             found = replace(found, **spent)
@@ -230,6 +235,7 @@ def refine_from(
     renderer = ViewRenderer(rasterizer)
     if rendered is None or _size(rendered) != (size.width, size.height):
         rendered = renderer.render(Camera(size, expected))
+    # The last render is at hand, and brings the pose near enough for one Gauss-Newton step a render.
     first = refine_photometric(
         photo, rendered.frame, rendered.camera, Camera(size, expected), config.levels, valid_mask=valid
     )
@@ -242,6 +248,7 @@ def refine_from(
         uncertainty = pose_uncertainty(photo, rendered.frame, camera, camera, query.focal_sigma, valid)
         if uncertainty is None:
             return None
+        # Estimating the uncertainty includes a step, which is taken.
         pose = moved(pose, uncertainty.last_step)
         turn, way = np.linalg.norm(uncertainty.last_step[:3]), np.linalg.norm(uncertainty.last_step[3:])
         if size.fx * (turn + way / _typical_depth(rendered.frame)) < config.settled_px:

@@ -20,6 +20,7 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
     """Return a C-contiguous read-only array; copies only if it must to leave the caller's array writable."""
     result = np.ascontiguousarray(array, dtype=dtype)
     if result is array and array.flags.writeable:
+        # Freezing the caller's own array would be a surprise.
         result = array.copy()
     result.flags.writeable = False
     return result
@@ -131,6 +132,7 @@ class Pose:
                 where="world_from_camera",
                 hint="Remove scale and mirroring; columns are the camera's x, y and z axes in the world.",
             )
+        # The last row of a rigid motion is exact in every format, so the tolerance is tight.
         if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-9:
             raise InvalidPrior("the last row must be 0 0 0 1.", where="world_from_camera")
         object.__setattr__(self, "world_from_camera", matrix)

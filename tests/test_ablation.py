@@ -9,15 +9,16 @@ import pytest
 from small_room import write_room
 from test_estimators import LENS_UPRIGHT, photo_at, unseen_pose
 
-from service.bench.ablation import CONDITIONS, Removal, removals, run, table
+from service.bench.ablation import CONDITIONS, Removal, removals, run, table, unscaled_dilation
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.localize import LoadedScene, Request, localize
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.match_stages import MATCHING, solve_matches_near
+from service.render import cpu
 from service.results import PoseEstimate
-from service.types import Intrinsics, Query
+from service.types import Camera, Intrinsics, Pose, Query, SceneInfo
 
 LENS = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)
 
@@ -58,6 +59,15 @@ def test_what_is_removed_leaves_no_trace(room: LoadedScene) -> None:
     assert "retrieve_rotated" in {record.stage for record in without("nothing", room, turned).records}
     assert "retrieve_rotated" not in {record.stage for record in without("in-plane rotation", room, turned).records}
     assert "sample_poses" not in {r.stage for r in without("sampled poses (effort fast)", room, turned).records}
+
+
+def test_the_dilation_is_unscaled_for_a_run_only() -> None:
+    info = SceneInfo("s", "s", "0" * 64, "ply", training_focal_px=2 * LENS.fx)
+    camera = Camera(LENS, Pose(np.eye(4)))
+    scaled = cpu.dilation_for(camera, info)
+    with unscaled_dilation():
+        assert cpu.dilation_for(camera, info) == pytest.approx(4 * scaled)
+    assert cpu.dilation_for(camera, info) == scaled
 
 
 def test_the_decoupled_solver_and_its_stand_in_find_the_planted_pose_among_wrong_matches() -> None:

@@ -158,7 +158,7 @@ def _outcomes(one: BenchScene, trials: Sequence[Trial], removal: Removal, condit
     request = Request(options=removal.options, config=removal.config)
     trust = "approximate" if condition == APPROXIMATE and not removal.exact_focal else "given"
     outcomes = []
-    with _unscaled_dilation() if removal.unscaled_dilation else nullcontext():
+    with unscaled_dilation() if removal.unscaled_dilation else nullcontext():
         for trial in trials:
             wall, cpu_s = time.perf_counter(), time.process_time()
             estimate = localize_trial(one, trial, request, trust)
@@ -181,7 +181,8 @@ def _row(part: str, condition: str, outcomes: Sequence[Outcome]) -> dict[str, An
 
 
 @contextmanager
-def _unscaled_dilation() -> Iterator[None]:
+def unscaled_dilation() -> Iterator[None]:
+    """Dilate renders like the training photos, whatever their size, for as long as the context lasts."""
     scaled = cpu.dilation_for
     try:
         cpu.dilation_for = lambda camera, info: cpu.DEFAULTS.dilation_px2

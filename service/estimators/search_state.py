@@ -146,6 +146,7 @@ class SearchState:
     @classmethod
     def of(cls, query: Query, tools: Tools[ViewIndex], config: SearchConfig) -> SearchState:
         """Return the state at the start."""
+        # A mirrored photo has a state, and so pictures and renders, of its own.
         images = QueryImages(query, tools.matcher)
         retrieval = Retrieval(images, tools.prepared, config.retrieval)
         return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
@@ -183,12 +184,14 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     found = yield from _changed(stage.records, state.noted)
     if found is None:
         return
+    # A pose refined from a prior has no matches behind it.
     agreeing = found.num_inliers or 0
     focal_sigma = state.images.query.focal_sigma
     supported = stage.expected or (agreeing >= state.config.photometric_min_inliers and not focal_sigma)
     verdict = state.verify(found, agreeing if supported else None)
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
+    # Of a small copy a doubt may vanish in the full size.
     conclusive = verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative
     state.accepted = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score
@@ -215,8 +218,10 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
         return False
     if not state.tools.prepared.like_its_mirror_image or not may_be_mirrored(best.verdict.signals, config.mirror):
         return False
+    # The intrinsics that were estimated hold for the mirror image, too.
     query = mirrored_query(state.images.query.corrected(best.refined.correction))
     mirrored = SearchState.of(replace(query, prior=None, region=None), state.tools, config)
+    # Mirroring turns a rotation into its opposite.
     variant = replace(best.variant, roll_steps_45deg=-best.variant.roll_steps_45deg % 8)
     search = _search_mirrored(mirrored, variant, config.mirror.max_loss_ratio * best.loss)
     found = yield from _changed(
@@ -224,6 +229,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     )
     if found is None:
         return False
+    # Both may be wrong: a poor answer is no evidence for the mirror image.
     if not state.accepted and mirrored.verify(found).status is not Status.LOCALIZED:
         return False
     images = mirrored.images.corrected(found.correction)
@@ -259,6 +265,7 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
         return
     images = state.images.corrected(answer.refined.correction)
     frame = state.renderer.at(images.query, answer.refined.pose).frame
+    # Of the opaque pixels: the distance in which two poses count as different.
     distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
     answers = [answer]
     for other in _ambiguous_hypotheses(state, images, Explanation(answer.refined.pose, distance), whole):
@@ -297,6 +304,7 @@ def _ambiguous_hypotheses(
 def _refine_ambiguous(state: SearchState, other: AbsolutePose, answer: VerifiedPose) -> StageResult:
     """Refine an ambiguous hypothesis, unless its residual on a first render is much greater than the answer's."""
     config = state.config
+    # The same camera took the photo, wherever it stood.
     other = replace(other, correction=answer.refined.correction)
     max_loss = config.max_ambiguous_loss_ratio * answer.loss
     if next(refine_stage(other, state.images, state.renderer, config.refinement, max_loss), None) is None:

@@ -83,6 +83,7 @@ def run(
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
             return state.answer()
+    # A generator: a later stage is prepared only if the earlier ones failed.
     for stage in _search_stages(state, options):
         yield from run_stage(state, stage)
         if state.accepted:
@@ -105,6 +106,7 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
         views = top(retrieval.scores(small), min(config.small_photo_views, options.candidates))
         yield Stage(_search_views(name, small, deque(views), state), small, tentative=True)
         name = "retrieve_full_size"
+    # Not before: comparing rotations costs as much as a search.
     variant = retrieval.rotated_variant(variant)
     views = top(retrieval.scores(variant), options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else name
@@ -112,6 +114,7 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     variant = variant.scaled(config.large_photo_factor)
     ranked = top(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
+    # A stage ends early where matches or refinement fail; the next goes on with the other views.
     while untried:
         yield Stage(_search_views("retrieve_more_views", variant, untried, state), variant)
     if options.effort == "fast" or (options.effort == "normal" and not state.recognised):
@@ -149,8 +152,10 @@ def _search_views(name: str, variant: ImageVariant, untried: deque[int], state: 
         views = chain([state.renderer.at(images.query, prior).view(images.matcher)], views)
     features = state.retrieval.features(variant)
     found = yield from match_candidates(features, views, images, variant.max_error_px, config.matching)
+    # Chance matches grow with their number, so a share is required, too.
     if found is None or found.num_inliers < max(config.min_inliers, config.min_inlier_share * len(found.inlier)):
         return None
+    # With many inliers refinement converges from the pose as it is.
     if found.num_inliers < config.rematch_below_inliers:
         rematch = yield from render_and_rematch(found, images, state.renderer, config.matching)
         found = rematch.found
@@ -169,6 +174,7 @@ def _search_views(name: str, variant: ImageVariant, untried: deque[int], state: 
 def _sample_poses(variant: ImageVariant, state: SearchState) -> StageResult:
     """Render at poses sampled near the views, match, and go on from the pose that most matches agree with."""
     images, tools, config = state.images, state.tools, state.config
+    # The sampled poses are rotated like the photo, so that features match.
     roll_rad = -0.25 * np.pi * variant.roll_steps_45deg
     scores = state.retrieval.scores(variant)
     poses = poses_near_views(tools.prepared.views, scores, roll_rad, config.samples, tools.rng)

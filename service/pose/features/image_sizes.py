@@ -18,6 +18,7 @@ PHOTO_PX = 416
 
 def sized(intrinsics: Intrinsics, long_side: int) -> Intrinsics:
     """Return the camera of the image resampled to about this long side (px), both sides multiples of 32."""
+    # At least one multiple: very wide images would have no height otherwise.
     factor = long_side / intrinsics.long_side / SIZE_MULTIPLE_PX
     width, height = (SIZE_MULTIPLE_PX * max(1, round(side * factor)) for side in (intrinsics.width, intrinsics.height))
     return intrinsics.resized(width, height)

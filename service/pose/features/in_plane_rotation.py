@@ -57,6 +57,7 @@ def detect_corners(
     rgb: UInt8[np.ndarray, "h w 3"], count: int, valid: Bool[np.ndarray, "h w"] | None = None
 ) -> Corners:
     """Return an image's `count` strongest corners, of its valid pixels (None: all)."""
+    # ORB expects a mask of bytes.
     mask = None if valid is None else valid.astype(np.uint8)
     detector = cv2.ORB.create(nfeatures=count, fastThreshold=CORNERS.min_contrast)
     found, descriptors = detector.detectAndCompute(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), mask)
@@ -73,7 +74,9 @@ def rolls_to_upright(photo: Corners, views: Corners) -> list[int]:
         return [0]
     matches = cv2.BFMatcher(cv2.NORM_HAMMING).match(photo.descriptors, views.descriptors)
     own, other = np.array([(match.queryIdx, match.trainIdx) for match in matches]).T
+    # If a match is right the two corners differ in direction by the photo's rotation.
     rotation_deg = photo.directions_deg[own] - views.directions_deg[other]
+    # A histogram over steps of 45 degrees: features tolerate the rest.
     counts = np.bincount(np.rint(rotation_deg / 45).astype(int) % 8, minlength=8)
     ranked = np.argsort(-counts, kind="stable")
     return ranked[counts[ranked] >= CORNERS.also_likely_share * counts.max()].tolist()

@@ -24,4 +24,5 @@ def mirrored_query(query: Query) -> Query:
 
 def mirrored_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
     """Return the camera whose image is the mirror image: its principal point changes sides."""
+    # In pixels from the left edge, whose mirror image is the right one.
     return replace(intrinsics, cx=intrinsics.width - intrinsics.cx)

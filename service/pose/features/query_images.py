@@ -52,6 +52,7 @@ class QueryImages:
         key = size.width, size.height
         if key not in self._photos:
             rgb = self.query.rgb
+            # Area averages don't alias when the image shrinks.
             mode = cv2.INTER_AREA if size.width * size.height < rgb.shape[0] * rgb.shape[1] else cv2.INTER_LINEAR
             self._photos[key] = np.asarray(cv2.resize(rgb, key, interpolation=mode))
         return self._photos[key]
@@ -62,6 +63,7 @@ class QueryImages:
             return None
         key = size.width, size.height
         if key not in self._masks:
+            # Pixels that mix with invalid ones are invalid, too.
             share = cv2.resize(self.query.valid_mask.astype(np.float32), key, interpolation=cv2.INTER_AREA)
             self._masks[key] = np.asarray(share) > PHOTOS.min_valid_share
         return self._masks[key]
@@ -77,8 +79,10 @@ class QueryImages:
             size = sized(self.query.intrinsics, long_side)
             rotated, rotated_from_photo = _rotated(self.resized(size), roll_steps_45deg)
             found = self.matcher.extract(rotated, PHOTOS.max_features)
+            # The inverse of a rotation is its transpose: back to the photo's own pixels.
             points = (found.points_px - rotated_from_photo[:, 2]) @ rotated_from_photo[:, :2]
             keep = _away_from_edges(points, self.valid_mask(size), size, bool(roll_steps_45deg % 2))
+            # The two sides are rounded to multiples of 32 separately, so their factors differ a little.
             scale = np.array([self.query.rgb.shape[1] / size.width, self.query.rgb.shape[0] / size.height])
             self._features[key] = Features(
                 (points[keep] * scale).astype(np.float32), found.scores[keep], found.descriptors[keep]
@@ -100,6 +104,7 @@ def _rotated(
         return rgb, np.eye(2, 3)
     cosine, sine = np.cos(steps_45deg * np.pi / 4), np.sin(steps_45deg * np.pi / 4)
     rotation = np.array([[cosine, sine], [-sine, cosine]])
+    # The canvas holds the whole rotated image.
     extent = np.abs(rotation) @ [width, height]
     canvas = (np.ceil(extent / SIZE_MULTIPLE_PX - 1e-6) * SIZE_MULTIPLE_PX).astype(int)
     shift = canvas / 2 - rotation @ [width / 2, height / 2]
@@ -118,6 +123,7 @@ def _away_from_edges(
     if oblique:  # the borders became lines in the canvas
         keep &= ((points > margin) & (points < np.array([size.width, size.height]) - margin)).all(1)
     if valid is not None:
+        # Erosion with a square of this side moves the mask's edge inwards by the margin.
         around = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
         safe = cv2.erode(valid.astype(np.uint8), around, borderType=cv2.BORDER_REPLICATE) > 0
         column, row = np.clip(points.astype(int), 0, [size.width - 1, size.height - 1]).T

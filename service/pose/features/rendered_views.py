@@ -59,14 +59,17 @@ class RenderedView:
     def shows_the_same_as(self, camera: Camera, tolerance_px: float) -> bool:
         """Return whether nine in ten of the surface points seen here are within this distance in `camera`'s image."""
         own, size = self.camera, camera.intrinsics
+        # The common case: nothing moved at all.
         if np.array_equal(camera.pose.world_from_camera, own.pose.world_from_camera) and size == own.intrinsics:
             return True
         height, width = self.frame.alpha.shape
         if (width, height) != (size.width, size.height):
             return False
+        # A coarse grid, away from the border, is enough to measure how far the image moves.
         row, column = (grid.ravel() for grid in np.mgrid[4 : height : VIEWS.grid_px, 4 : width : VIEWS.grid_px])
         depth = self.frame.median_depth[row, column]
         px = np.stack([column, row], 1)[depth > 0] + 0.5
+        # Where nothing is seen there is nothing to compare.
         if len(px) == 0:
             return False
         points = transformed(own.pose.world_from_camera, unproject(px, depth[depth > 0], own.intrinsics))
@@ -111,12 +114,14 @@ def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
 
 def _features_of(frame: Frame, size: Intrinsics, matcher: Matcher) -> Features:
     """Return a render's features, extracted at RENDER_PX: from a larger one they would be finer than the photo's."""
+    # Learned features stand little change of scale, so both images are described at the same size.
     rgb, small = to_uint8(frame.rgb), sized(size, RENDER_PX)
     if small.width * small.height >= size.width * size.height:
         return matcher.extract(rgb, VIEWS.max_features)
     found = matcher.extract(
         np.asarray(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)), VIEWS.max_features
     )
+    # Their places refer to the render as it is.
     scale = np.array([size.width / small.width, size.height / small.height], np.float32)
     return replace(found, points_px=found.points_px * scale)
 
@@ -124,9 +129,11 @@ def _features_of(frame: Frame, size: Intrinsics, matcher: Matcher) -> Features:
 def backprojected(features: Features, frame: Frame, camera: Camera) -> View:
     """Keep the features on opaque, smooth surface, and compute the scene point of each from the median depth."""
     height, width = frame.alpha.shape
+    # One pixel from the border, so that each has its eight neighbours.
     column = np.clip(features.points_px[:, 0].astype(int), 1, width - 2)
     row = np.clip(features.points_px[:, 1].astype(int), 1, height - 2)
     around = np.stack([frame.median_depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], 1)
+    # Across a depth edge the median depth would be that of either side.
     nearest, farthest = around.min(1, initial=np.inf), around.max(1, initial=0.0)
     smooth = (nearest > 0) & (farthest - nearest < VIEWS.max_depth_range * nearest)
     keep = np.flatnonzero(smooth & (frame.alpha[row, column] > VIEWS.min_alpha))
@@ -140,4 +147,5 @@ def backprojected(features: Features, frame: Frame, camera: Camera) -> View:
 
 def to_uint8(rgb: Float32[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Return a render (0..1) in a photo's 8 bits."""
+    # Bright scenes exceed 1; convertScaleAbs saturates, and would mirror negative values.
     return np.asarray(cv2.convertScaleAbs(np.maximum(rgb, 0), alpha=255.0))

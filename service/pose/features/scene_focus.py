@@ -49,6 +49,7 @@ def focus_of(cameras: Sequence[Camera], depth_of: Callable[[Camera], float]) -> 
     """
     poses = [camera.pose for camera in cameras]
     positions = np.stack([pose.position_in_world for pose in poses])
+    # With nearly parallel axes the nearest point lies anywhere along them.
     forward_facing = is_forward_facing(poses)
     if forward_facing:
         depths = np.array([depth_of(camera) for camera in cameras])
@@ -66,6 +67,7 @@ def focus_of_scene(scene: GaussianScene, rasterizer: Rasterizer) -> Focus:
         return focus_of([named.camera for named in scene.cameras], lambda camera: centre_depth(rasterizer, camera))
     opaque = scene.means[scene.opacities > FOCUS.min_opacity].astype(np.float64)
     opaque = opaque if len(opaque) else scene.means.astype(np.float64)
+    # The median ignores floaters far away.
     middle = np.median(opaque, axis=0)
     radius = float(np.median(np.linalg.norm(opaque - middle, axis=1)))
     return Focus(middle, max(FOCUS.distance_without_cameras * radius, 1e-9), False)
@@ -76,6 +78,7 @@ def centre_depth(rasterizer: Rasterizer, camera: Camera) -> float:
     small = Camera(camera.intrinsics.with_long_side(FOCUS.depth_render_px), camera.pose)
     (frame,) = rasterizer.render([small])
     height, width = frame.median_depth.shape
+    # A few pixels: a single one may look through a gap.
     middle = frame.median_depth[height // 2 - 4 : height // 2 + 4, width // 2 - 4 : width // 2 + 4]
     return float(np.median(middle[middle > 0])) if np.any(middle > 0) else 0.0
 

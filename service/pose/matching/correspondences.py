@@ -27,6 +27,7 @@ class Correspondences:
     @classmethod
     def pooled(cls, parts: Sequence[Correspondences]) -> Correspondences:
         """Put the matches with several views together, by their rank; `view_px` then refers to none of the views."""
+        # PROSAC draws from the front, where each view's best matches should be.
         by_rank = np.argsort(np.concatenate([np.arange(len(part.photo_px)) for part in parts]), kind="stable")
         return cls(
             np.concatenate([part.photo_px for part in parts])[by_rank],

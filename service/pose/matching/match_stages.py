@@ -72,6 +72,7 @@ def match_candidates(
     `features` are the photo's, in the size and rotation of the search; `max_error_px` is at PHOTO_PX.
     """
     best: AbsolutePose | None = None
+    # Matches with single views may be too few, and those with several agree with one pose.
     pooled: list[Correspondences] = []
     for view in views:
         matches = correspondences(features, view, images.matcher)
@@ -83,6 +84,7 @@ def match_candidates(
         yield record_of(view.camera, matches, found, best, "match")
         if best and best.num_inliers >= config.sufficient_inliers:
             return best
+    # No view suffices alone.
     together = Correspondences.pooled(pooled)
     found = solve_matches(together, images.query, max_error_px, config.pooled_trials)
     if found and (best is None or found.num_inliers > best.num_inliers):
@@ -111,6 +113,7 @@ def render_and_rematch(
 
     At a right pose more matches agree than with the view that led there, at a wrong one hardly any.
     """
+    # In the photo's usual size: a render has its scale, whatever variant led to the pose.
     features = images.features()
     for rounds in range(config.max_rematches):
         view = renderer.at(images.query.corrected(found.correction), found.pose).view(images.matcher)
@@ -119,6 +122,7 @@ def render_and_rematch(
         if again is None or again.num_inliers < config.min_rematch_inliers:
             return Rematch(None, rounds)
         step_deg, step_units = pose_distance(found.pose, again.pose)
+        # Translation is judged relative to what is seen: scenes have any unit.
         distance = np.median(np.linalg.norm(view.points_in_world - again.pose.position_in_world, axis=1))
         found = again
         record = record_of(view.camera, matches, found, found, "rematch")
@@ -157,6 +161,7 @@ def solve_matches_near(
         return None
     else:
         points = matches.points_in_world.astype(np.float64)
+        # Rotation about what is seen is independent of translation, about the camera it isn't.
         centre = np.median(points, axis=0)
         given = MatchedPoints(matches.photo_px.astype(np.float64), points, query.intrinsics, centre)
         solved = least_squares_solve(given, near.pose, config.decoupled)

@@ -66,6 +66,7 @@ class RefinedPose:
     def view_at_pose(self, images: QueryImages, renderer: ViewRenderer) -> tuple[RenderedView, RefinementResult | None]:
         """Return a render within a pixel of the pose, and the refinement on it: both at hand, or a new render."""
         camera = camera_of(images.query, self.pose)
+        # The gate measures at this size, and a smaller render of the first round is none.
         if self.rendered is not None and self.rendered.shows_the_same_as(camera, 1.0):
             return self.rendered, self.photometric
         return renderer.render(camera), None
@@ -97,6 +98,7 @@ def refine_stage(
     """
     if config.max_renders == 0:
         return RefineOutcome((yield from _as_matched(found, renderer)))
+    # Many agreeing matches outweigh a refinement that leads far away from them.
     trusted, free_focal = found.num_inliers >= config.trusted_inliers, bool(images.query.focal_sigma)
     small_px = None if free_focal else config.first_render_px
     now, refined, rendered = found, None, None
@@ -105,10 +107,12 @@ def refine_stage(
         if following is None:
             return RefineOutcome(refined)
         rendered = following
+        # From nearby the coarse levels change nothing.
         levels = config.levels if round_number or trusted else config.first_levels
         result = _refined_on(rendered, now, images, levels, bool(small_px), config)
         diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
         if diverged or result.loss > max_loss or not np.isfinite(result.loss):
+            # The last good pose was refined on an earlier render than the latest one.
             refined = refined and replace(refined, rendered=rendered, photometric=None)
             is_astray = diverged or not np.isfinite(result.loss)
             return RefineOutcome(refined, found if trusted and is_astray else None, is_astray)
@@ -120,6 +124,7 @@ def refine_stage(
     following = _next_render(rendered, now, images, renderer, config, None)
     if following is None:
         return RefineOutcome(refined)
+    # Distance and focal length still move along together: fresh matches decide between them.
     return RefineOutcome(replace(refined, rendered=following, photometric=None), restart=now)
 
 

@@ -81,12 +81,14 @@ def ambiguous_hypotheses(
 
     `scores` are the views' retrieval scores; `image` and `max_error_px` are in pixels of the intrinsics.
     """
+    # Views near the answer show the same thing, and would only confirm it.
     elsewhere = (i for i in top(scores, len(scores)) if not _shows_the_same(views[i], answer.pose, config))
     chosen = list(islice(elsewhere, config.views))
     if not chosen:
         return
     strong = _strongest(image, config.features)
     found = [correspondences(strong, _strongest_of(views[i], config.features), matcher) for i in chosen]
+    # Wider than an inlier's error: what the answer nearly explains is no evidence for another pose.
     explained_px = config.explained_factor * max_error_px
     left = _unexplained(Correspondences.pooled(found), intrinsics, answer.pose, explained_px)
     for _ in range(config.max_hypotheses):
@@ -95,6 +97,7 @@ def ambiguous_hypotheses(
             return
         if answer.differs_from(other.pose, config):
             yield other
+        # The next hypothesis has to rest on matches of its own.
         left = _unexplained(left, intrinsics, other.pose, explained_px)
 
 
@@ -102,6 +105,7 @@ def _shows_the_same(view: View, answer: Pose, config: AmbiguityConfig) -> bool:
     angle, way = pose_distance(view.camera.pose, answer)
     if angle > config.same_view_deg or len(view.points_in_world) == 0:
         return False
+    # A sample is enough for a median.
     seen = view.points_in_world[::8] - view.camera.pose.position_in_world
     return way < config.same_view_share * float(np.median(np.linalg.norm(seen, axis=1)))
 

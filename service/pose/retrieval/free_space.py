@@ -97,6 +97,7 @@ def _steps_in_the_clear(filled, starts, directions, first, most):
     """Return how many steps of a cell each one gets, from `first` cells away on, before a filled one, or `most`."""
     steps = np.empty(len(starts), np.int64)
     for i in range(len(starts)):
+        # No filled cell on the way so far.
         steps[i] = most
         for k in range(most):
             away = first + k
@@ -117,11 +118,14 @@ def survey(scene: GaussianScene) -> Space:
     opaque = opaque[:: -(-len(opaque) // SPACE.max_points)]
     points = scene.means[opaque].astype(np.float64)
     sizes = np.sort(scene.scales[opaque].astype(np.float64), axis=1)[:, 1]  # long and thin ones: how fine they are
+    # The largest and smallest Gaussians are background and noise.
     sizes = np.clip(sizes, *np.quantile(sizes, [0.1, 0.9]))
     info = scene.info
     focal = info.training_focal_px or info.training_long_side_px or SPACE.assumed_focal_px
+    # Floaters far away would make the grid too coarse.
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
+    # A wall is a surface: its cells grow with the square of the resolution, the volume's with the cube.
     cells = min(SPACE.max_cells, (len(points) / (6 * SPACE.points_per_cell)) ** 1.5)
     cell = max(float(np.cbrt(np.prod(np.maximum(high - low, 1e-3 * (high - low).max())) / cells)), 1e-9)
     shape = np.floor((high - low) / cell).astype(int) + 1

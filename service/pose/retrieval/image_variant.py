@@ -90,8 +90,10 @@ class Retrieval:
         """
         query = self.images.query
         lenses = [view.camera.intrinsics for view in self.index.views]
+        # Focal lengths relative to the long side: the angle of a pixel at equal sizes.
         of_views = float(np.median([max(lens.fx, lens.fy) / lens.long_side for lens in lenses]))
         factor = of_views * query.intrinsics.long_side / max(query.intrinsics.fx, query.intrinsics.fy)
+        # Resizing costs detail, and a guessed focal length may be off by more than the tolerance.
         if 1 / self.config.same_scale < factor < self.config.same_scale or query.intrinsics_source == "guessed":
             return ImageVariant(PHOTO_PX)
         return ImageVariant(int(np.clip(PHOTO_PX * factor, self.config.min_photo_px, self.config.max_photo_px)))
@@ -100,6 +102,7 @@ class Retrieval:
         """Return the rotation that the photo's corners suggest, if its scores exceed those of the upright photo."""
         suggested = rolls_to_upright(self.images.corners(), self.index.corners)
         best, most = upright, 0.0
+        # Extracting the features of a rotation is costly, so only the likeliest are compared.
         for steps in [steps for steps in suggested if steps][: self.config.max_rotations]:
             rotated = replace(upright, roll_steps_45deg=steps)
             score = self.config.rotation_bias * self.scores(rotated).max()
@@ -112,5 +115,6 @@ class Retrieval:
         if region is None:
             return scores
         away = np.array([distance_outside(region, view.camera.pose) for view in self.index.views])
+        # Views in the region have a distance of 0, so at least those are within reach.
         reach = np.sort(away)[min(self.config.views_outside_prior, len(away)) - 1]
         return np.where(away <= reach, scores, min(0.0, float(scores.min())))

@@ -46,6 +46,7 @@ class ViewIndex:
 
 def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:
     """Read the scene's index from the cache, or build it and store it there."""
+    # The name is a hash of all that the index depends on, so a stale one is never read.
     path = cache_dir / f"view-index-{_key(tools, viewpoints)}.npz" if cache_dir else None
     if path and path.exists():
         try:
@@ -64,6 +65,7 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="index") as pool:
+        # Rounded up, so that the corners of all views together stay below the limit.
         every = -(-len(cameras) * CORNERS.of_view // CORNERS.of_all_views)
         renderer = OccludedRenderer(tools.scene, tools.rasterizer, tools.rng, lod)
 
@@ -73,6 +75,7 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
             view = backprojected(tools.matcher.extract(rgb, VIEWS.max_features), frame, cameras[number])
             return view, detect_corners(rgb, CORNERS.of_view) if number % every == 0 else None
 
+        # In order: the index is the same whatever thread is first.
         found = list(pool.map(seen, range(len(cameras))))
         views = tuple(view for view, _ in found)
         mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
@@ -112,6 +115,7 @@ def _write(index: ViewIndex, path: Path) -> None:
         "descriptors": np.concatenate([view.features.descriptors for view in index.views]),
         "points_in_world": np.concatenate([view.points_in_world for view in index.views]),
     }
+    # Two processes may build the same index at once.
     handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -125,6 +129,7 @@ def _write(index: ViewIndex, path: Path) -> None:
 def _read(path: Path) -> ViewIndex:
     with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
         stored = {name: file[name] for name in file.files}
+    # The views' features lie in one array, one after the other.
     stops = np.cumsum(stored["counts"])
     views = []
     for i, (start, stop) in enumerate(zip(stops - stored["counts"], stops, strict=True)):

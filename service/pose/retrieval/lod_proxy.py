@@ -46,6 +46,7 @@ def lod_proxy(
     """
     if scene.count <= config.proxy_gaussians:
         return rasterizer
+    # A Gaussian's visible area is about that of its two larger axes.
     least = scene.scales.min(1)
     areas = scene.scales.prod(1, np.float64) / np.maximum(least, 1e-30) * scene.opacities + 1e-30
     share = config.proxy_gaussians * areas / areas.sum()
@@ -54,8 +55,10 @@ def lod_proxy(
         room = config.proxy_gaussians - np.count_nonzero(certain)
         share *= np.where(certain, 1.0, room / share.sum(where=~certain))
     chosen = np.flatnonzero(rng.random(scene.count, np.float32) < share)
+    # Twice the area that is lost, because random choice leaves gaps.
     wider = np.sqrt(2.0 / share[chosen], where=share[chosen] < 1, out=np.ones(len(chosen)))
     scales = (scene.scales[chosen] * wider[:, None]).astype(np.float32)
+    # The thinnest axis stays: a surface mustn't become thick.
     thinnest = np.argmin(scene.scales[chosen], axis=1)[:, None]
     np.put_along_axis(scales, thinnest, least[chosen, None], 1)
     arrays = {name: getattr(scene, name)[chosen] for name in ("means", "quats", "opacities")}
@@ -69,6 +72,7 @@ def occlusion_depths(frame: Frame, config: LodConfig = LOD) -> Float32[np.ndarra
     """
     surface, beyond = frame.median_depth, frame.depth - frame.median_depth
     behind = np.maximum(config.behind_factor * surface, surface + beyond / config.max_lost_share)
+    # Depth varies within the coarse pixel, so neighbours count, too.
     occluded = np.where(frame.alpha > config.opaque_alpha, behind, np.float32(np.inf))
     return np.asarray(cv2.dilate(occluded, np.ones((3, 3), np.uint8)))
 

@@ -50,6 +50,7 @@ def repeats_itself(views: Sequence[View], matcher: Matcher, pool: Executor, conf
     """Return whether what some view of the scene shows is seen from another pose, too."""
     if len(views) > config.max_views:
         return True
+    # Repetition is mutual: of two views that look alike at least one is likely among them.
     examined = views[:: config.every]
     return any(pool.map(lambda view: _is_seen_elsewhere(view, views, matcher, config), examined))
 
@@ -61,6 +62,7 @@ def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher, conf
     distance = float(np.median(np.linalg.norm(view.points_in_world - pose.position_in_world, axis=1)))
     scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
     error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX
+    # The view's own pose is the answer that others are compared with.
     own = Explanation(pose, distance)
     found = ambiguous_hypotheses(
         view.features, intrinsics, own, views, scores, matcher, error_px, AMBIGUITY.min_inliers
@@ -78,6 +80,7 @@ def like_its_mirror_image(
     """Return whether mirrored renders of the scene are localized in it."""
     if not views:
         return False
+    # Spread over the index, whose views are spread over the scene.
     probes = np.unique(np.linspace(0, len(views) - 1, config.mirror_probes).astype(int))
     inliers = pool.map(lambda i: _mirrored_inliers(views[i], views, rasterizer, matcher, config), probes)
     return float(np.median(list(inliers))) >= config.min_mirror_inliers
@@ -89,6 +92,7 @@ def _mirrored_inliers(
     """Return how many matches of a mirrored view with one of the others agree on a pose, at most."""
     (frame,) = rasterizer.render([view.camera])
     intrinsics = mirrored_intrinsics(view.camera.intrinsics)
+    # Mirroring the image changes its features, so they can't be taken from the index.
     features = matcher.extract(np.ascontiguousarray(to_uint8(frame.rgb)[:, ::-1]), VIEWS.max_features)
     scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
     error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX

@@ -34,8 +34,11 @@ def retrieval_scores(
     Gaussians, 13 similar rooms, 374 views: a right view is among the first five for 10 photos of 16; relative to the
     average for 8, by VLAD with 32 words for 3. In the six test scenes and studio each of them finds one for all 58.)
     """
+    # Extractors return features by strength, the strongest first.
     photo = np.ascontiguousarray(descriptors[: config.photo_features].T)
+    # Unit length: the dot product is the cosine similarity.
     best = np.stack([(view[: config.view_features] @ photo).max(0, initial=0.0) for view in views], 1)
+    # Of few views a fixed rank, of many a share of them; never beyond the last.
     rank = min(max(config.usual_rank, round(config.usual_share * len(views))), len(views) - 1)
     usual = -np.partition(-best, rank, axis=1)[:, rank, None]
     return np.maximum(best - usual, 0.0).sum(0, dtype=np.float64)

@@ -102,6 +102,7 @@ def find_views(
     search = lod_proxy(scene, rasterizer, rng)
     views = _Views(space, search, config)
     views.judge(_shells(space, config) + _in_volume(space, rng, config) + _by_size(space, rng, config.size_candidates))
+    # Near good candidates others are likely good, too.
     best = np.argsort(-np.array(views.scores), kind="stable")[: config.best]
     views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(config.offspring)])
     good = views.good()
@@ -110,6 +111,7 @@ def find_views(
         before, few = _covered(seen), len(good) < space.enough
         if before > config.sufficient_coverage and not few:
             break
+        # Half of the candidates aim at what is seen least, half vary the good views.
         aimed = _by_size(space, rng, config.round_candidates // 2, seen <= np.quantile(seen, config.least_seen_share))
         near = rng.choice(good, config.round_candidates // 2) if len(good) else []
         views.judge(aimed + [_jittered(views.poses[i], space, rng, config.wide_turn) for i in near])
@@ -148,6 +150,7 @@ def floaters(scene: GaussianScene) -> float:
         wanted = _ids(cells + np.array(step) - 1)
         at = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
         around += np.where(ids[at] == wanted, counts[at], 0)
+    # The space has a sample of the points; neighbours become fewer in proportion.
     opaque = max(int((scene.opacities > SPACE.min_opacity).sum()), len(space.points))
     alone = around <= max(1.0, PLACEMENT.floater_neighbours * len(space.points) / opaque)
     return float(counts[alone].sum() / counts.sum())
@@ -191,6 +194,7 @@ class _Views:
         """Render the candidates small, except those among Gaussians and those known to be outside."""
         positions = np.stack([pose.position_in_world for pose in poses])
         enclosures = self._space.enclosures(positions)
+        # Rendering is what costs, so candidates are filtered by geometry first.
         worth = np.flatnonzero(~self._space.occupied(positions) & (enclosures >= self._least_enclosed))
         lens = search_camera(self._config.render_px, self._config.fov_deg)
         self.add([Camera(lens, poses[i]) for i in worth.tolist()])
@@ -219,6 +223,7 @@ class _Views:
         """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior."""
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
         solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
+        # Not the maximum: a single view may stand in a closet.
         limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
         self._least_enclosed = (
             self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
@@ -236,6 +241,7 @@ class _Views:
         points = self._surfaces[i]
         rays = points - self.poses[i].position_in_world
         distances = np.linalg.norm(rays, axis=1, keepdims=True)
+        # Rounded to steps of some 40 degrees, and distances to octaves: within those, features match.
         directions = np.rint(1.4 * rays / np.maximum(distances, 1e-12))
         octaves = np.floor(np.log2(np.maximum(distances, 1e-12)))
         voxels = np.floor(points / self._voxel)
@@ -291,6 +297,7 @@ def _in_volume(space: Space, rng: np.random.Generator, config: PlacementConfig) 
     """Return poses at random places in the volume that look at random Gaussians."""
     low, high = np.quantile(space.points, [0.05, 0.95], axis=0)
     positions = rng.uniform(low, high, (config.volume_candidates, 3))
+    # Where there are more Gaussians there is more to see.
     targets = space.points[rng.integers(len(space.points), size=config.volume_candidates)]
     return _looking(positions, targets, space.up)
 
@@ -305,10 +312,12 @@ def _by_size(
     among = np.arange(len(space.points)) if wanted is None else np.flatnonzero(wanted)
     taken = rng.choice(among, count)
     directions = rng.standard_normal((count, 3))
+    # Photos are mostly taken level: the vertical part is halved.
     directions -= 0.5 * (directions @ space.up)[:, None] * space.up
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     targets = space.points[taken]
     distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.4), np.log(1.6), count))
+    # Not behind the next wall, as seen from the target.
     distances = np.minimum(distances, 0.9 * space.clear(targets, -directions, float(distances.max())))
     return _looking(targets - distances[:, None] * directions, targets, space.up)
 

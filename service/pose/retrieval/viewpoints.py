@@ -45,6 +45,7 @@ def index_cameras(
         found = find_views(scene, rasterizer, rng, config.placement)
         return [Camera(sized(camera.intrinsics, config.render_px), camera.pose) for camera in found.cameras]
     cameras = [named.camera for named in scene.cameras]
+    # Rendering all of many cameras would take longer than the index itself.
     depths = [centre_depth(rasterizer, camera) for camera in cameras[:: -(-len(cameras) // config.depth_cameras)]]
     seen = [depth for depth in depths if depth > 0]
     chosen = spread([camera.pose for camera in cameras], float(np.median(seen)) if seen else 1.0, config)
@@ -59,6 +60,7 @@ def spread(poses: Sequence[Pose], depth: float, config: ViewpointConfig = VIEWPO
     """
     positions = np.stack([pose.position_in_world for pose in poses])
     axes = np.stack([pose.axis_in_world for pose in poses])
+    # Both parts are without unit: the chord between two axes is at most 2.
     places = np.concatenate([positions / max(depth, 1e-9), axes], 1)
     return farthest_points(places, config.min_views, config.max_views, config.spacing)
 
@@ -70,10 +72,12 @@ def farthest_points(
 
     The choice ends with `at_most`, or once it has `at_least` and none is farther than `spacing` from it.
     """
+    # The first is central, so that the choice doesn't depend on the cameras' order.
     chosen = [int(np.argmin(np.linalg.norm(places - np.median(places, axis=0), axis=1)))]
     distance = np.linalg.norm(places - places[chosen[0]], axis=1)
     while len(chosen) < min(at_most, len(places)):
         farthest = int(np.argmax(distance))
+        # Only duplicates of chosen places are left.
         if distance[farthest] == 0 or (len(chosen) >= at_least and distance[farthest] < spacing):
             break
         chosen.append(farthest)

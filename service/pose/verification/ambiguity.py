@@ -36,6 +36,7 @@ def rank_answers(losses: Sequence[float], config: AnswerConfig = ANSWERS) -> lis
     `losses` are their mean residuals after refinement. Improbable answers are left out, never the first one.
     """
     residuals = np.asarray(losses, np.float64)
+    # Relative to the best, so that the photo's own noise cancels.
     weights = (residuals / residuals.min()) ** -config.decisiveness
     probabilities = weights / weights.sum()
     order = np.argsort(residuals, kind="stable")

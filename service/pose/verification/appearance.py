@@ -86,6 +86,7 @@ class Pair:
         factor = APPEARANCE.long_side_px / max(height, width)
         size = (max(APPEARANCE.block_px, round(width * factor)), max(APPEARANCE.block_px, round(height * factor)))
         render, opaque = to_uint8(frame.rgb), visible_alpha(frame, valid)
+        # All three at one size and by area, so that they stay aligned.
         small = [cv2.resize(layer, size, interpolation=cv2.INTER_AREA) for layer in (photo, render, opaque)]
         return cls(small[0], small[1], small[2], valid is None)
 
@@ -113,8 +114,10 @@ class Blocks:
         if not pair.whole:  # gradients along the mask's edge are the mask's
             opaque = cv2.erode(opaque.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
         a, b = (_gradients(image) * opaque[..., None] for image in (pair.photo, pair.render))
+        # Products per block give the correlation without a second pass.
         sums = [_blocks(image).sum(2, dtype=np.float64) for image in (a * b, a * a, b * b)]
         alone, around = _correlations(*sums), _correlations(*(cv2.blur(i, (3, 3)) for i in sums))
+        # A saturated channel has lost its colour.
         unsaturated = cv2.inRange(pair.photo, (0, 0, 0), (WHITE - 1, WHITE - 1, WHITE - 1))
         share = _blocks(unsaturated.astype(np.float32)).reshape(-1, 1) / 255
         counted = np.maximum(share, APPEARANCE.min_unsaturated_share)
@@ -143,6 +146,7 @@ def gradient_correlation(blocks: Blocks) -> tuple[float, float]:
     Blocks weigh by the render's squared gradients; shares are of that weight. A passer-by lowers the correlation of a
     few blocks, a wrong pose that of all.
     """
+    # By correlation: what occludes the scene correlates least.
     worst_first = np.argsort(blocks.correlation)
     below = np.cumsum(blocks.weight[worst_first])
 
@@ -162,6 +166,7 @@ def local_colour_correlation(blocks: Blocks) -> float:
     """
     if not blocks.valid.any():
         return 1.0
+    # Flat blocks correlate by chance.
     shows = blocks.weight > APPEARANCE.flat_share * np.median(blocks.weight[blocks.valid])
     same = blocks.valid & shows & (np.minimum(blocks.correlation, blocks.around) > APPEARANCE.same_gradients)
     if same.sum() < APPEARANCE.min_count:
@@ -181,6 +186,7 @@ def _shares(
     pr, pl = (photo * render).sum(0), (photo * luma).sum(0)
     ridge = APPEARANCE.ridge
     rr, ll = rr * (1 + ridge) + ridge, ll * (1 + ridge) + ridge
+    # Two unknowns a channel: the normal equations are solved in closed form.
     determinant = rr * ll - rl * rl
     of_channel, of_luma = (pr * ll - pl * rl) / determinant, (pl * rr - pr * rl) / determinant
     alone_r, alone_l = np.maximum(pr / rr, 0), np.maximum(pl / ll, 0)
@@ -219,6 +225,7 @@ def _correlation(a: Float32[np.ndarray, "3 n"], b: Float32[np.ndarray, "3 n"], h
     for _ in range(APPEARANCE.fits):
         x, y = _centred(a, kept), _centred(b, kept)
         gain = ((x * y) @ kept) / np.maximum((y * y) @ kept, np.float32(1e-6))
+        # The gain is fitted to what is kept, so one pass isn't enough.
         misfit = np.abs(x - gain[:, None] * y).sum(0)
         count = len(kept) - int(hidden * len(kept))
         kept = (misfit <= np.partition(misfit, count - 1)[count - 1]).astype(np.float32)

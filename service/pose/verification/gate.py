@@ -83,15 +83,18 @@ def verify(
     """
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
+    # Fresh matches cost most of a verification.
     if supporting_matches is not None and photometric_suffices(signals, config):
         verdict = judge(signals, uncertainty, query.focal_sigma, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
     few = len(features.scores) < config.min_features
+    # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
         return judge(signals | NO_MATCHES, uncertainty, query.focal_sigma, few, config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
+    # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), config.min_valid_share)
     return _within_prior(judge(signals, uncertainty, query.focal_sigma, few, config), images, pose)
@@ -150,6 +153,7 @@ def judge(
     `focal_sigma` is the standard deviation of the logarithm of the photo's focal length before localization, 0 where
     it was given as exact.
     """
+    # The sum of the model could compensate for one bad signal; floors don't.
     doubtful = config.model.below_floor(signals)
     score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
     doubt, covariance, sigma = _doubt_about_intrinsics(uncertainty, focal_sigma, config)
@@ -181,6 +185,7 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
     """Return which kind of signals, matches or pixels, is the worse one; of those below their floors, if any are."""
     scales = config.model.scales
     scaled = {name: float(scales[name](value)) for name, value in signals.items() if name in scales}
+    # A signal below its floor is why the pose was refused.
     scaled = {name: scaled[name] for name in doubtful} or scaled
     matches = np.mean([value for name, value in scaled.items() if name.startswith("inlier")] or [1.0])
     pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")] or [1.0])
@@ -195,6 +200,7 @@ def _doubt_about_intrinsics(
     """Return a doubt about the focal length, the pose's covariance, and the deviation of the focal length's log."""
     if uncertainty is None:
         return None, None, focal_sigma
+    # What another step would still change is an error, too: it adds its square.
     covariance = uncertainty.covariance[:6, :6] + np.outer(uncertainty.last_step, uncertainty.last_step)
     off = abs(uncertainty.focal_step)
     if focal_sigma:

@@ -33,6 +33,7 @@ class Scale:
     def __call__(self, value: Float[np.ndarray, "*n"] | float) -> Float64[np.ndarray, "*n"] | np.float64:
         ends = np.array([self.at_zero, self.at_one])
         if self.logarithmic:
+            # Ratios matter for counts and pixels, differences for correlations.
             value, ends = np.log(np.maximum(value, 1e-6)), np.log(ends)
         return np.clip((np.asarray(value) - ends[0]) / (ends[1] - ends[0]), 0.0, 1.0)
 
@@ -67,6 +68,7 @@ class GateModel:
 
     def probability(self, signals: Mapping[str, float]) -> float:
         """Return how probably a pose with these signals is right, 0..1; without signals of matches by the others."""
+        # Verification by the pixels alone has a model of its own.
         model = self.with_matches if "inliers" in signals else self.photometric
         logit = model.bias + sum(weight * self.scales[name](signals[name]) for name, weight in model.weights.items())
         return float(1.0 / (1.0 + np.exp(-logit)))
@@ -85,14 +87,16 @@ def model_from_json(content: Mapping[str, Any]) -> GateModel:
     if content["version"] != FORMAT_VERSION:
         raise ValueError(f"the gate's model has version {content['version']}, this code reads {FORMAT_VERSION}")
     return GateModel(
-        MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
-        *(
-            Logistic(content[kind]["bias"], MappingProxyType(content[kind]["weights"]))
-            for kind in ("with_matches", "photometric")
-        ),
-        MappingProxyType(content["floors"]),
-        MappingProxyType(content["fitted_on"]),
+        scales=MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
+        with_matches=_logistic(content["with_matches"]),
+        photometric=_logistic(content["photometric"]),
+        floors=MappingProxyType(content["floors"]),
+        fitted_on=MappingProxyType(content["fitted_on"]),
     )
+
+
+def _logistic(content: Mapping[str, Any]) -> Logistic:
+    return Logistic(content["bias"], MappingProxyType(content["weights"]))
 
 
 def model_to_json(model: GateModel) -> dict[str, Any]:
@@ -120,4 +124,5 @@ def write_model(model: GateModel, path: Path) -> None:
     path.write_text(json.dumps(model_to_json(model), indent=2) + "\n", encoding="utf-8")
 
 
+# Read once, when the module is imported.
 SHIPPED_MODEL = load_model()

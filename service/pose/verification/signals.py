@@ -43,12 +43,14 @@ def geometry_signals(frame: Frame, size: Intrinsics, uncertainty: PoseUncertaint
     `coverage`: share of the image that is opaque; `drift_px`: by how much another step of refinement on this frame
     would move the image; `sigma_share`: standard deviation of the position over the median depth.
     """
+    # A sample is enough for a median.
     depth = frame.median_depth[::4, ::4]
     typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
     drift = spread = np.inf
     if uncertainty is not None:
         spread = float(np.sqrt(np.trace(uncertainty.covariance[3:6, 3:6]))) / typical_depth
         if spread < SIGNALS.undetermined:
+            # Both as pixels: an angle times the focal length, a translation over the depth times it.
             rotation, translation = np.linalg.norm(uncertainty.last_step.reshape(2, 3), axis=1)
             drift = size.fx * float(rotation + translation / typical_depth)
     return {
@@ -69,6 +71,7 @@ def match_signals(
     scale, cells = size.long_side / query.intrinsics.long_side, SIGNALS.cells
     error = scale * reprojection_error_px(found.photo_px, found.points_in_world, query.intrinsics, pose)
     inlier = error < SIGNALS.max_error_px
+    # Cells that show nothing of the scene can't have inliers.
     opaque = cv2.resize(alpha, (cells, cells), interpolation=cv2.INTER_AREA) > 0.5 * SIGNALS.min_alpha
     cell = (found.photo_px[inlier] * (cells / np.array([query.intrinsics.width, query.intrinsics.height]))).astype(int)
     held = np.zeros((cells, cells), bool)
