@@ -189,9 +189,8 @@ class FolderDraft:
         try:
             load_scene(self._folder)
         except SceneError as error:
-            error.where = error.where.replace(
-                str(self._folder), "archive"
-            )  # clients must not learn the service's folders
+            # Clients must not learn where the service keeps its files.
+            error.where = error.where.replace(str(self._folder), "archive")
             raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
 
 
