@@ -30,7 +30,10 @@ def encode(value: Any) -> str:
 
 
 def decode(kind: type[_T], text: str) -> _T:
-    """Read a `kind` that `encode` wrote. Raises ValueError for another version, KeyError for a missing field."""
+    """Read a `kind` that `encode` wrote.
+
+    Raises ValueError for another version, KeyError for an unknown field, TypeError for a missing one.
+    """
     envelope = json.loads(text)
     if envelope["version"] != VERSION:
         raise ValueError(f"stored by another program: version {envelope['version']}")
