@@ -1,0 +1,121 @@
+"""Jobs without HTTP, on stores in memory: an attempt is its worker's as long as the lease is renewed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import pytest
+from api_server import GO_ON, photo, until
+from memory_stores import MemoryJobStore, MemoryPhotoStore
+from stand_ins import make_scene
+
+from service.errors import IdempotencyConflict, PhotoGone
+from service.jobs.config import JobsConfig
+from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
+from service.jobs.model import JobSpec, StoredJob
+from service.jobs.service import JobOrder, Jobs
+
+
+class CountingObserver:
+    """Counts what happens to jobs."""
+
+    def __init__(self) -> None:
+        self.seen: Counter[str] = Counter()
+
+    def started(self, waited_s: float) -> None:
+        self.seen["started"] += 1
+
+    def ended(self, estimator: str, state: str, status: str | None, seconds: float | None) -> None:
+        self.seen[f"{estimator} {state} {status}"] += 1
+
+    def stage(self, estimator: str, stage: str, seconds: float) -> None:
+        self.seen[f"stage {stage}"] += 1
+
+    def renders(self, estimator: str, count: int) -> None:
+        self.seen["renders"] += count
+
+
+class UnrenewedStore(MemoryJobStore):
+    """Loses the heartbeats of every first attempt."""
+
+    def renew(self, attempts: Sequence[tuple[str, int]], lease_until: float) -> None:
+        super().renew([(job_id, attempt) for job_id, attempt in attempts if attempt > 1], lease_until)
+
+
+@contextmanager
+def running(store: MemoryJobStore, observer: CountingObserver | None = None, **config) -> Iterator[Jobs]:
+    engine = EmbeddedEngine(EngineConfig("stepping"))
+    engine.add_loaded("room", make_scene())
+    engine.start()
+    until(lambda: engine.readiness().ready)
+    config = {"workers": 2, "lease_s": 0.6, "shutdown_s": 0, "photo_grace_s": 0} | config
+    jobs = Jobs(JobsConfig(**config), engine, store, MemoryPhotoStore(), observer or CountingObserver())
+    jobs.start()
+    try:
+        yield jobs
+    finally:
+        GO_ON.set()
+        jobs.close()
+        engine.close()
+
+
+def order(key: str | None = None, **options) -> JobOrder:
+    data = photo()
+    spec = JobSpec("stepping", options=options, seed=5)
+    return JobOrder(data, "p.jpg", hashlib.sha256(data).hexdigest(), spec, "me", key, repr(options))
+
+
+def ended(jobs: Jobs, job: StoredJob) -> StoredJob:
+    until(lambda: jobs.get(job.id).ended and jobs.live(job.id) is None)
+    return jobs.get(job.id)
+
+
+def test_a_job_runs_on_stores_in_memory(stepping):
+    observer = CountingObserver()
+    with running(MemoryJobStore(), observer) as jobs:
+        accepted = jobs.accept(order("key", steps=4))
+        assert jobs.accept(order("key", steps=4)).id == accepted.id
+        with pytest.raises(IdempotencyConflict):
+            jobs.accept(order("key", steps=5))
+        job = ended(jobs, accepted)
+        assert (job.state, job.attempt, job.records, job.stage, job.scene) == ("succeeded", 1, 4, "step", "room")
+        assert [record.step.index for record in jobs.records(job)] == [0, 1, 2, 3]
+        assert jobs.result(job).estimate.seed == 5
+        with pytest.raises(PhotoGone):
+            jobs.photo(job)
+        assert observer.seen == {
+            **{"started": 1, "stepping succeeded not_localized": 1, "stage step": 1, "stage verify": 1, "renders": 0}
+        }
+
+
+def test_a_lease_that_is_renewed_keeps_the_attempt(stepping):
+    with running(MemoryJobStore(), lease_s=0.3) as jobs:
+        job = jobs.accept(order(steps=6, pause_s=0.2))
+        job = ended(jobs, job)  # four leases long
+        assert (job.state, job.attempt, job.lost) == ("succeeded", 1, 0)
+
+
+def test_a_lost_attempt_is_made_again_and_its_late_result_is_refused(stepping):
+    observer = CountingObserver()
+    with running(UnrenewedStore(), observer) as jobs:
+        accepted = jobs.accept(order(hold=True))
+        live = jobs.live(accepted.id)
+        assert live
+        until(lambda: jobs.get(accepted.id).attempt == 2)  # another worker has it, while the first one still holds on
+        until(lambda: len(live.records) == 1)
+        stepping.GO_ON.set()
+        job = ended(jobs, accepted)
+        assert (job.state, job.attempt, job.lost, job.records) == ("succeeded", 2, 1, 3)
+        assert [record.step.index for record in jobs.records(job)] == [0, 1, 2]
+        assert (observer.seen["started"], observer.seen["stepping succeeded not_localized"]) == (2, 1)
+
+
+def test_a_job_whose_attempts_are_all_lost_is_interrupted(stepping):
+    with running(UnrenewedStore(), max_lost=1) as jobs:
+        job = ended(jobs, jobs.accept(order(hold=True)))
+        assert (job.state, job.attempt, job.lost) == ("interrupted", 1, 1)
+        assert job.failure
+        assert job.failure.code == "interrupted"
