@@ -7,7 +7,7 @@
       |-- SceneError
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
       |     |-- SceneExists
-      |     |-- SceneUnloaded, SceneInUse, NoRoom  (in memory, or not)
+      |     |-- SceneUnloaded, SceneInUse, SceneMemoryFull  (in memory, or not)
       |     `-- SceneNotReady  (still loading; try again later)
       |-- JobNotFound, RecordNotFound, JobNotReady
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
@@ -104,8 +104,8 @@ class SceneInUse(SceneError):
     code = "scene_in_use"
 
 
-class NoRoom(SceneError):
-    code = "no_room"
+class SceneMemoryFull(SceneError):
+    code = "scene_memory_full"
 
 
 class SceneNotReady(SceneError):

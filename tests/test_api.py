@@ -21,7 +21,7 @@ from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 import service.estimators
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
-from service.web.schemas import resources as documents
+from service.web.schemas import resources
 from service.web.settings import Settings
 
 # ------------------------------------------------------------------ the life of a job
@@ -631,7 +631,7 @@ def test_capabilities_tell_what_can_be_chosen(shared):
 
 @pytest.mark.parametrize("name", ["xfeat", "sift"])
 def test_the_matcher_that_is_set_is_the_default(name):
-    told = documents.capabilities(settings(estimator="view_index", matcher=name))
+    told = resources.capabilities(settings(estimator="view_index", matcher=name))
     assert [matcher.name for matcher in told.matchers if matcher.default] == [name]
 
 

@@ -80,7 +80,7 @@ WRAPPED = {
     "anyio": {"service/web"},
     "annotated_types": {"service/web/schemas/requests.py"},
     "pydantic": {"service/web", "service/cli/terminal.py"},
-    "pydantic_core": {"service/web/schemas/parsing.py"},
+    "pydantic_core": {"service/web/schemas/request_body.py"},
     "pydantic_settings": {"service/web/settings.py"},
     "limits": {"service/web/middleware/limits.py"},
     "prometheus_client": {"service/web/metrics.py"},

@@ -116,7 +116,7 @@ def on_scene(s: SimpleNamespace, scene: str) -> str:
 
 SCENES = {
     "scene_not_found": "none", "scene_unloaded": "away", "corrupt_scene": "torn", "unsupported_format": "odd",
-    "scene_not_ready": "slow", "no_room": "fat",
+    "scene_not_ready": "slow", "scene_memory_full": "fat",
 }  # fmt: skip
 
 

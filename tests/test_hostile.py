@@ -230,7 +230,7 @@ def test_a_bug_is_counted_as_500_and_has_our_headers(plugins):
     with ready_service() as client:
         job = post(client).json()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("service.web.routes.jobs.documents.job_trace", None)
+            patch.setattr("service.web.routes.jobs.resources.trace_out", None)
             answer = client.get(job["links"]["trace"])
         assert_problem(answer, 500, "internal_error")
         assert answer.headers["x-request-id"]

@@ -138,7 +138,7 @@ def test_a_scene_in_use_is_not_dropped_for_another(stepping, folder):
         held = post(client, prefer="", scene="attic", options={"hold": True}).headers["location"]
         post(client, scene="hall")
         until(lambda: states(client)["hall"] == "failed")
-        assert_problem(post(client, scene="hall"), 503, "no_room", "scene")
+        assert_problem(post(client, scene="hall"), 503, "scene_memory_full", "scene")
         stepping.GO_ON.set()
         finished(client, held)
         assert client.post("/scenes/hall/load").status_code == 202

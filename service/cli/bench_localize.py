@@ -47,7 +47,7 @@ def bench_localize(
     from service.bench import miss_images
     from service.bench.localize import Budget, run
     from service.localize import DEFAULT_MATCHER
-    from service.web.schemas.parsing import options_from
+    from service.web.schemas.job_spec import options_from
 
     print_machine()
     with progress_bar() as progress:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from service.jobs.model import JobRecord
     from service.localize import LoadedScene
     from service.web.schemas.job_results import Result
-    from service.web.schemas.parsing import Body
+    from service.web.schemas.request_body import Body
     from service.web.schemas.requests import LocalizeFields
 
 
@@ -63,7 +63,7 @@ def localize(
     from service.localize import DEFAULT_ESTIMATOR
     from service.photos.sequence import is_sequence
     from service.scene_formats.discovery import find_scenes
-    from service.web.schemas.parsing import Body, body_of
+    from service.web.schemas.request_body import Body, body_of
 
     fields = _fields(
         {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every},
@@ -87,7 +87,7 @@ def localize(
 
 def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
     """Return the request's fields as the API parses them; `nested` options are JSON, or files of it."""
-    from service.web.schemas.parsing import read_fields
+    from service.web.schemas.job_spec import read_fields
 
     # Through the API's own parser: the same names, limits and error texts.
     given = plain | {name: parsed_option(text, name) for name, text in nested.items()}
@@ -115,7 +115,7 @@ def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[Load
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
     from service.web.schemas.conversion import result_out
-    from service.web.schemas.parsing import job_spec
+    from service.web.schemas.job_spec import job_spec
 
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
@@ -139,7 +139,7 @@ def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, 
     from service.jobs.read_photo import read_photo
     from service.web.schemas.conversion import frame_out, result_out
     from service.web.schemas.exports import trajectory_of
-    from service.web.schemas.parsing import job_spec
+    from service.web.schemas.job_spec import job_spec
 
     spec = job_spec(fields)
     # The service limits the frames of a job; the command line doesn't.

@@ -20,7 +20,7 @@ def render(
     """Render a scene; without intrinsics as its first training camera sees, or 640 x 480."""
     from service.scene_manager.scene_images import picture
     from service.scene_manager.status import PictureSpec
-    from service.web.schemas.parsing import checked_intrinsics, pose_from, read_fields
+    from service.web.schemas.job_spec import checked_intrinsics, pose_from, read_fields
 
     fields = read_fields({"truth": parsed_option(pose, "truth")})
     if fields.truth is None:

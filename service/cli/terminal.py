@@ -53,7 +53,7 @@ def short(value: Any) -> str:
 
 def parsed_option(text: str, where: str) -> Any:
     """Parse an option that is JSON, or names a file of it; None if it is empty."""
-    from service.web.schemas.parsing import parsed_json
+    from service.web.schemas.request_body import parsed_json
 
     if not text:
         return None

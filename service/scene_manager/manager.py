@@ -22,8 +22,8 @@ import numpy as np
 from service.errors import (
     BadInput,
     Failure,
-    NoRoom,
     SceneInUse,
+    SceneMemoryFull,
     SceneNotFound,
     SceneNotReady,
     SceneUnloaded,
@@ -290,7 +290,7 @@ class Scenes:
                 self.unload(entry)
 
     def _make_room(self, entry: Entry, needed: int) -> None:
-        """Drop the least recently used scenes until another one fits. Raises NoRoom."""
+        """Drop the least recently used scenes until another one fits. Raises SceneMemoryFull."""
         if self._memory_bytes is None:
             return
         with self._lock:
@@ -304,7 +304,7 @@ class Scenes:
                 _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
                 _drop(other)
             if total + needed > self._memory_bytes:
-                raise NoRoom(
+                raise SceneMemoryFull(
                     f"scene '{entry.id}' takes {needed / 1e6:.0f} MB, {total / 1e6:.0f} of "
                     f"{self._memory_bytes / 1e6:.0f} MB are in use.",
                     where="scene",

@@ -57,12 +57,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     and plug-ins of the settings that can't be used, InvalidRequest if anybody could use the service without `open`.
     """
     settings = settings or Settings()
-    SCENE_FORMATS.names()  # an added plug-in with a name that is taken is refused now, and here for all kinds
-    RASTERIZERS.names()
-    for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
-        kind.load(name)  # an unknown name must stop the start, not fail each job
-    if settings.rasterizer:
-        RASTERIZERS.load(settings.rasterizer)
+    _check_plugins(settings)
     engine = engine or EmbeddedEngine(settings.engine)
     named = _named_scenes(settings)
     for scene in named:
@@ -74,20 +69,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
-            folder = stack.enter_context(data_folder(settings.data_dir))
-            scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
-            for scene in scene_store.scenes():
-                if scene.uploaded:
-                    engine.add(scene)
-            store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
-            jobs = Jobs(settings.jobs, engine, store, photos, metrics)
-            stack.push_async_callback(to_thread.run_sync, engine.close)
-            await to_thread.run_sync(engine.start)
-            stack.push_async_callback(to_thread.run_sync, jobs.close)
-            await to_thread.run_sync(jobs.start)
-            limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
-            app.state.parts = Parts(settings, engine, scene_store, jobs, keys, metrics, *limits)
-            _add_gauges(metrics, engine, jobs, settings.workers)
+            app.state.parts = await _start(stack, settings, engine, named, keys, metrics)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -109,6 +91,42 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     _declare_documentation(app)
     require_policies(app.routes)
     return app
+
+
+def _check_plugins(settings: Settings) -> None:
+    """Load the plug-ins that the settings name, so that an unknown one stops the start and doesn't fail each job."""
+    SCENE_FORMATS.names()  # raises if two plug-ins have the same name; here for all kinds
+    RASTERIZERS.names()
+    for kind, name in ((ESTIMATORS, settings.estimator), (MATCHERS, settings.matcher)):
+        kind.load(name)
+    if settings.rasterizer:
+        RASTERIZERS.load(settings.rasterizer)
+
+
+async def _start(
+    stack: AsyncExitStack,
+    settings: Settings,
+    engine: Engine,
+    named: list[StoredScene],
+    keys: KeyRing,
+    metrics: Metrics,
+) -> Parts:
+    """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
+    folder = stack.enter_context(data_folder(settings.data_dir))
+    scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
+    for scene in scene_store.scenes():
+        if scene.uploaded:
+            engine.add(scene)
+    store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
+    jobs = Jobs(settings.jobs, engine, store, photos, metrics)
+    stack.push_async_callback(to_thread.run_sync, engine.close)
+    await to_thread.run_sync(engine.start)
+    # Registered after the engine's, hence called before: running jobs need it until they end.
+    stack.push_async_callback(to_thread.run_sync, jobs.close)
+    await to_thread.run_sync(jobs.start)
+    limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
+    _add_gauges(metrics, engine, jobs, settings.workers)
+    return Parts(settings, engine, scene_store, jobs, keys, metrics, *limits)
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:

@@ -65,7 +65,7 @@ def job_document(parts: Parts, job_id: str, root: str) -> JobOut:
     """Describe a job in full, as it stands. Not for the event loop: reads the disk. Raises JobNotFound."""
     job = parts.jobs.get(job_id)
     result = parts.jobs.result(job) if job.state == "succeeded" else None
-    return resources.job_document(job, result, root)
+    return resources.job_out(job, result, root)
 
 
 PartsOf = Annotated[Parts, Depends(_parts)]

@@ -17,7 +17,7 @@ from service.web.schemas import geopose_protocol as gpp
 from service.web.schemas import resources
 from service.web.schemas.conversion import result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
-from service.web.schemas.parsing import Body
+from service.web.schemas.request_body import Body
 from service.web.schemas.requests import LocalizeFields
 
 GEOPOSE = "application/geopose+json"

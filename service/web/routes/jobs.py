@@ -20,7 +20,7 @@ from service.results import Status
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf, job_document
-from service.web.schemas import resources as documents
+from service.web.schemas import resources
 from service.web.schemas.conversion import record_camera, record_out, result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.exports import EXPORT_TYPES, ExportFormat, exported
@@ -49,7 +49,7 @@ def list_jobs(
     query = {name: value for name, value in given.items() if value is not None}
     more = f"{root}/jobs?{urlencode(query | {'before': page[limit - 1].number})}" if len(page) > limit else None
     return JobList(
-        jobs=[documents.job_summary(job, root) for job in page[:limit]],
+        jobs=[resources.job_summary_out(job, root) for job in page[:limit]],
         next=more,
         queued=parts.jobs.waiting(),
         running=parts.jobs.running(),
@@ -155,7 +155,7 @@ async def job_photo(job: JobOf, parts: PartsOf) -> Response:
 @route_policy(role="read")
 def job_trace(job: JobOf, parts: PartsOf) -> Trace:
     """Return all records of the latest attempt so far."""
-    return documents.job_trace(job, parts.jobs.records(job))
+    return resources.trace_out(job, parts.jobs.records(job))
 
 
 @router.get(
@@ -205,6 +205,6 @@ def export_pose(job: JobOf, parts: PartsOf, format: Annotated[ExportFormat, Path
     GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
     an `images.txt`, a `transforms.json`, or a trajectory with the photos' times; `geopose` has the last one only.
     """
-    documents.require_pose(job)
+    resources.require_pose(job)
     created, result = datetime.fromtimestamp(job.created, UTC), result_out(parts.jobs.result(job))
     return Response(exported(format, job.photo.name, created, result), media_type=EXPORT_TYPES[format])

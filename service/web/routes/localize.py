@@ -15,8 +15,9 @@ from service.web.middleware.limits import client_of
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import Parts, PartsOf, RootOf, job_document
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
+from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
-from service.web.schemas.parsing import Body, job_spec, read_body, read_fields
+from service.web.schemas.request_body import Body, read_body
 from service.web.schemas.requests import LocalizeFields, LocalizeIn
 
 router = APIRouter()

@@ -14,9 +14,9 @@ from service.scene_manager.scene_images import PICTURE_TYPES
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
 from service.web.routes.dependencies import JPEG, PartsOf, RootOf
-from service.web.schemas import resources as documents
+from service.web.schemas import resources
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
-from service.web.schemas.parsing import checked_intrinsics, pose_from
+from service.web.schemas.job_spec import checked_intrinsics, pose_from
 from service.web.schemas.requests import RenderIn
 from service.web.schemas.scenes import SceneList, SceneOut, SceneSummary
 
@@ -29,14 +29,14 @@ router = APIRouter()
 @route_policy(role="read")
 def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
     """List the scenes with their states."""
-    return SceneList(scenes=[documents.scene_summary(scene, root) for scene in parts.engine.scenes()])
+    return SceneList(scenes=[resources.scene_summary_out(scene, root) for scene in parts.engine.scenes()])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
 @route_policy(role="read")
 def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
     """Return a scene with its training cameras."""
-    return documents.scene_document(parts.engine.scene(scene_id), parts.engine.contents(scene_id), root)
+    return resources.scene_out(parts.engine.scene(scene_id), parts.engine.contents(scene_id), root)
 
 
 @router.put(
@@ -72,7 +72,7 @@ async def upload_scene(
             await to_thread.run_sync(draft.write, chunk)
         stored = await to_thread.run_sync(draft.commit, file)
     await to_thread.run_sync(parts.engine.add, stored)
-    return documents.scene_document(await to_thread.run_sync(parts.engine.load, scene_id), None, root)
+    return resources.scene_out(await to_thread.run_sync(parts.engine.load, scene_id), None, root)
 
 
 @router.post(
@@ -81,7 +81,7 @@ async def upload_scene(
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Load a scene into memory and prepare it; also a scene whose loading failed."""
-    return documents.scene_summary(parts.engine.load(scene_id), root)
+    return resources.scene_summary_out(parts.engine.load(scene_id), root)
 
 
 @router.post(
@@ -93,7 +93,7 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     """Remove a scene from memory once the last job on it has ended. It accepts no new jobs until it is loaded again."""
-    return documents.scene_summary(parts.engine.unload(scene_id), root)
+    return resources.scene_summary_out(parts.engine.unload(scene_id), root)
 
 
 @router.delete(

@@ -9,7 +9,7 @@ from service.versions import versions
 from service.web.metrics import METRICS_TYPE
 from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import CallerOf, PartsOf
-from service.web.schemas import resources as documents
+from service.web.schemas import resources
 from service.web.schemas.error_examples import errors
 from service.web.schemas.system import Capabilities, Liveness, Readiness, Token
 
@@ -23,7 +23,7 @@ router = APIRouter()
 @route_policy(role="read")
 def get_capabilities(parts: PartsOf) -> Capabilities:
     """Return the estimators with their options, the matchers, renderers and scene formats."""
-    return documents.capabilities(parts.settings)
+    return resources.capabilities(parts.settings)
 
 
 @router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))

@@ -48,7 +48,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/localize",
     ),
     (
-        e.NoRoom(
+        e.SceneMemoryFull(
             "scene 'studio' takes 812 MB, 1400 of 2000 MB are in use.",
             where="scene",
             hint="Unload another scene, or raise SPLATFIX_SCENE_MEMORY_BYTES.",
@@ -76,7 +76,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     ),
     (e.JobNotReady("the job is running.", where="job"), f"{_JOB}/export/colmap"),
     (
-        e.NoPose("the job found no pose that could be used.", where="job", hint="Its document says why."),
+        e.NoPose("the job found no pose that could be used.", where="job", hint="See its reason: GET /jobs/ID."),
         f"{_JOB}/export/colmap",
     ),
     (
@@ -127,7 +127,7 @@ SCENE_ERRORS = (
     "corrupt_scene",
     "unsupported_format",
     "scene_not_ready",
-    "no_room",
+    "scene_memory_full",
 )
 """Errors of operations that need a loaded scene."""
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Len
 from pydantic import Field
 
+from service.errors import BadInput, InvalidIntrinsics, InvalidOptions, InvalidPrior, InvalidRequest
 from service.photos.video import MAX_EVERY
 from service.web.api_model import Model
 
@@ -90,6 +91,16 @@ class LocalizeFields(Model):
     """Seconds from now by which the job must have started; else it fails."""
     keep_photo: bool = False
     """Keep the photo, upright and without EXIF data, as long as the job. Default: delete it after the job."""
+
+
+FIELD_ERRORS: dict[str, type[BadInput]] = {
+    "options": InvalidOptions,
+    "intrinsics": InvalidIntrinsics,
+    "prior": InvalidPrior,
+    "truth": InvalidPrior,
+    "times_s": InvalidRequest,
+}
+"""Fields that are JSON text in a form, and the error that an invalid one raises; other fields raise InvalidRequest."""
 
 
 class LocalizeIn(LocalizeFields):

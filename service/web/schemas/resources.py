@@ -1,4 +1,4 @@
-"""Jobs, scenes and the machine as the models that the API returns; links carry the sub-path."""
+"""Converts jobs, scenes and capabilities to the models of the API. `root` is the sub-path, which links begin with."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from service.web.schemas.conversion import (
     region_out,
     result_out,
 )
+from service.web.schemas.job_spec import options_adapter
 from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
-from service.web.schemas.parsing import options_adapter
 from service.web.schemas.scenes import SceneLinks, SceneOut, SceneSummary
 from service.web.schemas.system import Capabilities, Capability, EstimatorCapability
 from service.web.settings import Settings
 
 
-def job_summary(job: StoredJob, root: str) -> JobSummary:
-    """Describe a job as in a list."""
+def job_summary_out(job: StoredJob, root: str) -> JobSummary:
+    """Convert a job for the list of jobs."""
     return JobSummary(**_summary(job, root))
 
 
-def job_document(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
-    """Describe a job in full, with its result or its error."""
+def job_out(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
+    """Convert a job, with its result or its error."""
     summary, spec = _summary(job, root), job.spec
     return JobOut(
         **summary,
@@ -83,30 +83,30 @@ def _summary(job: StoredJob, root: str) -> dict:
 
 
 def require_pose(job: StoredJob) -> None:
-    """Raise JobNotReady, NoPose unless the job has a result with a pose to be used."""
+    """Check that a job ended with a pose that may be used. Raises JobNotReady, NoPose."""
     if not job.ended:
         raise JobNotReady(f"the job is {job.state}.", where="job")
     if job.state != "succeeded" or job.status == Status.NOT_LOCALIZED:
-        raise NoPose("the job found no pose that could be used.", where="job", hint="Its document says why.")
+        raise NoPose("the job found no pose that could be used.", where="job", hint="See its reason: GET /jobs/ID.")
 
 
 def _time(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-def job_trace(job: StoredJob, records: list[JobRecord]) -> Trace:
-    """Spell out the records that a job has so far."""
-    told = [record_out(record.step, record.frame) for record in records]
-    return Trace(job=job.id, state=job.state, attempt=job.attempt, records=told)
+def trace_out(job: StoredJob, records: list[JobRecord]) -> Trace:
+    """Convert the records of a job's latest attempt."""
+    converted = [record_out(record.step, record.frame) for record in records]
+    return Trace(job=job.id, state=job.state, attempt=job.attempt, records=converted)
 
 
-def scene_summary(scene: SceneStatus, root: str) -> SceneSummary:
-    """Describe a scene as in a list."""
+def scene_summary_out(scene: SceneStatus, root: str) -> SceneSummary:
+    """Convert a scene for the list of scenes."""
     return SceneSummary(**_scene(scene, root))
 
 
-def scene_document(scene: SceneStatus, contents: SceneContents | None, root: str) -> SceneOut:
-    """Describe a scene with its training cameras; `contents` is None until it is in memory."""
+def scene_out(scene: SceneStatus, contents: SceneContents | None, root: str) -> SceneOut:
+    """Convert a scene with its training cameras; `contents` is None until it is in memory."""
     info = scene.info
     bounds = contents and contents.bounds_in_world
     return SceneOut(
@@ -140,7 +140,7 @@ def _scene(scene: SceneStatus, root: str) -> dict:
 
 
 def capabilities(settings: Settings) -> Capabilities:
-    """Say what can be chosen. Imports every plug-in: slow the first time."""
+    """List all plug-ins and the limits of requests. Imports every plug-in: slow the first time."""
     return Capabilities(
         estimators=[_estimator(plugin) for plugin in plugins(ESTIMATORS, settings.estimator)],
         matchers=plugins(MATCHERS, settings.matcher),
@@ -156,7 +156,7 @@ def _estimator(plugin: Capability) -> EstimatorCapability:
     if plugin.available:
         try:
             schema = options_adapter(ESTIMATORS.load(plugin.name).Options).json_schema()
-        except Exception as error:  # of a plug-in's making; the others are listed all the same
+        except Exception as error:  # any error of a plug-in's code; the others must still be listed
             reason = f"its Options have no JSON schema: {error}"
             plugin = plugin.model_copy(update={"available": False, "reason": reason})
     return EstimatorCapability(**plugin.model_dump(), options_schema=schema)
