@@ -196,8 +196,8 @@ def test_the_rules_can_fail():
     assert not _may_import(Path("service/pose/features/query_images.py"), "service.pose.matching.correspondences")
     assert not _may_import(Path("service/pose/retrieval/index.py"), "service.pose.verification.gate")
     assert _may_import(Path("service/pose/retrieval/index.py"), "service.pose.features.rendered_views")
-    assert not _may_import(Path("service/web/schemas/parsing.py"), "service.web.routes.jobs")
-    assert _may_import(Path("service/web/routes/jobs.py"), "service.web.schemas.parsing")
+    assert not _may_import(Path("service/web/schemas/requests.py"), "service.web.routes.jobs")
+    assert _may_import(Path("service/web/routes/jobs.py"), "service.web.middleware.limits")
 
 
 def test_no_two_modules_have_one_name():
