@@ -32,10 +32,12 @@ def main() -> None:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
+    # By the environment, since any user of the machine can read the command line.
     service = ServiceClient(arguments.service, key=os.environ.get("SPLATFIX_VIEWER_KEY", ""))
     with redirect_stdout(io.StringIO()):  # viser prints its address, which only the relay uses
         viewer = Viewer(service, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())
+    # A process whose parent has died gets another parent, so no viewer outlives its service.
     while not ended.wait(1.0) and os.getppid() == arguments.parent:
         pass
     with redirect_stdout(io.StringIO()):

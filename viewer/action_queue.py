@@ -23,6 +23,7 @@ class ActionQueue:
     def post(self, action: Action, key: Hashable = None) -> None:
         """Queue an action; by default its key is the action itself."""
         with self._changed:
+            # A dict keeps the place of a key whose value is replaced.
             self._actions[action if key is None else key] = action
             self._changed.notify()
 

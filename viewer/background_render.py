@@ -86,6 +86,7 @@ class BackgroundRender:
         """Show the browser's splats, where there are any, until the view rests again."""
         with self._changed:
             self._moves += 1
+            # Without splats the old render stays until the next one, rather than an empty view.
             if self._showing and not (self._without_splats and self._enabled):
                 self._showing = False
                 self._show(None)
@@ -114,6 +115,7 @@ class BackgroundRender:
             scene_id, without_splats = self._scene_id if self._enabled else None, self._without_splats
         if scene_id is None:
             return
+        # At full size whatever the size of this render: only then it compares equal to the browser's next report.
         self._view = self._camera()
         try:
             image = decode(self._service.picture(scene_id, self._camera(long_side_px)))
@@ -131,6 +133,7 @@ class BackgroundRender:
     def _camera(self, long_side_px: int = _LONG_SIDE_PX) -> Camera:
         """Return the browser's camera with an image of at most this size."""
         camera = self._client.camera
+        # A browser that hasn't reported its size yet has 0.
         factor = min(1.0, long_side_px / max(camera.image_width, camera.image_height, 1))
         width, height = max(1, round(camera.image_width * factor)), max(1, round(camera.image_height * factor))
         focal = 0.5 * height / float(np.tan(0.5 * camera.fov))

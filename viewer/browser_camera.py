@@ -31,12 +31,13 @@ class BrowserCamera:
         with self._canvas.atomic():
             camera.up_direction = view.up
             camera.position = view.position
-            camera.look_at = view.look_at
+            camera.look_at = view.look_at  # after the position, which moves it along
             camera.fov = view.fov_rad
 
     def fly_to(self, goal: Viewpoint) -> None:
         """Move the camera along a smooth path; blocks for 0.8 s."""
         camera = self._canvas.camera
+        # Copies, as viser's arrays change with the camera.
         start = Viewpoint(camera.position.copy(), camera.look_at.copy(), camera.up_direction.copy(), camera.fov)
         began = time.monotonic()
         share = 0.0

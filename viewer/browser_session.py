@@ -54,6 +54,7 @@ class BrowserSession:
         self._shared.lists.listen(self._lists_changed)
         self._lists_changed()
         self._background.start()
+        # Last, so that no action runs before everything is connected.
         threading.Thread(target=self._run, name=f"browser-{self._client.client_id}", daemon=True).start()
 
     def close(self) -> None:
@@ -63,6 +64,7 @@ class BrowserSession:
 
     def _run(self) -> None:
         while (actions := self._queue.take(self._idle_in_s())) is not None:
+            # Idle work is done in small parts, between which new actions are taken first.
             for action in actions or [self._idle]:
                 self._try(action)
         self._shared.lists.ignore(self._lists_changed)
@@ -98,6 +100,7 @@ class BrowserSession:
 
     def _connect_widgets(self) -> None:
         controls, post = self._controls, self._queue.post
+        # With the user's value, since a running job may set the widget before the action runs.
         on_user_change(controls.jobs, lambda label: post(partial(self._selection.choose_job, label), "job"))
         on_user_change(controls.newest, lambda follow: post(partial(self._selection.choose_newest, follow), "newest"))
         on_user_change(controls.scenes, lambda name: post(partial(self._selection.choose_scene, name), "scene"))

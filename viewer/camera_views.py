@@ -53,6 +53,7 @@ def scene_extent(
     directions, else +z.
     """
     points = np.array([c.pose.position_in_world for c in cameras], np.float64).reshape(-1, 3)
+    # A single camera has no extent.
     if len(points) < 2:
         points = np.asarray(centres, np.float64).reshape(-1, 3) if len(centres) else np.zeros((1, 3))
     centre = np.median(points, 0)
@@ -75,6 +76,7 @@ def initial_view(scene: SceneExtent, cameras: Sequence[Camera]) -> Viewpoint:
     """Return the view of a scene before any job: its first training camera's, else one from outside and above."""
     if cameras:
         return view_through(cameras[0], scene, aspect=1.0)  # inside, where the scene is an interior
+    # Any direction across up does; the world axis farthest from it is never parallel.
     across = np.eye(3)[np.argmin(np.abs(scene.up))]
     away = across - scene.up * (across @ scene.up) + 0.5 * scene.up
     position = scene.centre + 2.5 * scene.radius * away / np.linalg.norm(away)
@@ -84,6 +86,7 @@ def initial_view(scene: SceneExtent, cameras: Sequence[Camera]) -> Viewpoint:
 def view_through(camera: Camera, scene: SceneExtent, aspect: float) -> Viewpoint:
     """Return the view through a camera, roll included, with its image fitted to a viewport of this width / height."""
     k, pose = camera.intrinsics, camera.pose
+    # In units of the focal length; the wider of both fits determines the field of view.
     half_height = max(0.5 * k.height / k.fy, 0.5 * k.width / k.fx / aspect)
     right, down = pose.world_from_camera[:3, 0], pose.world_from_camera[:3, 1]
     # The browser orbits about this axis: the scene's up, projected so that the image keeps the camera's roll.

@@ -109,6 +109,7 @@ def _curve_chart(
     title: str, series: dict[str, Float64[np.ndarray, "n"]], records: Sequence[IterationRecord], index: int
 ) -> str:
     finite = _finite_values(series)
+    # Logarithmic where the values span more than one and a half decades.
     log = bool(finite.min() > 0 and finite.max() > 30 * finite.min())
     low, high, ticks = _axis(finite, log=log)
     last = max(1, len(records) - 1)
@@ -121,6 +122,7 @@ def _curve_chart(
         return float(_HEIGHT - 14 - (_HEIGHT - 22) * share)
 
     colours = stage_colours(records)
+    # The losses' series are the stages, and have their colours.
     palette = colours if set(series) <= set(colours) else dict(zip(series, _SERIES_COLOURS, strict=False))
     parts = [_bands(records, x)]
     for tick in ticks:
@@ -150,6 +152,7 @@ def _axis(values: Float64[np.ndarray, "k"], *, log: bool) -> tuple[float, float,
         powers = np.arange(np.log10(low), np.log10(high) + 0.5)
         return float(low), float(high), [float(10.0**p) for p in powers[:: -(-len(powers) // 4)]]
     low, high = min(0.0, float(values.min())), float(values.max()) or 1.0
+    # Steps of 1, 2 or 5 times a power of ten, at most five of them.
     step = 10.0 ** np.floor(np.log10(high - low))
     step *= next(f for f in (0.2, 0.5, 1.0) if (high - low) / (f * step) <= 5) if (high - low) / step < 5 else 2.0
     return low, high, [float(t) for t in np.arange(np.ceil(low / step), high / step + 1e-9) * step]
@@ -200,6 +203,7 @@ def _column(records: Sequence[IterationRecord], name: str) -> Float64[np.ndarray
 
 def _polar_histogram(counts: Float64[np.ndarray, "bins"]) -> str:
     """Return wedges about a centre with areas proportional to the counts, in the image's directions."""
+    # The square root makes areas, not radii, proportional to the counts.
     reach = 62 * np.sqrt(counts / max(counts.max(), 1))
     half = np.pi / len(counts)
     wedges = []
@@ -217,6 +221,7 @@ def _polar_histogram(counts: Float64[np.ndarray, "bins"]) -> str:
 
 def _length_histogram(lengths: Float64[np.ndarray, "m"]) -> str:
     """Return a histogram over a logarithmic axis of pixels."""
+    # From the 2 % quantile: a single tiny vector would add empty decades.
     low = np.floor(np.log10(max(np.quantile(lengths, 0.02), MIN_VECTOR_PX)))
     high = np.ceil(np.log10(max(lengths.max(), 10**low * 10)))
     edges = np.linspace(low, high, int(4 * (high - low)) + 1)

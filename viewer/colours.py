@@ -48,6 +48,7 @@ def match_colours(view: MatchView, by: ColourBy) -> UInt8[np.ndarray, "m 3"]:
     if by == "inlier":
         return np.array([OUTLIER_COLOUR, INLIER_COLOUR], np.uint8)[view.inlier.astype(int)]
     low, high = np.log(_RESIDUAL_PX)
+    # Any value does for NaN, whose colours are replaced below; the clip keeps the logarithm finite.
     share = (np.log(np.nan_to_num(view.residual_px, nan=1.0).clip(1e-6)) - low) / (high - low)
     colours = _interpolate(_RESIDUAL_SCALE, np.clip(share, 0, 1))
     colours[np.isnan(view.residual_px)] = UNKNOWN_COLOUR

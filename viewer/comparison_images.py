@@ -30,6 +30,7 @@ _SHIFT = 4
 _DOT_OFFSETS = np.argwhere(np.hypot(*np.mgrid[-3:4, -3:4]) < 3.3) - 3
 """Rows and columns of a dot's pixels relative to its centre."""
 
+# The cores are the service's.
 cv2.setNumThreads(1)
 
 
@@ -102,6 +103,7 @@ def side_by_side(
 
     The render is right of an upright photo and under a wide one, whichever shows both larger.
     """
+    # The window is 800 x 1160 px: there two images are larger side by side only if they are upright.
     if photo.shape[1] < 0.9 * photo.shape[0]:
         box = (_WIDTH_PX - _GAP_PX) // 2, _HEIGHT_PX
         a, b = _fit(photo, *box), _fit(render, *box)
@@ -148,11 +150,14 @@ def match_vectors_image(
     k = view.photo_camera.intrinsics
     image = _fit(background, _WIDTH_PX, _HEIGHT_PX)
     image = cv2.cvtColor((0.45 * cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+    # The background may have another size than the photo that the matches refer to.
     scale = np.array([image.shape[1] / k.width, image.shape[0] / k.height])
     starts, ends = (view.photo_px - view.vectors_px) * scale, view.photo_px * scale
     lengths, inks = np.linalg.norm(ends - starts, axis=1), colours.tolist()
+    # Shorter ones would be covered by their dot, longer ones come from points beside the camera plane.
     drawn = (lengths > 3) & (lengths < 10 * _WIDTH_PX)
     pairs = _fixed_point(np.where(drawn[:, None, None], np.stack([starts, ends], axis=1), ends[:, None])).tolist()
+    # Inliers last, on top of outliers.
     for i in np.argsort(view.inlier, kind="stable"):
         if drawn[i]:
             tip = min(0.5, _ARROW_TIP_PX / lengths[i])

@@ -86,6 +86,7 @@ class ComparisonPanel:
         self, stream: JobStream, record: IterationRecord, view: MatchView | None, photo: UInt8[np.ndarray, "h w 3"]
     ) -> UInt8[np.ndarray, "a b 3"]:
         mode, by, weight = self.mode, self.colour_by, self._controls.weight.value
+        # `complete`, because the photo of a sequence's job changes when it ends.
         key = stream.id, stream.complete, record.index, mode, by, weight, self._with_lines
         if key not in self._composed:
             render = self._render(stream, record, view)
@@ -94,6 +95,7 @@ class ComparisonPanel:
                 image = side_by_side(photo, render, lines, None if lines is None else match_colours(lines, by))
             else:
                 image = overlay(cast(Overlay, mode), photo, render, weight)
+            # The oldest go first; a dict is in order of insertion.
             kept = list(self._composed.items())[1 - _IMAGES_KEPT :]
             self._composed = dict([*kept, (key, image)])
         return self._composed[key]

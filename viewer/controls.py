@@ -35,6 +35,7 @@ class Controls:
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH_PX)
         gui.add_html(
+            # A script of the relay follows data-splatfix on a click; `href` would leave a service below a sub-path.
             "<a href='/' data-splatfix='./' style='padding:0 .6em;font-size:.9em'>← localize another photo</a>"
         )
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
@@ -63,6 +64,7 @@ class Controls:
         self._add_window(gui)
 
     def _add_window(self, gui: viser.GuiApi) -> None:
+        # Hidden until there is an image to show.
         self.window = gui.add_panel(visible=False)
         with self.window.add_tab("photo and render"):
             self.mode = gui.add_button_group("compare", MODES)

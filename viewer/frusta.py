@@ -55,6 +55,7 @@ def hit_frustum(
     if not len(poses):
         return None
     direction = direction / np.linalg.norm(direction)
+    # The middle of the drawn pyramid, not its apex, which is hard to click.
     middles = poses[:, :3, 3] + 0.6 * depth * poses[:, :3, 2]
     along = (middles - origin) @ direction
     beside = np.linalg.norm(middles - origin - along[:, None] * direction, axis=1)

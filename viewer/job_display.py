@@ -45,6 +45,7 @@ class JobDisplay:
         self.leave()
         self._opened = time.monotonic()
         self.stream = self._streams.follow(job_id, self._on_change)
+        # A stream that another browser follows has its records already and may never change again.
         self._on_change()
 
     def leave(self) -> None:

@@ -53,6 +53,7 @@ class JobList:
 
     def _poll(self) -> None:
         logged = ""
+        # Without browsers the service gets no requests.
         while self._has_listeners.wait() and not self._closed.is_set():
             try:
                 lists = tuple(self._client.jobs()), tuple(self._client.scenes())

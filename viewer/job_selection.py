@@ -32,6 +32,7 @@ class JobSelection:
         wanted = self._chosen if not self._follows_newest else jobs[0].id if jobs else None
         if wanted is not None and (self._job.stream is None or self._job.stream.id != wanted):
             self._job.open(wanted)
+        # The first scene, until there is a job.
         elif wanted is None and self._scene.scene_id is None and self._lists.jobs is not None:
             self._scene.show(next(iter(self._lists.scenes), None), None)
             self._controls.headline.content = headline_html(None, 0, "")

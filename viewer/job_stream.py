@@ -68,6 +68,7 @@ class JobStream:
             try:
                 self._photo = decode(self._client.photo(self.id))
             except ServiceError as error:
+                # Other errors may pass, and the photo is requested again.
                 if error.status not in (404, 410):
                     raise
             self._photo_requested = True
@@ -84,6 +85,7 @@ class JobStream:
             if key in self._renders:
                 self._renders.move_to_end(key)
                 return self._renders[key]
+        # Outside the lock: a request takes long, and two of the same image do no harm.
         image = decode(self._client.render(self.id, index, matched=matched))
         with self._lock:
             self._renders[key] = image
@@ -148,6 +150,7 @@ class JobStream:
         self.attempt, self.records = attempt, []
 
     def _notify(self) -> None:
+        # A copy, since another thread may add or remove one meanwhile.
         for listener in tuple(self.listeners):
             listener()
 

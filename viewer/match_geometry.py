@@ -58,6 +58,7 @@ def backproject_matches(matches: MatchVectors, depth: Float32[np.ndarray, "h w"]
     column = np.clip(matches.render_px[:, 0].astype(int), 0, depth.shape[1] - 1)
     row = np.clip(matches.render_px[:, 1].astype(int), 0, depth.shape[0] - 1)
     z = np.asarray(depth[row, column], np.float64)
+    # 0 marks pixels without an opaque surface.
     z[z <= 0] = np.nan
     return BackprojectedMatches(matches, backproject(matches.render_px, z, camera), index)
 
@@ -76,6 +77,7 @@ def matches_at_pose(source: BackprojectedMatches, camera: Camera, index: int) ->
     else:
         render_px, render_camera = matches.render_px.astype(np.float64), matches.render_camera
     segments = _segments(source.points_in_world, photo_px, camera)
+    # One sum finds a NaN in any coordinate.
     drawn = np.isfinite(segments.sum((1, 2)))
     return MatchView(
         photo_px=photo_px,

@@ -62,6 +62,7 @@ def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
     rows = [
         ("stage", escape(record.stage)),
         ("after", f"{record.elapsed_s * 1000:.0f} ms"),
+        # Wall and CPU time differ where a job waits or uses several threads.
         ("CPU time", f"{record.cpu_s * 1000:.0f} ms"),
         ("matches", _or_dash(record.num_matches, "d")),
         ("inliers", _or_dash(record.num_inliers, "d")),

@@ -40,6 +40,7 @@ class Playback:
     def toggle(self) -> None:
         """Play or pause; at the end, play from the start."""
         self.playing = not self.playing and self.count > 1
+        # Played to the end, so that there is nothing left to play.
         if self.playing and self.at_end:
             self.go(0)
 

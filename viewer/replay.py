@@ -44,6 +44,7 @@ def replay_html(stream: JobStream, content: SceneContent) -> str:
         scene.trajectory.show(records, job)
         recording = server.get_scene_serializer()
         every = -(-len(records) // _MAX_STEPS)
+        # The last record is the result and always included.
         shown = records[::every] if (len(records) - 1) % every == 0 else [*records[::every], records[-1]]
         for record in shown:
             _show_step(scene, stream, job, record)
@@ -53,6 +54,7 @@ def replay_html(stream: JobStream, content: SceneContent) -> str:
         page = recording.as_html(dark_mode=True)
     finally:
         server.stop()
+    # viser has no option for the title.
     return page.replace("<title>Viser</title>", f"<title>{html.escape(job.photo_name)} – splatfix</title>", 1)
 
 

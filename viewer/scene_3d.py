@@ -66,6 +66,7 @@ class Scene3D:
     def hit(self, origin: Sequence[float], direction: Sequence[float]) -> int | Camera | None:
         """Return what a click's ray hits: the index of a record, or a training camera."""
         ray = np.array(origin, np.float64), np.array(direction, np.float64)
+        # A step first: its frusta often stand among training cameras.
         step = self.trajectory.hit(*ray)
         return self.training_cameras.hit(*ray) if step is None else step
 

@@ -37,6 +37,7 @@ class SceneCache:
             if scene_id in self._scenes:
                 self._scenes.move_to_end(scene_id)
                 return self._scenes[scene_id]
+        # Outside the lock, as the requests may take seconds.
         description = self._client.scene(scene_id)
         splats = self._client.splats(scene_id, MAX_SPLATS)
         cameras = [named.camera for named in description.cameras]

@@ -28,6 +28,7 @@ class SceneDisplay:
             return False
         self._scene.show_scene(self._cache.get(scene_id), pose)
         self.scene_id = self._controls.scenes.value = scene_id
+        # The splats are sent only after everything else.
         self._background.set_without_splats(True)
         self._background.set_scene(scene_id)
         self._describe()

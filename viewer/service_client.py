@@ -189,6 +189,7 @@ class ServiceClient:
                         return
                     if event == "record":
                         yield int(event_id.partition(".")[0]), parse_record(json.loads(data))
+                    # The last event of a stream.
                     elif event in ("result", "error"):
                         yield _job(json.loads(data))
                         return
@@ -231,6 +232,7 @@ def parse_splats(data: bytes) -> Splats:
     start = 4 + int.from_bytes(data[:4], "little")
     header = json.loads(data[4:start])
     n = header["count"]
+    # 9 float32 and 4 bytes a splat.
     if len(data) != start + 40 * n:
         raise ValueError(f"{len(data)} bytes for {n} splats")
     floats = np.frombuffer(data, "<f4", 9 * n, start)

@@ -84,6 +84,7 @@ class StepDisplay:
     def redraw(self, stream: JobStream, index: int) -> None:
         """Queue images, charts and 3D of a record."""
         neighbours = [k for k in (index - 1, index + 1) if 0 <= k < len(stream.records)]
+        # Replaces what remained for the step that was shown before.
         self._queue = [(0.0, partial(self._draw_window, stream, index))]
         self._queue += [(0.0, partial(self._prepare, stream, stream.records[k])) for k in neighbours]
 
@@ -122,6 +123,7 @@ class StepDisplay:
         self._scene.matches.show(view, colours)
 
     def _prepare(self, stream: JobStream, record: IterationRecord) -> None:
+        # If the step is shown after all, the error is reported then.
         with suppress(ServiceError, ValueError):
             self._images.prepare(stream, record, _match_view(stream, record))
 

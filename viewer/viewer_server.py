@@ -35,6 +35,7 @@ class Viewer:
         self.server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, brand_color=(230, 126, 20)
         )
+        # Only now, as the constructor may have raised before.
         self._shared.start()
         self.server.on_client_connect(self._open)
         self.server.on_client_disconnect(self._close)
@@ -55,6 +56,7 @@ class Viewer:
 
     def _open(self, client: viser.ClientHandle) -> None:
         path = requested_path(self.server, client.client_id)
+        # The page reports its WebGL in software, where splats would take seconds a frame.
         session = BrowserSession(client, self._shared, job_id_in_path(path), splats=not path.endswith("?gl=software"))
         with self._lock:
             self._sessions[client.client_id] = session

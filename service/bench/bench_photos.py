@@ -94,6 +94,7 @@ def prepare_photo(
     `occluders` are photos of another scene. Raises UnknownName, InvalidOptions.
     """
     data = photo.path.read_bytes()
+    # The original file, so that decoding and EXIF are measured as the service meets them.
     if not modifications and not photo.flatten:
         return SentPhoto(data, photo.camera.intrinsics, photo.camera)
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=background_rgb)
@@ -118,6 +119,7 @@ def _from_truth(folder: Path) -> list[BenchPhoto]:
 
 def _from_entry(folder: Path, entry: dict[str, Any]) -> BenchPhoto:
     name, original = entry["photo"], entry.get("original")
+    # The demo scenes' photos are in a subfolder; other files with true poses name paths.
     files = [folder / name, folder / "photos" / name]
     file = next((f for f in files if f.is_file()), files[0])
     try:
@@ -132,6 +134,7 @@ def _from_transforms(path: Path, folder: Path) -> list[BenchPhoto]:
     file, manifest = TransformsFile.open(path), read_manifest(folder)
     names = file.split("test")
     if names is None:
+        # A file of test photos has no others.
         step = 1 if path.stem.endswith("_test") else HOLD_OUT_EVERY
         names = sorted(file.frames)[::step]
     return [_photo(folder, str(file.photo_file(name) or name), file.camera(name, manifest)) for name in names]

@@ -81,6 +81,7 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
     test, training = LAYOUTS[layout](folder)
     if not test:
         raise SceneNotFound(f"there are no test photos in layout '{layout}'.", where=str(folder))
+    # The manifest moves the scene, and the true poses must move with it.
     place = scene if scene is not None and scene.is_dir() else folder
     world_from_scene = read_manifest(place).world_from_scene
     transparent = layout == "nerf_synthetic"
@@ -99,6 +100,7 @@ def detect_layout(folder: Path) -> str:
         return "scene"
     if (folder / "transforms_train.json").is_file() and (folder / "transforms_test.json").is_file():
         return "nerf_synthetic"
+    # Mip-NeRF 360 ships both, Deep Blending only COLMAP's model.
     if (folder / COLMAP_FOLDER).is_dir() and not has["transforms.json"]:
         return "mipnerf360" if has["poses_bounds.npy"] else "deep_blending"
     if has["poses_bounds.npy"]:
@@ -119,6 +121,7 @@ def _nerfstudio(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
     names, listed = sorted(file.frames), file.split("test")
     if listed is None:
         count = int(np.ceil(NERFSTUDIO_TRAINING_SHARE * len(names)))
+        # As nerfstudio's own parser splits, or test photos would be among those it trained on.
         kept = {names[i] for i in np.linspace(0, len(names) - 1, count, dtype=int)}
         return _from_transforms(file, [n for n in names if n not in kept]), _from_transforms(file, sorted(kept))
     return _from_transforms(file, listed), _from_transforms(
@@ -162,6 +165,7 @@ def _llff_camera(file: Path, values: Float64[np.ndarray, "3 5"]) -> NamedCamera:
 
 def _colmap(folder: Path) -> tuple[list[_Photo], list[_Photo]]:
     cameras = read_cameras(folder / COLMAP_FOLDER, lambda name: True)
+    # By stem, as reduced copies may have another suffix than the model's names.
     files = {file.stem: file for file in _photo_files(folder, None)}
     photos = []
     for named in cameras:
@@ -191,6 +195,7 @@ def _photo_files(folder: Path, count: int | None) -> list[Path]:
 
 
 def _resized_to(file: Path, intrinsics: Intrinsics) -> Intrinsics:
+    # The poses' file states the intrinsics of the largest size.
     return intrinsics.resized(*_size_of(file))
 
 

@@ -57,6 +57,7 @@ def surround_with_copies(
         parts.append(part)
         cameras += [replace(named, name=f"tile{number}/{named.name}") for named in cameras_of_part]
         total += len(part.means)
+    # Scenes of different SH degrees are reduced to the lowest.
     degree = min(part.sh.shape[1] for part in parts)
     arrays = {n: np.concatenate([getattr(p, n) for p in parts]) for n in ("means", "quats", "scales", "opacities")}
     sh = np.concatenate([part.sh[:, :degree] for part in parts])
@@ -78,6 +79,7 @@ def write_folder(scene: GaussianScene, folder: Path, source: Path, *, cameras: b
     """Write a scene folder with the photos and the true poses of the folder `source`; return its scene file."""
     folder.mkdir(parents=True)
     file = folder / ("scene.compressed.ply" if compressed else "scene.ply")
+    # The file has logits, which are infinite at 0 and 1.
     opacities = np.clip(scene.opacities, 1e-6, 1 - 1e-6)
     arrays = (
         scene.means, np.log(scene.scales), scene.quats, np.log(opacities / (1 - opacities)), scene.sh[:, 0],
@@ -87,6 +89,7 @@ def write_folder(scene: GaussianScene, folder: Path, source: Path, *, cameras: b
     manifest = {"background": scene.info.background_rgb, "render_mode": scene.info.render_mode}
     if scene.info.up_in_world:
         manifest["up"] = scene.info.up_in_world
+    # Without cameras the renderer couldn't know at which resolution the scene was trained.
     if scene.info.training_long_side_px:
         manifest["training_size"] = [scene.info.training_long_side_px, scene.info.training_long_side_px * 3 // 4]
     (folder / MANIFEST).write_text(json.dumps(manifest))
@@ -132,6 +135,7 @@ def _place_in_cell(
     matrix = np.eye(4)
     quarter = int(rng.integers(4)) // 2 * 2  # half turns only, so that a room that is not square fits its cell
     matrix[:3, :3] = so3_exp(up * (quarter * np.pi / 2))
+    # Another scene may have another unit of length.
     matrix[:3, :3] *= np.max(size / (1 + GAP)) / np.max(high - low) if source is not scene else 1.0
     across = _horizontal_axes(up)
     centre = np.mean(_extent(scene), axis=0) + sum(c * (a @ size) * a for c, a in zip(cell, across, strict=True))
@@ -147,6 +151,7 @@ def _horizontal_axes(up: Float64[np.ndarray, "3"]) -> list[Float64[np.ndarray, "
 
 
 def _extent(scene: GaussianScene) -> Float64[np.ndarray, "2 3"]:
+    # Floaters, which are translucent or far away, don't count.
     return np.quantile(scene.means[scene.opacities > 0.3].astype(np.float64), [0.005, 0.995], axis=0)
 
 
@@ -155,6 +160,7 @@ def _mirror(raw: RawGaussians) -> RawGaussians:
     sh = raw.sh.copy()
     odd = [k for k in ODD_IN_X if k < sh.shape[1]]
     sh[:, odd] *= -1
+    # A reflection at x = 0 keeps the rotation's component about x, and reverses those about y and z.
     signs = np.array([1, 1, -1, -1], np.float32)
     return replace(raw, means=raw.means * np.array([-1, 1, 1], np.float32), quats=raw.quats * signs, sh=sh)
 
@@ -163,6 +169,7 @@ def _mirror_camera(camera: Camera) -> Camera:
     """Return the camera whose image of the mirrored scene is the mirror image of the camera's of the scene."""
     pose = replace(camera.pose, world_from_camera=MIRROR_X @ camera.pose.world_from_camera @ MIRROR_X)
     k = camera.intrinsics
+    # The principal point is mirrored, too.
     return Camera(replace(k, cx=k.width - k.cx), pose)
 
 

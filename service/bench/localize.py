@@ -155,6 +155,7 @@ def measure(
         outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, units), latency_ms, cpu_ms)
         outcomes.append(outcome)
         lines.append(trial_result(trial, estimate, outcome, units))
+        # After the times were taken.
         if on_miss and not outcome.success(FINE):
             lines[-1] |= on_miss(trial, estimate)
         if progress:
@@ -175,6 +176,7 @@ def load_bench_scene(
     """Return a data set's test photos, and its scene without their cameras. Raises SceneError, UnknownName."""
     data_set = read_data_set(data or folder, layout, folder)
     scene = _load_scene(folder, data_set, background)
+    # A scene without training cameras takes its units from the test photos.
     training = [named.camera for named in scene.cameras] or [photo.camera for photo in data_set.test]
     if cameras == "ignored":
         scene = _load_scene(folder, data_set, background, cameras=False)
@@ -186,6 +188,7 @@ def load_bench_scene(
 def _load_scene(folder: Path, data_set: DataSet, background: str, cameras: bool = True) -> GaussianScene:
     scene = load_scene(folder, without_photos=data_set.held_back, cameras=cameras, training=data_set.training)
     rgb = BACKGROUNDS.get(background)
+    # The manifest of the scene knows better than the layout of the data set.
     if rgb is None and not (folder.is_dir() and read_manifest(folder).background):
         rgb = data_set.background_rgb
     if rgb is None or rgb == scene.info.background_rgb:
@@ -213,6 +216,7 @@ def make_trials(
             continue
         sent = prepare_photo(photo, modifications, bench_scene.background_rgb, seed, others)
         for number in numbers:
+            # One generator a trial: none depends on how many there are.
             rng = np.random.default_rng([seed, index, number])
             begin = start_pose(start, sent.truth.pose, bench_scene.units, bench_scene.training, rng)
             yield Trial(photo.name, number, sent.data, sent.intrinsics, sent.truth, begin)

@@ -67,6 +67,7 @@ def _match_exposure(render: RGBImage, photo: RGBImage, valid: Bool[np.ndarray, "
     matched = np.empty_like(render)
     for channel in range(3):
         x, y = render[valid, channel], photo[valid, channel]
+        # The bound keeps a uniform channel finite.
         gain = np.mean((x - x.mean()) * (y - y.mean())) / max(float(x.var()), 1e-9)
         matched[:, :, channel] = gain * (render[:, :, channel] - x.mean()) + y.mean()
     return matched

@@ -91,6 +91,7 @@ def _noise(photo: Photo, sigma: float, rng: np.random.Generator) -> Photo:
 def _blur(photo: Photo, sigma: float, rng: np.random.Generator) -> Photo:
     """Blur by a separable Gaussian; sigma in pixels of a photo with a long side of 800."""
     sigma = sigma * photo.intrinsics.long_side / 800
+    # Beyond three sigma a Gaussian has 0.3 % of its weight.
     reach = max(1, int(np.ceil(3 * sigma)))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / max(sigma, 1e-6)) ** 2)
     kernel = (kernel / kernel.sum()).astype(np.float32)
@@ -129,6 +130,7 @@ def _occlusion(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
         area = np.s_[top : top + tall, first : first + wide]
         new = np.zeros_like(covered)
         new[area] = ~covered[area]
+        # What exceeds the share stays uncovered.
         new.ravel()[np.flatnonzero(new)[left:]] = False
         piece = _random_crop(photo.occluders[int(rng.integers(len(photo.occluders)))], tall, wide, rng)
         rgb[area] = np.where(new[area][..., None], piece, rgb[area])
@@ -190,6 +192,7 @@ def _roll(photo: Photo, degrees: float, rng: np.random.Generator) -> Photo:
     focal = float(np.sqrt(old.fx * old.fy))
     corners = np.array([[0, 0], [old.width, 0], [0, old.height], [old.width, old.height]], float)
     rays = np.concatenate([(corners - [old.cx, old.cy]) / [old.fx, old.fy], np.ones((4, 1))], 1)
+    # The rolled corners in pixels about the principal point.
     extent = focal * (rays @ camera_from_rolled)[:, :2]
     low = extent.min(0)  # not rounded, so that quarter turns map pixel centres onto pixel centres
     width, height = (int(v) for v in np.ceil(extent.max(0) - low - 1e-6))
@@ -198,6 +201,7 @@ def _roll(photo: Photo, degrees: float, rng: np.random.Generator) -> Photo:
     x, y = (columns + 0.5 - camera.cx) / focal, (rows + 0.5 - camera.cy) / focal
     rays = np.stack([x, y, np.ones_like(x)], -1) @ camera_from_rolled.T
     at = rays[..., 0] * old.fx + old.cx, rays[..., 1] * old.fy + old.cy
+    # Bilinear weights below 1 mark pixels that mix with the padding.
     before = np.ones(photo.rgb.shape[:2], bool) if photo.mask is None else photo.mask
     mask = _sample(np.repeat(before[..., None], 3, 2).astype(np.float32), *at)[..., 0] > 0.999
     matrix = photo.pose.world_from_camera.copy()

@@ -81,6 +81,7 @@ def nees(estimate: PoseEstimate, truth: Pose) -> float | None:
     covariance = estimate.verdict.covariance
     if covariance is None or np.linalg.matrix_rank(covariance, hermitian=True) < len(covariance):
         return None
+    # The covariance is of the twist in the camera frame.
     twist = se3_log(estimate.pose.camera_from_world @ truth.world_from_camera)
     return float(twist @ np.linalg.solve(covariance, twist))
 

@@ -55,6 +55,7 @@ def run(
     for done, (count, width) in enumerate(cases, 1):
         cameras = room_cameras(width)
         scene = scenes.setdefault(count, synthetic_room(count))
+        # As if trained at this size; otherwise the dilation would shrink.
         info = replace(scene.info, training_focal_px=cameras[0].intrinsics.fx)
         rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(replace(scene, info=info))
         for (stage, threads), times in _times(rasterizer, cameras, repeats).items():
@@ -103,6 +104,7 @@ def _stage_times(rasterizer: Rasterizer, camera: Camera, repeats: int) -> dict[s
     }
     seconds = {stage: [] for stage in stages}
     for _ in range(repeats + 1):
+        # In turn, so that a slow moment of the machine affects all stages alike.
         for stage, call in stages.items():
             seconds[stage].append(_seconds(call))
     return {stage: np.array(each[1:]).T for stage, each in seconds.items()}
@@ -123,6 +125,7 @@ def synthetic_room(count: int, sh_degree: int = 3, seed: int = 0) -> GaussianSce
     normals = np.concatenate([normals, _directions(loose, rng)])
     spacing = np.sqrt(area / count)
     scales = _SCALE_OVER_SPACING * spacing * np.exp(rng.normal(0.0, 0.35, (count, 3)))
+    # Flat, as trained Gaussians on surfaces are.
     scales[:, 2] *= 0.1
     sh = rng.normal(0.0, 0.05, (count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = 1.2 * np.sin(means[:, None, :] * [1.3, 1.7, 2.1] + means[:, :1, None])[:, 0]
@@ -172,6 +175,7 @@ def _on_surfaces(
                 normal = np.eye(3)[axis]
                 faces.append((centre + side * size * normal, size * (1 - normal), normal))
     areas = np.array([np.prod(size[normal == 0]) for _, size, normal in faces])
+    # By area, so that the density is the same everywhere.
     of_point = rng.choice(len(faces), count, p=areas / areas.sum())
     centres, sizes, normals = (np.stack(part)[of_point] for part in zip(*faces, strict=True))
     means = centres + sizes * rng.uniform(-0.5, 0.5, (count, 3))

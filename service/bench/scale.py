@@ -55,6 +55,7 @@ def run(
         raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
     from service.bench.large_scenes import write_folder  # loads gsply
 
+    # As in `bench localize`: no index view may rest on a test photo's pose.
     held_back = [name for photo in find_photos(folder) for name in photo.names]
     scene = load_scene(folder, without_photos=held_back)
     if not scene.cameras:
@@ -70,6 +71,7 @@ def run(
             facts = {"gaussians": large.count, "sh_degree": large.sh_degree, "file": file.name}
             facts |= {"cameras": cameras, "file_bytes": file.stat().st_size}
             del large
+            # A new process, whose peak of memory is this size's alone.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
                 rows.append(facts | process.submit(measure_folder, at, units).result())
         if progress:
@@ -85,6 +87,7 @@ def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:
 def _resize(scene: GaussianScene, count: int, others: Sequence[GaussianScene]) -> GaussianScene:
     from service.bench.large_scenes import keep_most_contributing, surround_with_copies
 
+    # Smaller than the scene itself: the Gaussians that matter least are left out.
     if count < scene.count:
         return keep_most_contributing(scene, count, LoadedScene.of(scene).rasterizer)
     return surround_with_copies(scene, count, others)

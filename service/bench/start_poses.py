@@ -60,6 +60,7 @@ def start_pose(
         matrix[:3, 3] += rng.uniform(-PNERF_UNITS, PNERF_UNITS, 3) / units.units_per_scene_unit
     else:
         positions = np.stack([camera.pose.position_in_world for camera in cameras])
+        # A normalized Gaussian 4-vector is a uniformly random rotation.
         matrix[:3, :3] = rotation_from_quat(rng.normal(size=4))
         matrix[:3, 3] = rng.uniform(positions.min(0), positions.max(0))
     return Pose(matrix)
@@ -79,6 +80,7 @@ def _perturbed_in_world(
     matrix = np.eye(4)
     matrix[:3, :3] = rotation @ truth.world_from_camera[:3, :3]
     offset = (truth.position_in_world - units.focus_in_world) * units.units_per_scene_unit
+    # About the focus, as the protocol rotates in the normalized world frame.
     moved = rotation @ offset + shift
     matrix[:3, 3] = moved / units.units_per_scene_unit + units.focus_in_world
     return Pose(matrix)

@@ -124,6 +124,7 @@ def summary(steps: Sequence[Step]) -> dict[str, Any]:
     drift: median error of the last tenth of the frames minus that of the first tenth.
     """
     outcomes = [step.outcome for step in steps]
+    # The first frame needs a search in the whole scene.
     later = outcomes[1:] or outcomes
     turned, shifted = (np.array([getattr(o, n) for o in outcomes]) for n in ("rotation_deg", "translation_units"))
     tenth = max(1, len(steps) // 10)
@@ -157,6 +158,7 @@ def smooth_path(stations: Sequence[Pose], units: Units, frames: int, config: Seq
     for i in range(1, len(knots)):  # a quaternion and its negative are one rotation
         if knots[i, 3:] @ knots[i - 1, 3:] < 0:
             knots[i, 3:] *= -1
+    # Densely, since the spline's parameter isn't proportional to the distance.
     at = np.linspace(0, len(knots) - 1, config.samples_per_knot * (len(knots) - 1) + 1)
     dense = [_pose(_spline(knots, t)) for t in at]
     lengths = [_frames_between(a, b, units, config) for a, b in pairwise(dense)]

@@ -78,6 +78,7 @@ class Layer:
             self._remove(name)
             return
         old = self._nodes.get(name)
+        # An update in place sends only what changed, and the page doesn't flicker.
         if isinstance(old, viser.LineSegmentsHandle):
             with self._canvas.atomic():
                 old.points, old.colors = segments, np.asarray(colours, np.uint8)
@@ -143,6 +144,7 @@ class Layer:
             wxyz=quaternion_wxyz(camera.pose.world_from_camera),
             position=camera.pose.position_in_world,
             visible=self._nodes_visible,
+            # With shadows a frustum would look like a part of the scene.
             cast_shadow=False,
             receive_shadow=False,
         )

@@ -21,5 +21,6 @@ class MatchLayer(Layer):
         segments, drawn = np.zeros((0, 2, 3), np.float32), np.zeros((0, 3), np.uint8)
         if view is not None and colours is not None:
             segments, drawn = view.segments, colours[view.drawn]
+        # Each segment has its colour at both ends.
         self._draw_lines("vectors", segments, np.repeat(linear_colours(drawn)[:, None], 2, 1), 2.0)
         self._draw_points("points", segments[:, 0], drawn, 0.05 * self.extent.frustum_depth)

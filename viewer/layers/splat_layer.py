@@ -43,6 +43,7 @@ class SplatLayer(Layer):
         splats = self._splats
         # viser sends covariances as float16: scaled so that the largest just fits, small ones keep their digits.
         largest = float(splats.covariances[:, [0, 3, 5]].max(initial=1e-12))
+        # Covariances scale with the square of lengths.
         k = np.sqrt(_MAX_COVARIANCE / largest)
         self._nodes["splats"] = self._canvas.scene.add_gaussian_splats(
             self._path("splats"),

@@ -32,6 +32,7 @@ class TrajectoryLayer(Layer):
             return
         depth = self.extent.frustum_depth
         poses = stack_poses([r.pose for r in records])
+        # Records that leave the pose unchanged would draw the same frustum again.
         moved = np.flatnonzero(np.abs(np.diff(poses, axis=0)).max((1, 2), initial=0.0) > 0) + 1
         kept = [0, *moved.tolist()]
         steps = poses[kept]
