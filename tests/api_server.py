@@ -37,6 +37,12 @@ from service.web.settings import Settings
 ROOT = Path(__file__).parents[1]
 IN_SUBPROCESS = os.environ.get("SPLATFIX_TEST_ENGINE") == "subprocess"
 """Run all tests of the API on the engine of `subprocess_engine`; by hand, since each server takes seconds to start."""
+NOT_IN_A_SUBPROCESS = {
+    "test_a_scene_still_loading_is_not_ready": "holds a matcher by an event of the test's process",
+    "test_a_bug_in_a_route_is_a_problem_document_without_details": "breaks a rasterizer in the test's process",
+    "test_errors.py": "brings parts of the service into states by changing them in the test's process",
+}
+"""Tests of the API, or files of them, that reach around HTTP into the engine, and how."""
 GO_ON = multiprocessing.get_context("spawn").Event()
 """Held jobs wait for it, in whatever process they run."""
 
@@ -69,7 +75,9 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
         hooks = {"response": [assert_documented]}
-        with httpx.Client(base_url=url, timeout=20, trust_env=False, event_hooks=hooks) as client:
+        with httpx.Client(
+            base_url=url, timeout=90 if IN_SUBPROCESS else 20, trust_env=False, event_hooks=hooks
+        ) as client:
             until(lambda: server.started)
             yield client
     finally:

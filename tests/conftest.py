@@ -1,5 +1,6 @@
 """What all tests share."""
 
+import os
 from collections.abc import Iterator
 
 import pytest
@@ -13,6 +14,19 @@ settings.register_profile("steady", deadline=None, derandomize=True, database=No
 settings.load_profile("steady")
 
 # The API's tests; imported where they are used, since other tests needn't wait for the engine.
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what can't run with the engine of another process, where that is asked for."""
+    if os.environ.get("SPLATFIX_TEST_ENGINE") != "subprocess":
+        return
+    from api_server import NOT_IN_A_SUBPROCESS
+
+    for item in items:
+        name = item.name.partition("[")[0]
+        reason = NOT_IN_A_SUBPROCESS.get(name) or NOT_IN_A_SUBPROCESS.get(item.path.name)
+        if reason:
+            item.add_marker(pytest.mark.skip(reason=reason))
 
 
 @pytest.fixture(scope="module")

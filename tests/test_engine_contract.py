@@ -3,9 +3,10 @@
 The second half runs tests of the API on a service whose engine is a subprocess. All of them run so by hand:
 
     SPLATFIX_TEST_ENGINE=subprocess python -m pytest tests/test_api.py tests/test_durable.py tests/test_scenes.py \\
-        tests/test_sequences.py tests/test_clients.py
+        tests/test_sequences.py tests/test_clients.py tests/test_security.py tests/test_hostile.py \\
+        tests/test_route_policy.py tests/test_errors.py
 
-What can't, because it doesn't speak HTTP only, is listed in NOT_IN_A_SUBPROCESS.
+What can't, because it doesn't speak HTTP only, is listed in `api_server.NOT_IN_A_SUBPROCESS`, and skipped then.
 """
 
 from __future__ import annotations
@@ -293,14 +294,6 @@ def test_a_scene_that_was_unloaded_stays_away(engine, folder):
 
 
 # ------------------------------------------------------------------ the API on a subprocess engine
-
-NOT_IN_A_SUBPROCESS = {
-    "test_api.py": {
-        "test_a_scene_still_loading_is_not_ready": "holds a matcher by an event of the test's process",
-        "test_a_bug_in_a_route_is_a_problem_document_without_details": "breaks a rasterizer in the test's process",
-    },
-    "test_errors.py": {"all": "brings a service's parts into states by changing them in the test's process"},
-}
 
 
 @pytest.fixture(scope="module")
