@@ -75,9 +75,8 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
         hooks = {"response": [assert_documented]}
-        with httpx.Client(
-            base_url=url, timeout=90 if IN_SUBPROCESS else 20, trust_env=False, event_hooks=hooks
-        ) as client:
+        seconds = 90 if IN_SUBPROCESS else 20  # the first request may wait for the child's imports
+        with httpx.Client(base_url=url, timeout=seconds, trust_env=False, event_hooks=hooks) as client:
             until(lambda: server.started)
             yield client
     finally:
