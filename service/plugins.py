@@ -81,7 +81,7 @@ class PluginRegistry:
                 yield self._import(name)
 
     def _import(self, name: str) -> ModuleType:
-        """Import a plug-in and ask what it misses. Raises UnknownName, BackendMissing."""
+        """Import a plug-in and call its `missing`. Raises UnknownName, BackendMissing."""
         plugin = self._plugin(name)
         try:
             module = plugin.entry.load()
@@ -110,7 +110,7 @@ def _discovered(
 ) -> dict[str, _Plugin]:
     """Find the plug-ins without importing any. Raises InvalidRequest if one takes a name that is in use.
 
-    Cached because every request asks; `search_path` is sys.path, where distributions are looked for.
+    Cached, since it is needed for every request; `search_path` is sys.path, where distributions are looked for.
     """
     own = {info.name for info in pkgutil.iter_modules(folders[:1])}
     found: dict[str, _Plugin] = {}

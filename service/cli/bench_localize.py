@@ -40,7 +40,7 @@ def bench_localize(
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
-    misses: Annotated[Path | None, typer.Option(help="A folder for a picture of each miss at 1 deg, 0.01.")] = None,
+    misses: Annotated[Path | None, typer.Option(help="A folder for an image of each miss at 1 deg, 0.01.")] = None,
     json_file: JsonFileOption = None,
 ) -> None:
     """Localize a scene's test photos and compare with the truth."""

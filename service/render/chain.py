@@ -50,7 +50,7 @@ d colour (3, 0 where clamped), viewing direction (3)."""
 
 
 @kernel
-def pose_twist(records, sums, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
+def pose_twist(records, sums, visible, geometry, sh, degree, view, pinhole, width, height, dilation, antialiased,
                scratch, twist):  # fmt: skip
     """Write d loss / d twist (rotation, translation), float64."""
     r = view
@@ -58,7 +58,7 @@ def pose_twist(records, sums, visible, geometry, sh, degree, view, lens, width, 
         twist[k] = 0.0
     for first in range(0, visible, 16):
         gx, gy, gz, x, y, z, wx, wy, wz, _, _, dx, dy, dz = _gaussian(
-            records, sums, first, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
+            records, sums, first, visible, geometry, sh, degree, view, pinhole, width, height, dilation, antialiased,
             scratch,
         )  # fmt: skip
         twist[0] += sum16(wx - (y * gz - z * gy))
@@ -71,13 +71,13 @@ def pose_twist(records, sums, visible, geometry, sh, degree, view, lens, width, 
 
 
 @kernel
-def scene_rows(records, sums, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
+def scene_rows(records, sums, visible, geometry, sh, degree, view, pinhole, width, height, dilation, antialiased,
                scratch, rows):  # fmt: skip
     """Write a row of 16 floats for every record; `rows` has room for a multiple of 16."""
     r = view
     for first in range(0, visible, 16):
         gx, gy, gz, _, _, _, _, _, _, a, b, dx, dy, dz = _gaussian(
-            records, sums, first, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
+            records, sums, first, visible, geometry, sh, degree, view, pinhole, width, height, dilation, antialiased,
             scratch,
         )  # fmt: skip
         (a0, a1, a2), (b0, b1, b2) = a, b
@@ -102,7 +102,7 @@ def scene_rows(records, sums, visible, geometry, sh, degree, view, lens, width, 
 
 
 @inline
-def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, width, height, dilation, antialiased,
+def _gaussian(records, sums, first, visible, geometry, sh, degree, view, pinhole, width, height, dilation, antialiased,
               scratch):  # fmt: skip
     """Apply the chain rule to 16 records.
 
@@ -110,7 +110,7 @@ def _gaussian(records, sums, first, visible, geometry, sh, degree, view, lens, w
     the Gaussian's centre. Leaves in `scratch`: sums at 256, d covariance (xx, xy, yy) at 512, d colour at 560, the
     viewing direction at 608.
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     r = view
     for lane in range(16):
         i = min(first + lane, visible - 1) * 16  # the last group repeats the last record, with sums of 0

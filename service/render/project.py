@@ -122,7 +122,7 @@ def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
 
 
 @inline
-def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, tile_depths):
+def block_hidden(sphere, view, pinhole, near, tiles_x, tiles_y, tile_depths):
     """Whether a bounding sphere lies behind the occlusion depths of all tiles that it may reach into."""
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
@@ -131,8 +131,8 @@ def block_hidden(sphere, view, lens, near, tiles_x, tiles_y, tile_depths):
         return False
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
-    x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, lens[0], lens[2], tiles_x)
-    y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, lens[1], lens[3], tiles_y)
+    x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, pinhole[0], pinhole[2], tiles_x)
+    y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, pinhole[1], pinhole[3], tiles_y)
     return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths)
 
 
@@ -155,15 +155,15 @@ def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
 
 
 @kernel
-def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, antialiased, near, tile_depths,
+def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilation, antialiased, near, tile_depths,
             records, depths, rects, scratch):  # fmt: skip
     """Write a record, a depth and a tile rectangle for every visible Gaussian; return (visible, tile entries).
 
-    `view`: camera_from_world, 12 floats row by row. `lens`: fx, fy, cx, cy. `tile_depths`: for each tile the depth
+    `view`: camera_from_world, 12 floats row by row. `pinhole`: fx, fy, cx, cy. `tile_depths`: for each tile the depth
     beyond which nothing is seen; empty: unlimited. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1
     (ends excluded).
     """
-    fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     high_x = (width - cx) / fx + np.float32(0.15) * width / fx
     low_x = cx / fx + np.float32(0.15) * width / fx
     high_y = (height - cy) / fy + np.float32(0.15) * height / fy
@@ -184,7 +184,7 @@ def project(geometry, sh, spheres, degree, view, lens, width, height, dilation, 
     for block in range(spheres.shape[0]):
         if not in_view(spheres[block], view, fx, fy, low_x, high_x, low_y, high_y, near):
             continue
-        if len(tile_depths) and block_hidden(spheres[block], view, lens, near, tiles_x, tiles_y, tile_depths):
+        if len(tile_depths) and block_hidden(spheres[block], view, pinhole, near, tiles_x, tiles_y, tile_depths):
             continue
         for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
             at = chunk * 160
