@@ -1,10 +1,11 @@
-"""Train a 3D Gaussian scene on the CPU, with the gradients of our own renderer.
+"""Train a 3D Gaussian scene on the CPU with the gradients of splatfix's renderer.
 
     python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 14000]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
 (float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
-those that fade are moved onto those whose centres are pulled at most, which are split. Two photos a step, one a core.
+those with little opacity are moved to those with the largest position gradients, which are split (after 3DGS-MCMC,
+Kheradmand et al. 2024). Two photos a step, one on each of two threads.
 """
 
 from __future__ import annotations
@@ -30,27 +31,30 @@ from service.scene_formats import load_scene
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
 SH_C0 = 0.28209479177387814
-DEGREE = 2
-"""Of the SH: beyond it the file grows faster than the picture betters."""
+SH_DEGREE = 2
+"""Degree 3 enlarges the file more than it improves the renders."""
 SH_EVERY = 500
-"""Iterations between two SH degrees."""
+"""Iterations after which the next SH degree is added."""
 RELOCATE_EVERY = 100
-RELOCATE_UNTIL, CALM_FROM = 0.7, 0.7
-"""Shares of the iterations."""
-FADED = 0.02
+RELOCATE_UNTIL, DECAY_FROM = 0.7, 0.7
+"""Shares of the iterations: end of relocation, begin of the decay of all learning rates."""
+MIN_OPACITY = 0.02
+"""Gaussians below it are relocated."""
 SSIM_SHARE = 0.2
 OPACITY_DECAY = 1e-7
-"""A gentle pull on what is seen: what the photos don't need fades, and can be moved."""
+"""Gradient added to the opacity of every visible Gaussian, so that those the photos don't need can be relocated."""
 
 
 @dataclass(slots=True)
 class Photo:
+    """A photo with its camera."""
+
     camera: Camera
     rgb: np.ndarray
     _blurred: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def blurred(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The photo as float32 with its local means and variances, which SSIM asks for at every visit."""
+        """Return the photo (0..1) with its local means and variances for SSIM; computed once."""
         if self._blurred is None:
             target = self.rgb.astype(np.float32) / np.float32(255)
             means = blur(target)
@@ -59,7 +63,7 @@ class Photo:
 
 
 class Model:
-    """Raw parameters, with the scene's activated arrays beside them; views of those make the `GaussianScene`."""
+    """Parameters before activation, Adam's state, and activated arrays, of which a `GaussianScene` has views."""
 
     def __init__(self, points: np.ndarray, colours: np.ndarray, spacing: np.ndarray) -> None:
         n = len(points)
@@ -67,27 +71,28 @@ class Model:
         self.quats = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
         self.log_scales = np.log(np.repeat(0.7 * spacing[:, None], 3, 1)).astype(np.float32)
         self.logits = np.zeros(n, np.float32)
-        self.sh = np.zeros((n, (DEGREE + 1) ** 2, 3), np.float32)
+        self.sh = np.zeros((n, (SH_DEGREE + 1) ** 2, 3), np.float32)
         self.sh[:, 0] = (colours - 0.5) / SH_C0
         self.scales, self.opacities = np.empty_like(self.log_scales), np.empty_like(self.logits)
         self.moments = np.zeros((n, 2, 11 + self.sh[0].size), np.float32)
         self.steps = np.zeros(n, np.int32)
-        self.pull = np.zeros(n, np.float32)
+        self.gradient_sum = np.zeros(n, np.float32)
         self.sort()
 
     def sort(self) -> None:
-        """Bring neighbours in space together in memory: the renderer keeps that order, and walks it."""
+        """Sort by Morton code: the renderer keeps the order, in which neighbours in space are neighbours in memory."""
         order = morton_order(self.means)
-        for name in ("means", "quats", "log_scales", "logits", "sh", "moments", "steps", "pull"):
+        for name in ("means", "quats", "log_scales", "logits", "sh", "moments", "steps", "gradient_sum"):
             setattr(self, name, getattr(self, name)[order])
         self.activate()
 
     def activate(self) -> None:
+        """Compute scales and opacities from the parameters."""
         np.exp(self.log_scales, out=self.scales)
         self.opacities[:] = 1 / (1 + np.exp(-self.logits))
 
     def scene(self, info: SceneInfo) -> GaussianScene:
-        """A scene that looks at this model's memory and changes with it."""
+        """Return a scene that shares this model's memory and changes with it."""
         views = []
         for array in (self.means, self.quats, self.scales, self.opacities, self.sh):
             view = array.view()
@@ -96,33 +101,38 @@ class Model:
         return GaussianScene(*views, info)
 
     def relocate(self, rng: np.random.Generator) -> int:
-        """Move the faded onto the most pulled and split those: same place, half the opacity, smaller."""
-        faded = np.flatnonzero(self.opacities < FADED)
-        weights = np.where(self.opacities < FADED, 0, self.pull)
-        faded = faded[: np.count_nonzero(weights) // 2]
-        if len(faded):
-            chosen = rng.choice(len(weights), len(faded), replace=False, p=weights / weights.sum())
+        """Move Gaussians of low opacity to ones drawn by their position gradients, and split those; return how many.
+
+        The two parts are displaced from the common centre, smaller, and together as opaque as the whole was.
+        """
+        low = np.flatnonzero(self.opacities < MIN_OPACITY)
+        weights = np.where(self.opacities < MIN_OPACITY, 0, self.gradient_sum)
+        low = low[: np.count_nonzero(weights) // 2]
+        if len(low):
+            chosen = rng.choice(len(weights), len(low), replace=False, p=weights / weights.sum())
             offset = rng.normal(size=(len(chosen), 3)).astype(np.float32) * self.scales[chosen] * 0.7
             w, v = self.quats[chosen, :1], self.quats[chosen, 1:]
-            turned = offset + 2 * np.cross(v, np.cross(v, offset) + w * offset)
+            # Rotated by the quaternion, from the Gaussian's axes to the world's.
+            rotated = offset + 2 * np.cross(v, np.cross(v, offset) + w * offset)
+            # Two layers of this opacity let through what one did before.
             share = 1 - np.sqrt(1 - np.minimum(self.opacities[chosen], 0.99))
             self.logits[chosen] = np.log(share / (1 - share))
             self.log_scales[chosen] -= np.log(1.4)
             for array in (self.quats, self.log_scales, self.logits, self.sh):
-                array[faded] = array[chosen]
-            self.means[faded] = self.means[chosen] + turned
-            self.means[chosen] -= turned
-            both = np.concatenate([faded, chosen])
+                array[low] = array[chosen]
+            self.means[low] = self.means[chosen] + rotated
+            self.means[chosen] -= rotated
+            both = np.concatenate([low, chosen])
             self.moments[both] = 0
             self.steps[both] = 0
-        self.pull[:] = 0
+        self.gradient_sum[:] = 0
         self.sort()
-        return len(faded)
+        return len(low)
 
 
 @kernel
 def adam_rows(index, gradients, values, moments, first, steps, rate):
-    """One step of Adam on the rows in view; `first` is the parameter's place in `moments`."""
+    """Do one step of Adam on the rows `index`; the parameter's moments begin at column `first`."""
     beta1, beta2 = np.float32(0.9), np.float32(0.999)
     rest1, rest2 = np.float32(0.1), np.float32(0.001)
     for v in range(np.uint64(index.shape[0])):
@@ -140,10 +150,14 @@ def adam_rows(index, gradients, values, moments, first, steps, rate):
 
 
 def step(model: Model, g: SceneGradients, means_rate: float, rate: float, degree: int) -> None:
-    """Adam on the Gaussians in view (3DGS's rates, times `rate`), with the chain rule of the activations."""
+    """Do one step of Adam on the visible Gaussians, with the chain rule of the activations.
+
+    Learning rates are those of 3DGS (Kerbl et al. 2023) times `rate`; `degree` is the highest SH degree trained.
+    """
     i = g.index
     model.steps[i] += 1
-    model.pull[i] += np.linalg.norm(g.means, axis=1) * model.scales[i].max(1)
+    # In units of the Gaussian's size, as small ones have large gradients.
+    model.gradient_sum[i] += np.linalg.norm(g.means, axis=1) * model.scales[i].max(1)
     opacity = model.opacities[i]
     d_logits = ((g.opacities + OPACITY_DECAY) * opacity * (1 - opacity))[:, None]
     d_scales = g.scales * model.scales[i]
@@ -167,12 +181,15 @@ def step(model: Model, g: SceneGradients, means_rate: float, rate: float, degree
 
 
 def blur(image: np.ndarray) -> np.ndarray:
-    """SSIM's window (Wang 2004): 11 pixels, sigma 1.5. Symmetric, so it is its own adjoint."""
+    """Return the image under SSIM's window (Wang et al. 2004): Gaussian, 11 pixels, sigma 1.5.
+
+    The filter is symmetric, so it is its own adjoint.
+    """
     return cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT)
 
 
 def loss_gradient(picture: np.ndarray, photo: Photo) -> tuple[float, np.ndarray]:
-    """0.8 L1 + 0.2 (1 - SSIM) over the image, and its gradient by the picture."""
+    """Return the loss 0.8 L1 + 0.2 (1 - SSIM) of a render, and its gradient with respect to the render."""
     d_mu, d_s11, d_s12, gradient = (np.empty_like(picture) for _ in range(4))
     target, mu2, s22 = photo.blurred()
     mu1, m11, m12 = blur(picture), blur(picture * picture), blur(picture * target)
@@ -186,7 +203,7 @@ def loss_gradient(picture: np.ndarray, photo: Photo) -> tuple[float, np.ndarray]
 
 @kernel
 def _ssim(mu1, m11, m12, mu2, s22, d_mu, d_s11, d_s12):
-    """Mean of SSIM = A1 A2 / (B1 B2), and its derivatives by the three blurred images."""
+    """Return the mean of SSIM = A1 A2 / (B1 B2); write its derivatives with respect to the three blurred images."""
     one, two = np.float32(1), np.float32(2)
     c1, c2 = np.float32(0.01**2), np.float32(0.03**2)
     total = 0.0
@@ -205,7 +222,7 @@ def _ssim(mu1, m11, m12, mu2, s22, d_mu, d_s11, d_s12):
 
 @kernel
 def _gather_gradient(picture, target, d_mu, d_s11, d_s12, share, gradient):
-    """Mean absolute difference, and the whole loss' gradient from the parts of SSIM's."""
+    """Return the mean absolute difference; write the loss's gradient from that of SSIM's blurred images."""
     scale = np.float32(1.0 / picture.shape[0])
     total = 0.0
     for i in range(np.uint64(picture.shape[0])):
@@ -218,25 +235,26 @@ def _gather_gradient(picture, target, d_mu, d_s11, d_s12, share, gradient):
 
 
 def read_photos(folder: Path, key: str) -> list[Photo]:
-    """Read the photos that `transforms.json` lists under the key."""
+    """Return the photos that `transforms.json` lists under the key."""
     transforms = json.loads((folder / "transforms.json").read_text())
     photos = []
     for frame in transforms["frames"]:
         if frame["file_path"] not in transforms[key]:
             continue
         pixels = Image.open(folder / frame["file_path"]).convert("RGB")
-        lens = Intrinsics(*pixels.size, frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"])
+        intrinsics = Intrinsics(*pixels.size, frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"])
         opencv = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
-        photos.append(Photo(Camera(lens, Pose(opencv)), np.asarray(pixels)))
+        photos.append(Photo(Camera(intrinsics, Pose(opencv)), np.asarray(pixels)))
     return photos
 
 
 def starting_points(folder: Path, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, colours, and the distance to the neighbours as a first size."""
+    """Return initial positions, colours, and distances to the nearest neighbours as sizes, from `points.npy`."""
     given = np.load(folder / "points.npy", allow_pickle=False)
     rows = given[rng.choice(len(given), count, replace=len(given) < count)]
     points, colours = rows[:, :3].astype(np.float32), rows[:, 3:]
     if len(given) < count:
+        # Points drawn twice are moved apart by a centimetre, else their Gaussians would stay identical.
         points = points + rng.normal(size=points.shape).astype(np.float32) * 0.01
     matcher = cv2.flann.Index(points, {"algorithm": 1, "trees": 4})
     _, squared = matcher.knnSearch(points, 4, params={"checks": 64})
@@ -244,7 +262,7 @@ def starting_points(folder: Path, count: int, rng: np.random.Generator) -> tuple
 
 
 def psnr(rasterizer: CpuRasterizer, photos: list[Photo]) -> float:
-    """Mean over the photos, in dB."""
+    """Return the mean PSNR of renders at the photos' cameras, in dB."""
     values = []
     for photo in photos:
         picture = np.clip(rasterizer.render([photo.camera])[0].rgb, 0, 1)
@@ -253,19 +271,19 @@ def psnr(rasterizer: CpuRasterizer, photos: list[Photo]) -> float:
 
 
 def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> GaussianScene:
-    """Train on the training photos; the held-out ones only tell the PSNR at the end."""
+    """Return a scene trained on a folder's training photos; print the PSNR of the held-out ones at the end."""
     rng = np.random.default_rng(seed)
     photos, held_out = read_photos(folder, "train_filenames"), read_photos(folder, "test_filenames")
     background = tuple(json.loads((folder / "transforms.json").read_text()).get("background", (0, 0, 0)))
-    lens = photos[0].camera.intrinsics
+    intrinsics = photos[0].camera.intrinsics
     info = SceneInfo(
         folder.name,
         folder.name,
         "",
         "ply",
         background,
-        training_focal_px=lens.fx,
-        training_long_side_px=lens.long_side,
+        training_focal_px=intrinsics.fx,
+        training_long_side_px=intrinsics.long_side,
     )
     model = Model(*starting_points(folder, gaussians, rng))
     rasterizer = CpuRasterizer(model.scene(info))
@@ -287,11 +305,11 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
             batch = [photos[order.pop()] for _ in range(2)]
             done = iteration / iterations
             means_rate = 1.6e-4 * extent * 0.01**done
-            # Calming every rate at the end lets the last steps agree on what the noise of single photos hides.
-            rate = 0.1 ** max(0.0, (done - CALM_FROM) / (1 - CALM_FROM))
-            # Both gradients first: they look at the memory that a step changes.
+            # With decayed rates the last steps average over the photos instead of following single ones.
+            rate = 0.1 ** max(0.0, (done - DECAY_FROM) / (1 - DECAY_FROM))
+            # Both gradients first, since a step changes the memory that they are computed from.
             for loss, g in list(pool.map(gradients, batch)):
-                step(model, g, means_rate, rate, min(DEGREE, iteration // SH_EVERY))
+                step(model, g, means_rate, rate, min(SH_DEGREE, iteration // SH_EVERY))
                 average += 0.01 * (loss - average)
             if iteration % RELOCATE_EVERY == 0 and 0 < done < RELOCATE_UNTIL:
                 model.relocate(rng)
@@ -305,6 +323,7 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
 
 def write(scene: GaussianScene, path: Path) -> None:
     """Write a PLY, compressed if the name ends in .compressed.ply."""
+    # The renderer skips contributions below 1/255.
     visible = scene.opacities > 1 / 255
     raw = (
         scene.means, np.log(scene.scales), scene.quats, np.log(scene.opacities / (1 - scene.opacities)),
@@ -315,7 +334,7 @@ def write(scene: GaussianScene, path: Path) -> None:
 
 
 def main() -> None:
-    """Train, write, read back what was written, and tell its PSNR."""
+    """Train, write the file, and print the PSNR of the file as it is read back."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--out", type=Path, required=True)

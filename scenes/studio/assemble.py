@@ -1,4 +1,4 @@
-"""Put together the demo scene's folder from what `build.py` made: training cameras, photos, truth, manifest.
+"""Assemble the demo scene's folder from the output of `build.py`: training cameras, photos, truth, manifest.
 
     python scenes/studio/assemble.py scenes/studio/build
 

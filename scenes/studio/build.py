@@ -48,7 +48,7 @@ MODIFICATIONS = (
 
 
 def model() -> None:
-    """Model the room afresh."""
+    """Build the room in an empty Blender scene."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     rng = np.random.default_rng(SEED)
     room.build(rng)
@@ -57,7 +57,7 @@ def model() -> None:
 
 
 def set_up_renderer() -> bpy.types.Object:
-    """Path tracing on the CPU with few samples and a denoiser; returns the camera."""
+    """Set up path tracing on the CPU with few samples and a denoiser; return the camera."""
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
@@ -90,7 +90,7 @@ def set_up_renderer() -> bpy.types.Object:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Swallow what Blender's C code prints, so that the progress lines stay readable."""
+    """Discard what Blender's C code prints, which would interleave with the progress lines."""
     sys.stdout.flush()
     kept = os.dup(1)
     with open(os.devnull, "w") as sink:
@@ -121,7 +121,7 @@ def take(view: View, target: Path, camera: bpy.types.Object) -> None:
 
 
 def take_all(jobs: list[tuple[View, Path]], camera: bpy.types.Object) -> None:
-    """Take the photos that are still missing, one progress line each."""
+    """Render the photos that don't exist yet, with a progress line for each."""
     missing = [(view, path) for view, path in jobs if not path.exists()]
     print(f"{len(jobs) - len(missing)} photos are there, {len(missing)} to take", flush=True)
     start = time.monotonic()
@@ -137,7 +137,7 @@ def take_all(jobs: list[tuple[View, Path]], camera: bpy.types.Object) -> None:
 
 
 def lens_of(modification: str) -> tuple[int, int, float]:
-    """Upright width and height and the lens of a held-out photo."""
+    """Return upright width and height (px) and focal length of a held-out photo."""
     if modification == "portrait":
         return cameras.SHORT_SIDE, cameras.LONG_SIDE, cameras.LENS
     lens = cameras.WIDE_LENS if modification == "wide" else cameras.LENS
@@ -145,7 +145,7 @@ def lens_of(modification: str) -> tuple[int, int, float]:
 
 
 def main() -> None:
-    """Command line entry."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description="Make the photos of the studio scene.")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "build", help="work folder")
     parser.add_argument("--only", choices=("all", "train", "heldout"), default="all")

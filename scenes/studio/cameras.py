@@ -1,4 +1,4 @@
-"""Where the photos of the studio are taken: training views that cover the room, held-out views.
+"""Camera poses of the studio's photos: training views that cover the room, and held-out views.
 
 Poses are camera-to-world matrices in OpenGL axes (+x right, +y up, looking along -z), which is
 also what Blender's cameras use.
@@ -41,7 +41,7 @@ class View:
 
 
 class Room:
-    """Ray queries against the finished scene."""
+    """Ray casts into the finished scene."""
 
     def __init__(self) -> None:
         vertices: list = []
@@ -55,16 +55,16 @@ class Room:
         self.tree = BVHTree.FromPolygons(vertices, faces)
 
     def hit(self, origin: Array, direction: Array) -> tuple[Array, Array, float] | None:
-        """Point, normal and distance of the first surface along a unit direction."""
+        """Return point, normal and distance of the first surface along a unit direction."""
         point, normal, _, distance = self.tree.ray_cast(Vector(origin), Vector(direction))
         return None if point is None else (np.array(point), np.array(normal), distance)
 
     def gap(self, point: Array) -> float:
-        """Distance from a point to the nearest surface."""
+        """Return the distance from a point to the nearest surface."""
         return self.tree.find_nearest(Vector(point))[3]
 
     def sees(self, eye: Array, point: Array, tolerance: float = 0.01) -> bool:
-        """Whether nothing stands between the eye and a surface point."""
+        """Return whether nothing occludes a surface point from the eye."""
         ray = point - eye
         distance = float(np.linalg.norm(ray))
         found = self.hit(eye, ray / distance)
@@ -72,7 +72,7 @@ class Room:
 
 
 def look(position: Array, yaw: float, pitch: float, roll: float = 0.0) -> Array:
-    """Pose of a camera looking along `yaw` (about z from +x) and `pitch` (up is positive)."""
+    """Return the pose of a camera looking along `yaw` (about z from +x) and `pitch` (up is positive)."""
     forward = np.array([cos(pitch) * cos(yaw), cos(pitch) * sin(yaw), sin(pitch)])
     right = np.array([sin(yaw), -cos(yaw), 0.0])
     up = np.cross(right, forward)
@@ -101,7 +101,7 @@ def project(view: View, points: Array) -> tuple[Array, Array, Array]:
 
 
 def free_position(space: Room, rng: Rng) -> Array:
-    """Random eye position that keeps its distance from everything."""
+    """Return a random eye position with a minimum distance from all surfaces."""
     low = np.array([CLEARANCE, CLEARANCE, 0.7])
     high = np.array([room.SIZE[0] - CLEARANCE, room.SIZE[1] - CLEARANCE, 2.1])
     while True:
@@ -111,7 +111,7 @@ def free_position(space: Room, rng: Rng) -> Array:
 
 
 def open_view(space: Room, view: View) -> bool:
-    """Whether the picture is not mostly filled by something close to the lens."""
+    """Return whether the image is not mostly filled by a close surface."""
     depths = []
     for u in np.linspace(0.08, 0.92, 7) * view.width:
         for v in np.linspace(0.08, 0.92, 6) * view.height:
@@ -122,7 +122,7 @@ def open_view(space: Room, view: View) -> bool:
 
 
 def surface_sample(space: Room, rng: Rng, count: int) -> tuple[Array, Array]:
-    """Points and normals spread over the surfaces that can be seen from free space."""
+    """Return points and normals on the surfaces that are visible from free space."""
     points, normals = [], []
     while len(points) < count:
         eye = free_position(space, rng)
@@ -137,7 +137,7 @@ def surface_sample(space: Room, rng: Rng, count: int) -> tuple[Array, Array]:
 
 
 def visible(space: Room, view: View, points: Array, normals: Array) -> Array:
-    """Mask of the surface points that a view shows, not too slanted."""
+    """Return the mask of surface points that a view shows at a sufficient angle."""
     u, v, depth = project(view, points)
     eye = view.pose[:3, 3]
     toward = eye - points
@@ -150,7 +150,7 @@ def visible(space: Room, view: View, points: Array, normals: Array) -> Array:
 
 
 def training_views(space: Room, rng: Rng, count: int, pool: int = 640) -> list[View]:
-    """Greedy choice among random views: each next one adds most to what is still seen seldom."""
+    """Choose among random views greedily: each adds most to the coverage of points that few views show."""
     points, normals = surface_sample(space, rng, 2500)
     views: list[View] = []
     while len(views) < pool:
@@ -178,7 +178,7 @@ def training_views(space: Room, rng: Rng, count: int, pool: int = 640) -> list[V
 
 
 def heldout_views(space: Room, rng: Rng, training: list[View], lenses: list[tuple]) -> list[View]:
-    """Views between two training views each; `lenses` holds (width, height, lens) per view."""
+    """Return views each between two training views; `lenses` holds (width, height, lens) per view."""
     pool: list[Array] = []
     while len(pool) < 150:
         a, b = (training[k].pose for k in rng.choice(len(training), 2, replace=False))

@@ -1,4 +1,4 @@
-"""Files that go with the photos: poses, held-out truth, and points to initialise Gaussians."""
+"""Files beside the photos: poses, true poses of held-out photos, and points to initialize Gaussians."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # from OpenGL camera axes to OpenCV's,
 
 
 def write_transforms(out: Path, training: list[View], heldout: list[View]) -> None:
-    """Poses and intrinsics of all upright photos in nerfstudio's layout."""
+    """Write poses and intrinsics of all upright photos in nerfstudio's layout."""
     names = [f"train/{v.name}.png" for v in training]
     tests = [f"heldout_original/{v.name}.png" for v in heldout]
     frames = [
@@ -44,7 +44,7 @@ def write_transforms(out: Path, training: list[View], heldout: list[View]) -> No
 
 
 def write_heldout(out: Path, heldout: list[View], modifications: tuple[str, ...]) -> None:
-    """The held-out JPEGs, altered where they are to be, and truth.json."""
+    """Write the held-out photos, some of them altered, and truth.json."""
     truth = []
     turns = iter((6, 8))
     count = {"exposure": 0, "occlusion": 0}
@@ -79,7 +79,7 @@ def write_heldout(out: Path, heldout: list[View], modifications: tuple[str, ...]
 
 
 def write_points(out: Path, space: Room, training: list[View], rng: np.random.Generator) -> Array:
-    """Points of the scene's surface with the colours that the training photos give them."""
+    """Write points of the scene's surface with their colours in the training photos."""
     each = POINTS // len(training)
     rows = []
     for view in training:

@@ -1,4 +1,4 @@
-"""What happens to finished held-out photos: exposure, occlusion, JPEG with EXIF."""
+"""Alterations of rendered held-out photos: exposure, occlusion, JPEG with EXIF."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read(path: Path) -> Array:
 
 
 def expose(photo: Array, which: int) -> Array:
-    """Photo as another exposure or white balance would have made it."""
+    """Return the photo under another exposure or white balance."""
     linear = np.where(photo <= 0.04045, photo / 12.92, ((photo + 0.055) / 1.055) ** 2.4)
     linear = np.clip(linear * GAINS[which], 0, 1)
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
@@ -73,7 +73,7 @@ OCCLUDERS = (
 
 
 def occlude(photo: Array, which: int) -> tuple[Array, float]:
-    """Photo with something before the lens, and the share of the area that is covered."""
+    """Return the photo with an occluder in front, and the share of its area that is covered."""
     height, width = photo.shape[:2]
     shape, colour, grain, blur = OCCLUDERS[which]
     for size in np.linspace(0.2, 1.6, 141):
@@ -91,7 +91,7 @@ def occlude(photo: Array, which: int) -> tuple[Array, float]:
 
 
 def write_jpeg(photo: Array, view: View, orientation: int, path: Path) -> None:
-    """JPEG as a camera would store it: pixels turned by `orientation`, lens and turn in EXIF."""
+    """JPEG as a camera would store it: pixels rotated by `orientation`, focal length and orientation in EXIF."""
     pixels = np.round(np.clip(photo, 0, 1) * 255).astype(np.uint8)
     stored = np.ascontiguousarray(np.rot90(pixels, ORIENTATIONS.get(orientation, 0)))
     exif = Image.Exif()
