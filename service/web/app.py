@@ -170,6 +170,7 @@ def data_folder(path: Path | None) -> Iterator[Path]:
     """Lock a folder for this process; None: a temporary one. Raises StorageFailed, also if it is locked."""
     with ExitStack() as stack:
         folder = path or Path(stack.enter_context(TemporaryDirectory(prefix="splatfix-")))
+        # The lock is released by the kernel, also when the process is killed.
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock = stack.enter_context((folder / "lock").open("w"))
@@ -183,7 +184,7 @@ def data_folder(path: Path | None) -> Iterator[Path]:
 
 
 def access_rules(settings: Settings, keys: KeyRing) -> AccessRules:
-    """Return who may use the service. Raises InvalidRequest if that is everybody, unless the settings say so."""
+    """Return who may use the service. Raises InvalidRequest if anybody could, unless `open` is set."""
     is_open = not keys
     if is_open and not is_loopback(settings.host) and not settings.open:
         raise InvalidRequest(
@@ -218,6 +219,7 @@ def _named_scenes(settings: Settings) -> list[StoredScene]:
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:
+    """Cancel a task and wait until it has ended."""
     task.cancel()
     with suppress(asyncio.CancelledError):
         await task

@@ -30,6 +30,7 @@ A job that ended without a result has a problem document as its `error`.
 
 def description(app: FastAPI) -> dict[str, Any]:
     """Return the description, with the models that no route declares."""
+    # Cached in the app: describing every model takes a while.
     if not app.openapi_schema:
         schema = get_openapi(
             title=app.title,
@@ -46,7 +47,7 @@ def description(app: FastAPI) -> dict[str, Any]:
         models |= {name: model for name, model in extra["$defs"].items() if name not in models}
         schema["components"]["examples"] = example_components()
         schema["components"]["securitySchemes"] = {"key": {"type": "http", "scheme": "bearer", "description": _KEYS}}
-        schema["security"] = [{"key": []}, {}]
+        schema["security"] = [{"key": []}, {}]  # {}: none, for a service without keys
         _drop_default_validation(schema)
         add_links(schema)
         app.openapi_schema = schema

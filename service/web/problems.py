@@ -131,7 +131,8 @@ def problem_of(error: Exception, instance: str) -> Problem:
 
 
 def problem_of_failure(failure: Failure, instance: str) -> Problem:
-    """Describe an error that was kept as data, as it would have been described when it was raised."""
+    """Describe a stored error, as `problem_of` would have described the exception."""
+    # 500: `internal_error` belongs to no SplatfixError.
     status = _status_by_code().get(failure.code, 500)
     return _problem(status, failure.code, failure.message, instance, failure.where, failure.hint)
 
@@ -142,7 +143,7 @@ def _status(kind: type[SplatfixError]) -> int:
 
 @cache
 def _status_by_code() -> dict[str, int]:
-    """Return the HTTP status of every error of ours, by its code."""
+    """Return the HTTP status of every SplatfixError, by its code."""
     kinds, found = [SplatfixError], {}
     while kinds:
         kind = kinds.pop()
@@ -223,6 +224,7 @@ def install(app: FastAPI) -> None:
 def _allowed(request: Request) -> set[str]:
     """Return the methods of a path. The router's own answer has those of the first matching route only."""
     methods: set[str] = set()
+    # Asked by matching each method, since several routes may share a path.
     for method in ("DELETE", "GET", "HEAD", "PATCH", "POST", "PUT"):
         scope = {**request.scope, "method": method}
         methods |= {method for route in request.app.routes if route.matches(scope)[0] is Match.FULL}

@@ -127,7 +127,7 @@ class Settings(BaseSettings):
 
     @property
     def jobs(self) -> JobsConfig:
-        """How jobs are run and kept."""
+        """The part of the settings for `service.jobs`."""
         return JobsConfig(
             workers=self.workers,
             queue_size=self.queue_size,
@@ -145,7 +145,7 @@ class Settings(BaseSettings):
 
     @property
     def engine(self) -> EngineConfig:
-        """What scenes are prepared for, and what they may take."""
+        """The part of the settings for the embedded engine."""
         return EngineConfig(
             self.estimator, self.matcher, self.rasterizer, self.cache_dir, memory_bytes=self.scene_memory_bytes
         )

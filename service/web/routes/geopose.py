@@ -57,6 +57,7 @@ async def geopose(
     time that `Prefer: wait` may have.
     """
     photo, intrinsics = gpp.image_of(wanted)
+    # The protocol has one image for each reading.
     if is_sequence(photo):
         raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
     named = scene or gpp.nearest_scene(await to_thread.run_sync(parts.engine.scenes), wanted)
@@ -71,6 +72,7 @@ async def geopose(
         await live.wait(wait_s)
     job = await to_thread.run_sync(parts.jobs.get, job.id)
     if not job.ended:
+        # The protocol has no second request to fetch the result with.
         await to_thread.run_sync(parts.jobs.cancel, job)
         raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
     if job.failure:

@@ -44,6 +44,7 @@ def list_jobs(
 ) -> JobList:
     """List the stored jobs that match all given filters, newest first, in pages."""
     wanted = JobFilter(scene, estimator, state, status, photo, before)
+    # One more than the page has: whether there is a next page.
     page = parts.jobs.page(wanted, limit + 1)
     given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
     query = {name: value for name, value in given.items() if value is not None}
@@ -83,48 +84,49 @@ async def job_events(
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream a job as server-sent events: `record` for each step from the first on, then `result` or `error`.
 
-    A `record` has `attempt.index` as id and a `Record` as data. If an attempt is lost, as by a crash, the job is tried
-    again: an event `restarted`, without an id and with a `Restarted` as data, says that the records of another attempt
-    follow from index 0 on, and that those before don't count any more. The last event has the id `end` and a `JobOut`
-    as data: `result` if the job succeeded, else `error`. `Last-Event-ID` resumes, also after a restart of the service.
+    A `record` has `attempt.index` as id and a `Record` as data. If an attempt is lost, e.g. by a crash, the job is
+    started again: after an event `restarted`, without an id and with a `Restarted` as data, the records of the new
+    attempt follow from index 0 on, and replace the earlier ones. The last event has the id `end` and a `JobOut` as
+    data: `result` if the job succeeded, else `error`. `Last-Event-ID` resumes, also after a restart of the service.
     """
     stream = _EventStream.after(last_event_id)
     if live := parts.jobs.live(job.id):
         async for _ in live.changes():
             attempt, records = live.progress
-            if attempt:  # 0: after a restart of the service it waits for its next one
+            if attempt:  # 0: queued again after a restart of the service
                 for event in await stream.events(attempt, records):
                     yield event
     job = await to_thread.run_sync(parts.jobs.get, job.id)
     for event in await stream.events(job.attempt, await to_thread.run_sync(parts.jobs.records, job)):
         yield event
-    if job.ended:  # else the service ends: the client comes again
-        document = await to_thread.run_sync(job_document, parts, job.id, root)
-        name = "result" if document.result else "error"
-        yield ServerSentEvent(event=name, id="end", raw_data=document.model_dump_json())
+    if job.ended:  # else the service is shutting down; the client reconnects with Last-Event-ID
+        ended = await to_thread.run_sync(job_document, parts, job.id, root)
+        name = "result" if ended.result else "error"
+        yield ServerSentEvent(event=name, id="end", raw_data=ended.model_dump_json())
 
 
 @dataclass(slots=True)
 class _EventStream:
-    """How far a client is: the attempt that it knows, and how many of its records."""
+    """What a client has received: the latest attempt, and how many of its records."""
 
     attempt: int = 0
     sent: int = 0
 
     @classmethod
     def after(cls, last_event_id: str) -> _EventStream:
-        """Return where a client is that has seen that event."""
+        """Return the state of a client whose last event had that id; an unknown id starts from the beginning."""
         found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
         return cls(int(found[1]), int(found[2]) + 1) if found else cls()
 
     async def events(self, attempt: int, records: Sequence[JobRecord]) -> list[ServerSentEvent]:
-        """Return what is new to the client, and take note that it gets it."""
+        """Return the events that the client lacks of an attempt's records, and count them as sent."""
         events: list[ServerSentEvent] = []
         if attempt != self.attempt:
             if self.attempt:
                 restarted = Restarted(attempt=attempt).model_dump_json()
                 events.append(ServerSentEvent(event="restarted", raw_data=restarted))
             self.attempt, self.sent = attempt, 0
+        # Records can be large: they are converted on a thread.
         fresh = records[self.sent :]
         for text in await to_thread.run_sync(_record_texts, fresh) if fresh else ():
             events.append(ServerSentEvent(event="record", id=f"{attempt}.{self.sent}", raw_data=text))
@@ -144,8 +146,9 @@ def _record_texts(records: Sequence[JobRecord]) -> list[str]:
 )
 @route_policy(role="read")
 async def job_photo(job: JobOf, parts: PartsOf) -> Response:
-    """Return the photo as the estimator gets it: upright, undistorted, reduced if large. It is deleted some time after
-    the job, unless the request has `keep_photo`.
+    """Return the photo as the estimator gets it: upright, undistorted, reduced if large.
+
+    It is deleted some time after the job, unless the request has `keep_photo`.
     """
     photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
     return Response(photo, media_type="image/jpeg")

@@ -24,8 +24,9 @@ router = APIRouter()
 
 
 def _form_schema() -> dict[str, Any]:
-    """The multipart form: as the JSON body, but the photo is a file and the nested fields are JSON text."""
+    """Return the schema of the multipart form: the JSON body's, with files, and nested fields as JSON text."""
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
+    # The definitions are among the document's components already.
     schema.pop("$defs", None)
     schema["description"] = "`options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text."
     for name in ("options", "intrinsics", "prior", "truth", "times_s"):
@@ -45,6 +46,7 @@ def _form_schema() -> dict[str, Any]:
     return schema
 
 
+# Described by hand: FastAPI would have to parse the body, and would answer with its own errors.
 _BODY = {
     "requestBody": {
         "required": True,
@@ -105,20 +107,21 @@ async def localize_photo(
         if live := parts.jobs.live(job.id):
             await live.wait(wait_s)
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
-    document = await to_thread.run_sync(job_document, parts, job.id, root)
+    answer = await to_thread.run_sync(job_document, parts, job.id, root)
     response.headers["Location"] = f"{root}/jobs/{job.id}"
-    response.status_code = 200 if document.state in ENDED else 202
-    return document
+    response.status_code = 200 if answer.state in ENDED else 202
+    return answer
 
 
 async def accepted(
     request: Request, parts: Parts, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
 ) -> StoredJob:
-    """Make a job of a request. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
+    """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
     client = client_of(request.scope)
 
     def accept() -> StoredJob:
         sha256 = hashlib.sha256(body.photo).hexdigest()
+        # Of the validated fields: the same request as form and as JSON is the same job.
         digest = hashlib.sha256((fields.model_dump_json() + sha256).encode()).hexdigest()
         spec = job_spec(fields, parts.settings.estimator)
         return parts.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))

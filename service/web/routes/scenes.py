@@ -64,6 +64,7 @@ async def upload_scene(
     file: Annotated[str, Query(description="Name of the file; its suffix decides the format.")] = "scene.ply",
 ) -> SceneOut:
     """Upload a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, stored and loaded."""
+    # Before the upload of perhaps gigabytes.
     known = await to_thread.run_sync(parts.engine.scenes)
     if any(scene.id == scene_id for scene in known):
         raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
@@ -105,10 +106,11 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def delete_scene(scene_id: str, parts: PartsOf) -> None:
     """Delete an uploaded scene and its files; not a scene of the settings, nor one that jobs use."""
-    parts.engine.scene(scene_id)
+    parts.engine.scene(scene_id)  # raises SceneNotFound
     stored = parts.scene_store.find(scene_id)
     if stored is None or not stored.uploaded:
         raise SceneInUse("this scene is in the service's settings; it can only be unloaded.", where="scene")
+    # First from the engine, which refuses while jobs use it.
     parts.engine.remove(scene_id)
     parts.scene_store.delete(scene_id)
 

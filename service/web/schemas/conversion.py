@@ -149,6 +149,7 @@ def frame_out(frame: SequenceFrame) -> FrameOut:
 
 def record_camera(record: IterationRecord, photo: Intrinsics, *, of_matches: bool) -> Camera:
     """Return a record's camera: its pose in the photo's size, or the camera that its matches refer to."""
+    # A match refers to a render, which may have another size and pose than the photo.
     if of_matches and record.matches is not None:
         return record.matches.render_camera
     return Camera(photo.corrected(record.correction), record.pose)

@@ -100,10 +100,10 @@ class JobList(Model):
 
 
 class Restarted(Model):
-    """A job is tried again from the beginning: records that came before don't count any more."""
+    """A job was started again: the records of earlier attempts are void."""
 
     attempt: int
-    """The one whose records follow."""
+    """Number of the attempt whose records follow."""
 
 
 class Trace(Model):
