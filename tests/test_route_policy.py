@@ -123,6 +123,16 @@ def test_what_no_route_serves_is_denied(locked, keys, method, path):
         assert status_of_head(locked, method, path, keys["admin"]) == 413
 
 
+@pytest.mark.parametrize("method", ["HEAD", "OPTIONS"])
+def test_head_and_options_have_the_policy_of_get(keys, method):
+    app = create_app(settings(estimator="view_index", keys_file=keys["file"]))
+    app.add_api_route("/more", declare(lambda: None, RoutePolicy(role="localize")))
+    assert status_of_head(app, method, "/livez") == 405
+    assert status_of_head(app, method, "/more") == 401
+    assert status_of_head(app, method, "/more", keys["read"]) == 403
+    assert status_of_head(app, method, "/more", keys["localize"]) == 405
+
+
 def test_a_socket_where_no_route_is_is_denied(locked):
     assert status_of_head(locked, "WEBSOCKET", "/jobs") == 401
 
