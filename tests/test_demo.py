@@ -21,7 +21,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
-from api_server import ROOT, serving, settings, until
+from api_server import ROOT, create_app, serving, settings, until
 from documents import blocks, lines_of
 
 from service import jit
@@ -29,7 +29,6 @@ from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query
 from service.types import Intrinsics, Pose
-from service.web.app import create_app
 
 STUDIO = ROOT / "scenes" / "studio"
 TRUTH = json.loads((STUDIO / "truth.json").read_text())
