@@ -56,6 +56,14 @@ def test_links_lead_to_files_and_headings(path):
             assert anchor in map(slug, headings), f"{path.name}: {target}#{anchor}"
 
 
+def test_contributing_names_files_that_are_there():
+    text = (ROOT / "CONTRIBUTING.md").read_text("utf-8")
+    named = set(re.findall(r"`((?:service|viewer|tests|docs|scenes|docker|\.ci)/[\w./]+)`", text))
+    examples = {name for name in named if re.search(r"my_|[A-Z]{4}", name)}
+    assert len(named - examples) > 50
+    assert not {name for name in named - examples if not (ROOT / name).exists()}
+
+
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
 def test_each_code_block_is_sound_or_says_why_it_is_not_run(block):
     check(block)
