@@ -3,6 +3,10 @@
 import os
 from collections.abc import Iterator
 
+# As on the command line, and before numpy is imported: threads of a library that wait for one another burn the cores
+# that other tests need.
+os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+
 import pytest
 import shape_checks
 from hypothesis import settings

@@ -104,8 +104,7 @@ def measured(copy: Copy, workers: int, file: Path) -> None:
     ]
     done = copy.pytest(command, 3600, COVERAGE_FILE=str(file.absolute()))
     if done.returncode != 0:
-        file.unlink(missing_ok=True)
-        raise SystemExit(f"the tests must pass before anything is changed:\n{done.stdout[-3000:]}")
+        print(f"some tests fail before anything is changed:\n{done.stdout[-3000:]}", file=sys.stderr)
 
 
 def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]]:

@@ -79,6 +79,16 @@ def calibration() -> float:
     return _iterated(np.linspace(-1, 1, 8000), 500) + float(image.sum()) + sum(i % 7 for i in range(80_000))
 
 
+@pytest.fixture
+def untraced() -> Iterator[None]:
+    """Without the tracer of a coverage run, which would double the time."""
+    tracer = sys.gettrace()
+    sys.settrace(None)
+    yield
+    sys.settrace(tracer)
+
+
+@pytest.mark.usefixtures("untraced")
 @pytest.mark.parametrize(("lens", "bound"), [("given", 8), ("withheld", 22)])  # seen: 3.6 to 4.3, 10 to 12
 def test_the_demo_photos_are_localized_and_none_falsely(studio, lens, bound):
     calibration()
