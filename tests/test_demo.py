@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import statistics
 import subprocess
 import sys
 import time
@@ -89,26 +88,27 @@ def untraced() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("untraced")
-@pytest.mark.parametrize(("lens", "bound"), [("given", 8), ("withheld", 22)])  # seen: 3.6 to 4.3, 10 to 12
+@pytest.mark.parametrize(("lens", "bound"), [("given", 8), ("withheld", 24)])  # seen: 4.1 and 11.9
 def test_the_demo_photos_are_localized_and_none_falsely(studio, lens, bound):
+    """The loop goes on beside the photos for half their time: what else slows this machine slows both."""
+    found, photos_s, loops_s = [], [], []
     calibration()
-    found, spent_s, calibration_s = [], [], []
-    for row in TRUTH:
+    for row in [TRUTH[0], *TRUTH]:  # the first one compiles
         data = (STUDIO / "photos" / row["photo"]).read_bytes()
         intrinsics = Intrinsics(**row["intrinsics"]) if lens == "given" else None
         begun = time.thread_time()
         answer = localize(read_query(data, intrinsics=intrinsics), studio, Request(seed=0))
-        done = time.thread_time()
-        calibration()
-        calibration_s.append(time.thread_time() - done)
-        spent_s.append(done - begun)
+        photos_s.append(time.thread_time() - begun)
         degrees, units = pose_distance(answer.pose, Pose(np.array(row["world_from_camera"])))
         found.append((answer.verdict.status, degrees < 5 and units < 0.05))
-    assert len(found) == 16
+        while sum(loops_s) < sum(photos_s[1:]) / 2:
+            begun = time.thread_time()
+            calibration()
+            loops_s.append(time.thread_time() - begun)
+    assert len(found) == 17
     assert ("localized", False) not in found
-    assert found.count(("localized", True)) >= 15
-    ratio = statistics.median(spent_s) / statistics.median(calibration_s)
-    assert ratio < bound
+    assert found[1:].count(("localized", True)) >= 15
+    assert np.mean(photos_s[1:]) / np.mean(loops_s) < bound
 
 
 # ------------------------------------------------------------------ the documents' examples
