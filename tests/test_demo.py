@@ -78,6 +78,11 @@ def calibration() -> float:
     return _iterated(np.linspace(-1, 1, 8000), 500) + float(image.sum()) + sum(i % 7 for i in range(80_000))
 
 
+def test_the_numerics_run_on_one_thread():
+    """With more, what a photo costs is chance: they wait for one another in busy loops."""
+    assert os.environ.get("OPENBLAS_NUM_THREADS") == "1", "numpy was imported before conftest.py: see addopts"
+
+
 @pytest.fixture
 def untraced() -> Iterator[None]:
     """Without the tracer of a coverage run, which would double the time."""
