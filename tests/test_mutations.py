@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from api_server import ROOT
+from mutation_run import drawn, naming
 from mutations import KINDS, mutants_of
 
 SOURCE = b'''"""A module \xe2\x80\x94 not all of it is ASCII."""
@@ -64,9 +65,15 @@ def test_every_kind_is_there_and_nothing_that_no_test_could_notice():
     assert "None = " not in texts
 
 
-def test_every_mutant_of_the_packages_is_python_again():
-    paths = sorted(path for folder in ("service", "viewer") for path in (ROOT / folder).rglob("*.py"))
-    for path in paths[::7]:
-        source = path.read_bytes()
-        for mutant in mutants_of(path.name, source)[::5]:
-            compile(mutant.applied(source), str(path), "exec")
+def test_a_longer_run_begins_like_a_shorter_one_and_every_mutant_is_python_again():
+    mutants = drawn(ROOT, 100, 1)
+    assert drawn(ROOT, 10, 1) == mutants[:10]
+    assert {mutant.kind for mutant in mutants[:5]} == set(KINDS)
+    for mutant in mutants:
+        compile(mutant.applied((ROOT / mutant.file).read_bytes()), mutant.file, "exec")
+
+
+def test_what_names_a_module_is_found():
+    named = {str(path) for path in naming("service/photos/images.py", ROOT)}
+    assert {"tests/test_images.py", "service/photos/sequence.py"} <= named
+    assert not {"tests/test_mutations.py", "service/geometry.py"} & named
