@@ -38,7 +38,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)(function)
 
 
-def summing(function: Callable[..., Any]) -> Callable[..., Any]:
+def kernel_reordered_sums(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel whose sums may be reordered, so that LLVM vectorizes them; NaN and infinity stay exact."""
     flags = {"reassoc", "nsz", "contract"}
     return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=flags)(function)

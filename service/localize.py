@@ -31,7 +31,7 @@ from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.verification.gate import VERIFICATION, downgraded, verify
 from service.render import RASTERIZERS
-from service.render.counted import Counted
+from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
@@ -58,7 +58,7 @@ class LoadedScene:
     image_matcher: ImageMatcher | None = None
     cache_dir: Path | None = None
     """Where prepared things (view indexes) are kept between runs; None: nowhere."""
-    passed_over: str = ""
+    skipped_rasterizers: str = ""
     """Why the rasterizer isn't an earlier one of RASTERIZER_ORDER."""
     warnings: tuple[str, ...] = ()
     """For every result."""
@@ -98,8 +98,8 @@ class LoadedScene:
         else:
             # It extracts features, which every method can use.
             images = None
-        renderer, passed_over, warnings = _renderer(scene, rasterizer)
-        return cls(scene, renderer, features, images, cache_dir, passed_over, warnings)
+        renderer, skipped_rasterizers, warnings = _renderer(scene, rasterizer)
+        return cls(scene, renderer, features, images, cache_dir, skipped_rasterizers, warnings)
 
     @property
     def nbytes(self) -> int:
@@ -134,9 +134,9 @@ def _renderer(scene: GaussianScene, name: str | None) -> tuple[Rasterizer, str, 
     """Return the rasterizer, why it isn't an earlier one of RASTERIZER_ORDER, and what results should warn of."""
     if name:
         return RASTERIZERS.load(name).create(scene), "", ()
-    name, passed_over = choose_rasterizer()
+    name, skipped_rasterizers = choose_rasterizer()
     try:
-        return RASTERIZERS.load(name).create(scene), passed_over, ()
+        return RASTERIZERS.load(name).create(scene), skipped_rasterizers, ()
     except BackendMissing as error:  # the GPU's memory may be full
         last = RASTERIZER_ORDER[-1]
         if name == last:

@@ -22,7 +22,7 @@ from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import correspondences
 from service.pose.retrieval.index import ViewIndex
-from service.pose.retrieval.scores import retrieval_scores, top
+from service.pose.retrieval.scores import retrieval_scores, top_indices
 from service.results import IterationRecord, PoseEstimate, StageTiming, Status
 from service.types import Query
 
@@ -123,7 +123,7 @@ def _inliers(images: QueryImages, loaded: LoadedScene, roll_steps_45deg: int, co
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     scores = retrieval_scores(features.descriptors, [view.features.descriptors for view in index.views])
     most = 0
-    for i in top(scores, config.views):
+    for i in top_indices(scores, config.views):
         matches = correspondences(features, index.views[i], loaded.matcher)
         found = estimate_absolute_pose(
             matches.photo_px, matches.points_in_world, query.intrinsics, pixels, config.trials

@@ -39,9 +39,9 @@ from service.pose.features.rendered_views import RenderedView, ViewRenderer
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import appearance
-from service.pose.verification.gate import VERIFICATION, VerificationConfig, judge, photometric_suffices
+from service.pose.verification.gate import VERIFICATION, VerificationConfig, photometric_suffices, verdict_of
 from service.pose.verification.signals import geometry_signals
-from service.render.counted import Counted
+from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose, Query
 
@@ -278,7 +278,7 @@ def verify_tracked(
     # A shared focal length is not for one photo to doubt.
     focal_step = 0.0 if focal_sigma else found.uncertainty.focal_step
     uncertainty = replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step)
-    return judge(signals, uncertainty, focal_sigma, config=config)
+    return verdict_of(signals, uncertainty, focal_sigma, config=config)
 
 
 @dataclass(slots=True)

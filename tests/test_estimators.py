@@ -25,7 +25,7 @@ from service.pose.features.rendered_views import to_uint8
 from service.pose.retrieval.index import prepared_index
 from service.pose.retrieval.view_placement import PlacementConfig
 from service.pose.retrieval.viewpoints import ViewpointConfig
-from service.render.counted import Counted
+from service.render.render_counter import Counted
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.warm_up import warm_up
 from service.types import Camera, Intrinsics, Pose, Query

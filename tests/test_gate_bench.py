@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.bench.gate import GARBAGE, garbage
+from service.bench.gate import GARBAGE, unrelated_image
 from service.bench.gate_fit import Sample, fit_model, fitted, probabilities, summary
 from service.pose.verification.gate import VERIFICATION
 from service.pose.verification.gate_model import MODEL_FILE, SHIPPED_MODEL, load_model, write_model
@@ -94,7 +94,7 @@ def test_a_model_of_another_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_pictures_of_nothing_are_pictures_and_differ() -> None:
-    pictures = [garbage(number) for number in range(GARBAGE)]
+    pictures = [unrelated_image(number) for number in range(GARBAGE)]
     assert all(p.shape == (480, 640, 3) and p.dtype == np.float32 for p in pictures)
     assert all(p.min() >= 0 and p.max() <= 1 for p in pictures)
     means = np.array([[p.mean(), p.std(), np.abs(np.diff(p, axis=1)).mean()] for p in pictures])

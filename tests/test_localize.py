@@ -251,7 +251,7 @@ class Gpu:
 
 
 @pytest.mark.parametrize(
-    ("gpu", "named", "expected", "passed_over", "warned"),
+    ("gpu", "named", "expected", "skipped_rasterizers", "warned"),
     [
         (Gpu(), None, "gsplat_cuda", "", False),
         (Gpu(), "cpu", "cpu", "", False),
@@ -259,11 +259,11 @@ class Gpu:
         (Gpu(full=True), None, "cpu", "the GPU has no memory left.", True),
     ],
 )
-def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expected, passed_over, warned):
+def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expected, skipped_rasterizers, warned):
     monkeypatch.setattr(service.localize, "RASTERIZERS", gpu)
     use(monkeypatch, Script(1))
     bound = LoadedScene.of(loaded.scene, rasterizer=named)
-    assert (bound.rasterizer.name, bound.passed_over) == (expected, passed_over)
+    assert (bound.rasterizer.name, bound.skipped_rasterizers) == (expected, skipped_rasterizers)
     found = localize(QUERY, bound, Request("script"))
     assert found.rasterizer == expected
     assert any("GPU" in warning for warning in found.warnings) == warned

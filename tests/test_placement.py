@@ -20,7 +20,7 @@ from service.pose.retrieval.view_placement import (
     find_views,
     floaters,
     search_camera,
-    solidity,
+    shows_single_surface,
 )
 from service.render.cpu import CpuRasterizer
 from service.types import Camera, GaussianScene
@@ -77,13 +77,13 @@ def places(scene: GaussianScene, seed: int = 0) -> tuple[np.ndarray, float, bool
     return positions, found.coverage, found.interior
 
 
-def test_solidity_counts_single_opaque_surfaces() -> None:
+def test_pixels_show_single_opaque_surfaces() -> None:
     ones = np.ones((10, 10), np.float32)
     rgb = np.zeros((10, 10, 3), np.float32)
-    assert solidity(Frame(rgb, ones, 2 * ones, 2 * ones), 0.5) == 1.0
-    assert solidity(Frame(rgb, ones, 2.5 * ones, 2 * ones), 0.5) == 0.0  # something translucent before it
-    assert solidity(Frame(rgb, ones, 0.3 * ones, 0.3 * ones), 0.5) == 0.0  # nose to a floater
-    assert solidity(Frame(rgb, 0.6 * ones, 2 * ones, 2 * ones), 0.5) == 0.0
+    assert shows_single_surface(Frame(rgb, ones, 2 * ones, 2 * ones), 0.5).all()
+    assert not shows_single_surface(Frame(rgb, ones, 2.5 * ones, 2 * ones), 0.5).any()  # behind a translucent one
+    assert not shows_single_surface(Frame(rgb, ones, 0.3 * ones, 0.3 * ones), 0.5).any()  # nose to a floater
+    assert not shows_single_surface(Frame(rgb, 0.6 * ones, 2 * ones, 2 * ones), 0.5).any()
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, (0, 0, 0)), (0.01, (5, -3, 2)), (300.0, (1e4, 0, 0))])

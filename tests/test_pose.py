@@ -21,11 +21,11 @@ from service.pose.features.rendered_views import ViewRenderer, backprojected, to
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.index import built_index, prepared_index
-from service.pose.retrieval.scores import retrieval_scores, top
-from service.pose.retrieval.viewpoints import ViewpointConfig, farthest_points, spread
+from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.viewpoints import ViewpointConfig, choose_spread_poses, farthest_points
 from service.pose.verification.appearance import (
-    Blocks,
-    Pair,
+    BlockStatistics,
+    ImagePair,
     colour_correlation,
     gradient_correlation,
     local_colour_correlation,
@@ -260,7 +260,7 @@ def test_a_vote_finds_the_view_that_shares_features_among_clutter() -> None:
     views = [clustered(rng, 300, 1.0) for _ in range(12)]
     shared, clutter = views[7][:40], clustered(rng, 260, 1.0)
     scores = retrieval_scores(np.concatenate([shared, clutter]), views)
-    assert top(scores, 1)[0] == 7
+    assert top_indices(scores, 1)[0] == 7
     assert scores[7] > 2 * np.sort(scores)[-2]
 
 
@@ -272,7 +272,7 @@ def test_what_many_views_show_doesnt_outvote_what_few_do() -> None:
     for i in range(12):
         views[i] = np.concatenate([chairs, views[i][:50]])
     views[40] = np.concatenate([picture, views[40][:120]])
-    assert top(retrieval_scores(np.concatenate([chairs, picture]), views), 1)[0] == 40
+    assert top_indices(retrieval_scores(np.concatenate([chairs, picture]), views), 1)[0] == 40
 
 
 def test_a_vote_needs_no_features_and_only_one_view() -> None:
@@ -420,10 +420,10 @@ def test_agreement_forgives_exposure_and_a_hidden_corner_but_not_another_place()
     known[:, 210:] = False
 
     def gradients(*images: Any) -> tuple[float, float]:
-        return gradient_correlation(Blocks.of(Pair.of(*images)))
+        return gradient_correlation(BlockStatistics.of(ImagePair.of(*images)))
 
     def colours(*images: Any) -> tuple[float, float]:
-        return colour_correlation(Pair.of(*images))
+        return colour_correlation(ImagePair.of(*images))
 
     for measure in (gradients, colours):
         assert min(measure(to_uint8(frame.rgb), frame)) > 0.99
@@ -443,7 +443,7 @@ def test_a_half_of_one_colour_tells_nothing_against_a_pose() -> None:
     rgb = frame.rgb.copy()
     rgb[:, :250] = 1.0
     bright = Frame(rgb, frame.alpha, frame.depth, frame.median_depth)
-    most, half = colour_correlation(Pair.of(to_uint8(0.97 * rgb), bright))
+    most, half = colour_correlation(ImagePair.of(to_uint8(0.97 * rgb), bright))
     assert half >= most > 0.95
 
 
@@ -464,7 +464,7 @@ def test_local_colours_distinguish_like_things_whatever_the_light_and_with_a_par
         return rgb.astype(np.float32)
 
     def correlation(photo: np.ndarray) -> float:
-        return local_colour_correlation(Blocks.of(Pair.of(to_uint8(photo), frame)))
+        return local_colour_correlation(BlockStatistics.of(ImagePair.of(to_uint8(photo), frame)))
 
     flat = np.ones((320, 384), np.float32)
     frame = Frame(balls(colours), flat, flat, flat)
@@ -480,9 +480,9 @@ def test_local_colours_distinguish_like_things_whatever_the_light_and_with_a_par
     assert correlation(hidden) > 0.95
     exchanged = balls(colours[[1, 2, 0, 3, 4, 5, 6, 7, 8]])
     assert correlation(exchanged) < 0.9
-    assert gradient_correlation(Blocks.of(Pair.of(to_uint8(exchanged), frame)))[0] > 0.9
+    assert gradient_correlation(BlockStatistics.of(ImagePair.of(to_uint8(exchanged), frame)))[0] > 0.9
     assert (
-        local_colour_correlation(Blocks.of(Pair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0
+        local_colour_correlation(BlockStatistics.of(ImagePair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0
     )  # nothing agrees
 
 
@@ -555,11 +555,11 @@ def test_farthest_points_take_extremes_first_and_stop_when_the_rest_is_near() ->
 def test_spread_takes_all_of_few_cameras_and_covers_many() -> None:
     directions = np.random.default_rng(0).normal(size=(300, 3))
     poses = [look_at(4 * d / np.linalg.norm(d), np.zeros(3), UP) for d in directions]
-    assert sorted(spread(poses[:20], 4.0)) == list(range(20))
-    chosen = spread(poses, 4.0)
+    assert sorted(choose_spread_poses(poses[:20], 4.0)) == list(range(20))
+    chosen = choose_spread_poses(poses, 4.0)
     assert 64 <= len(chosen) <= 256
     # What is seen half as far away looks different after half the way.
-    assert len(spread(poses, 2.0)) > len(chosen)
+    assert len(choose_spread_poses(poses, 2.0)) > len(chosen)
     axes = np.stack([pose.axis_in_world for pose in poses])
     nearest = np.degrees(np.arccos(np.clip((axes @ axes[chosen].T).max(1), -1, 1)))
     assert nearest.max() < 16  # 0.35 is 14 degrees on an orbit

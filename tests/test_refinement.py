@@ -14,7 +14,7 @@ from service.pose.refinement.covariance import scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.kernels import linearize, normal_equations
 from service.pose.refinement.photometric import refine_photometric
-from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, luma, occluder_depth
+from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, intensity, occluder_depth
 from service.pose.refinement.pyramid_level import NEUTRAL, PyramidLevel, RefinementState, _tukey_weights
 from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig, UncertaintyConfig
 from service.pose.refinement.uncertainty import pose_uncertainty
@@ -93,9 +93,11 @@ def test_a_photo_is_saturated_from_half_a_percent_on(clipped: int, scaled: bool)
         assert found is frame.rgb
 
 
-def test_luma_is_the_mean_of_the_channels() -> None:
-    assert luma(np.array([[[255, 255, 255], [30, 60, 90]]], np.uint8)) == pytest.approx(np.array([[1.0, 60 / 255]]))
-    assert luma(np.array([[[0.3, 0.6, 0.9]]], np.float32)) == pytest.approx(np.array([[0.6]]))
+def test_intensity_is_the_mean_of_the_channels() -> None:
+    assert intensity(np.array([[[255, 255, 255], [30, 60, 90]]], np.uint8)) == pytest.approx(
+        np.array([[1.0, 60 / 255]])
+    )
+    assert intensity(np.array([[[0.3, 0.6, 0.9]]], np.float32)) == pytest.approx(np.array([[0.6]]))
 
 
 # --- residuals and weights

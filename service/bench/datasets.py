@@ -52,7 +52,7 @@ class DataSet:
     """Given by the layout; None: the scene's."""
 
     @property
-    def held_back(self) -> list[str]:
+    def test_names(self) -> list[str]:
         """Names of the views whose cameras must not be among the scene's."""
         return [name for photo in self.test for name in photo.names]
 

@@ -89,7 +89,7 @@ def run(
         rng = np.random.default_rng(seed)
         others = [other for other in subjects if other is not one]
         cut = [_pixels(photo) for other in others for photo in other.photos[:OCCLUDERS]]
-        cut = cut or [garbage(number) for number in PATTERNED]
+        cut = cut or [unrelated_image(number) for number in PATTERNED]
         for photo in one.photos:
             samples += _of_photo(one, photo, cut, rng)
             done += 1
@@ -173,14 +173,14 @@ def _foreign(one: BenchScene, others: Sequence[BenchScene]) -> Iterator[Sample]:
             query = read_query(data, intrinsics=lens, background_rgb=one.background_rgb)
             yield _localized(one, "foreign", photo.name, query, None)
     for number in range(GARBAGE):
-        picture = garbage(number)
+        picture = unrelated_image(number)
         height, width = picture.shape[:2]
         lens = Intrinsics(width, height, 0.8 * width, 0.8 * width, width / 2, height / 2)
         query = read_query(encode_image(picture, "png"), intrinsics=lens, background_rgb=one.background_rgb)
         yield _localized(one, "garbage", str(number), query, None)
 
 
-def garbage(number: int) -> np.ndarray:
+def unrelated_image(number: int) -> np.ndarray:
     """Return a picture of nothing: one colour, noise, ramp, blotches, chequers, stripes, rectangles, soft noise."""
     rng = np.random.default_rng(number)
     height, width = 480, 640

@@ -186,7 +186,7 @@ def load_bench_scene(
 
 
 def _load_scene(folder: Path, data_set: DataSet, background: str, cameras: bool = True) -> GaussianScene:
-    scene = load_scene(folder, without_photos=data_set.held_back, cameras=cameras, training=data_set.training)
+    scene = load_scene(folder, without_photos=data_set.test_names, cameras=cameras, training=data_set.training)
     rgb = BACKGROUNDS.get(background)
     # The manifest of the scene knows better than the layout of the data set.
     if rgb is None and not (folder.is_dir() and read_manifest(folder).background):

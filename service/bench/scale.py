@@ -56,8 +56,8 @@ def run(
     from service.bench.large_scenes import write_folder  # loads gsply
 
     # As in `bench localize`: no index view may rest on a test photo's pose.
-    held_back = [name for photo in find_photos(folder) for name in photo.names]
-    scene = load_scene(folder, without_photos=held_back)
+    test_names = [name for photo in find_photos(folder) for name in photo.names]
+    scene = load_scene(folder, without_photos=test_names)
     if not scene.cameras:
         raise InvalidRequest("the scene needs training cameras, from which its units and its small sizes are computed.")
     around = [load_scene(other) for other in others]

@@ -44,8 +44,8 @@ def findings() -> Iterator[Finding]:
     """Examine the machine, yielding each finding as it is made: some take seconds."""
     yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
-    chosen, passed_over = choose_rasterizer()
-    yield Finding("renders with", True, f"{chosen} ({passed_over})" if passed_over else chosen)
+    chosen, skipped_rasterizers = choose_rasterizer()
+    yield Finding("renders with", True, f"{chosen} ({skipped_rasterizers})" if skipped_rasterizers else chosen)
     for name in dict.fromkeys((chosen, "cpu")):
         yield _tried(f"renderer {name}", partial(_try_renderer, name))
     yield _tried("matcher", _try_matcher)

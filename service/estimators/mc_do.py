@@ -40,7 +40,7 @@ from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.render_and_match import match_record, render_and_match
 from service.pose.retrieval.viewpoints import index_cameras
 from service.render import RASTERIZERS
-from service.render.counted import Counted
+from service.render.render_counter import Counted
 from service.results import Candidates, IterationRecord
 from service.types import Camera, Pose, Query
 
@@ -56,10 +56,10 @@ class MonteCarloConfig:
     """Range per axis around each of the scene's viewpoints, where there is no prior."""
     scene_range_share: float = 0.05
     """Of translations there: a share of the distance to the scene's centre."""
-    parents: int = 8
+    kept_hypotheses: int = 8
     """Best hypotheses that a resampling round draws around, at the poses that their matches are solved to."""
-    children_share: float = 0.125
-    """Hypotheses of a resampling round, as a share of the first one's; at least as many as parents."""
+    resampled_share: float = 0.125
+    """Hypotheses of a resampling round, as a share of the first one's; at least `kept_hypotheses`."""
     shrink: float = 0.3
     """Factor of the range from one round to the next."""
     enough_support: float = 60.0
@@ -191,11 +191,11 @@ def _sample(
         scored.sort(key=lambda h: -h.support)
         best = scored[: config.shown]
         yield IterationRecord("sample_poses", best[0].pose, candidates=_candidates(best))
-        parents = [h.solved.pose for h in best[: config.parents] if h.solved]
+        parents = [h.solved.pose for h in best[: config.kept_hypotheses] if h.solved]
         if best[0].support > config.enough_support or not parents:
             break
         degrees, share = config.shrink * degrees, config.shrink * share
-        count = max(config.parents, int(config.children_share * options.hypotheses))
+        count = max(config.kept_hypotheses, int(config.resampled_share * options.hypotheses))
     return scored[0].pose
 
 

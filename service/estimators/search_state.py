@@ -28,16 +28,16 @@ from service.pose.refinement.refine_stage import (
 from service.pose.retrieval.ambiguous_hypotheses import (
     AMBIGUITY,
     AmbiguityConfig,
-    Explanation,
+    PoseAtDistance,
     ambiguous_hypotheses,
 )
 from service.pose.retrieval.image_variant import RETRIEVAL, ImageVariant, Retrieval, RetrievalConfig
 from service.pose.retrieval.index import ViewIndex
-from service.pose.retrieval.scores import top
+from service.pose.retrieval.scores import top_indices
 from service.pose.verification.ambiguity import ANSWERS, AnswerConfig, explains_whole_photo, rank_answers
 from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import VERIFICATION, VerificationConfig, verify
-from service.pose.verification.mirror_images import MIRROR, MirrorConfig, may_be_mirrored, unlikeness
+from service.pose.verification.mirror_images import MIRROR, MirrorConfig, dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import Query
 
@@ -236,7 +236,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     rendered, _ = found.view_at_pose(images, mirrored.renderer)
     size = rendered.camera.intrinsics
     signals = appearance(images.resized(size), rendered.frame, images.valid_mask(size))
-    is_mirrored = unlikeness(signals) < unlikeness(best.verdict.signals)
+    is_mirrored = dissimilarity(signals) < dissimilarity(best.verdict.signals)
     yield replace(best.record("check_mirror"), mirrored=is_mirrored)
     return is_mirrored
 
@@ -244,7 +244,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
 def _search_mirrored(state: SearchState, variant: ImageVariant, max_loss: float) -> StageResult:
     """Match the mirrored photo and refine; end early where the first refinement's residual is greater than this."""
     config, retrieval = state.config, state.retrieval
-    views = (retrieval.index.views[i] for i in top(retrieval.scores(variant), config.small_photo_views))
+    views = (retrieval.index.views[i] for i in top_indices(retrieval.scores(variant), config.small_photo_views))
     features = retrieval.features(variant)
     found = yield from match_candidates(features, views, state.images, variant.max_error_px, config.matching)
     if found is None or found.num_inliers < config.min_inliers:
@@ -268,11 +268,11 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
     # Of the opaque pixels: the distance in which two poses count as different.
     distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
     answers = [answer]
-    for other in _ambiguous_hypotheses(state, images, Explanation(answer.refined.pose, distance), whole):
+    for other in _ambiguous_hypotheses(state, images, PoseAtDistance(answer.refined.pose, distance), whole):
         found = yield from _refine_ambiguous(state, other, answer)
         ambiguity = state.config.ambiguity
         if found is None or not all(
-            Explanation(found.pose, distance).differs_from(known.refined.pose, ambiguity) for known in answers
+            PoseAtDistance(found.pose, distance).differs_from(known.refined.pose, ambiguity) for known in answers
         ):
             continue
         verdict = state.verify(found)
@@ -283,7 +283,7 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
 
 
 def _ambiguous_hypotheses(
-    state: SearchState, images: QueryImages, answer: Explanation, whole: bool
+    state: SearchState, images: QueryImages, answer: PoseAtDistance, whole: bool
 ) -> Generator[AbsolutePose, None, None]:
     """Yield poses that many matches agree on which the answer doesn't explain."""
     assert state.best is not None

@@ -43,7 +43,7 @@ from service.pose.matching.render_and_match import render_and_match
 from service.pose.refinement.refine_stage import refine_stage, rematch_and_refine
 from service.pose.retrieval.image_variant import ImageVariant
 from service.pose.retrieval.index import ViewIndex, prepared_index
-from service.pose.retrieval.scores import top
+from service.pose.retrieval.scores import top_indices
 from service.results import Candidates, IterationRecord
 from service.types import Camera, Query
 
@@ -103,16 +103,16 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     name = "retrieve"
     if not state.images.query.focal_sigma:  # estimating the focal length needs many matches
         small = variant.scaled(config.small_photo_factor)
-        views = top(retrieval.scores(small), min(config.small_photo_views, options.candidates))
+        views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
         yield Stage(_search_views(name, small, deque(views), state), small, tentative=True)
         name = "retrieve_full_size"
     # Not before: comparing rotations costs as much as a search.
     variant = retrieval.rotated_variant(variant)
-    views = top(retrieval.scores(variant), options.candidates)
+    views = top_indices(retrieval.scores(variant), options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else name
     yield Stage(_search_views(name, variant, deque(views), state), variant)
     variant = variant.scaled(config.large_photo_factor)
-    ranked = top(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
+    ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
     # A stage ends early where matches or refinement fail; the next goes on with the other views.
     while untried:

@@ -23,7 +23,7 @@ class AlikedLightGlue:
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
         """Return the pairs of indices that LightGlue (Lindenberger et al., ICCV 2023) assigns."""
-        return networks.glued(self._network, a, b)
+        return networks.match_lightglue(self._network, a, b)
 
 
 def create() -> AlikedLightGlue:

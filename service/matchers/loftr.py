@@ -23,7 +23,7 @@ class Loftr:
 
     def match_images(self, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
         """Return the pairs of points that show the same, with their confidence."""
-        return networks.paired(self._network, a, b)
+        return networks.match_loftr(self._network, a, b)
 
 
 def create() -> Loftr:

@@ -108,7 +108,7 @@ def extracted(extract: Extractor, rgb: UInt8[np.ndarray, "h w 3"], limit: int) -
     return Features((points[order] + 0.5).astype(np.float32), scores[order], unit.astype(np.float32))
 
 
-def glued(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
+def match_lightglue(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
     """Pair the features of two images by LightGlue (Lindenberger et al., ICCV 2023).
 
     The network encodes positions relative to the image's size. Here the bounding box of the features takes the
@@ -121,7 +121,7 @@ def glued(network: LightGlue, a: Features, b: Features) -> Int32[np.ndarray, "m 
     return found["matches"][0].numpy().astype(np.int32)
 
 
-def paired(network: LoFTR, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
+def match_loftr(network: LoFTR, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
     """Return the matching points of two images by LoFTR, with their confidence."""
     with torch.inference_mode():
         gray = [_tensor(image).mean(1, keepdim=True) for image in (a, b)]

@@ -25,7 +25,7 @@ class XFeatLighterGlue:
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
         """Return the pairs of indices that LighterGlue assigns."""
-        return networks.glued(self._network, a, b)
+        return networks.match_lightglue(self._network, a, b)
 
 
 @cache

@@ -36,7 +36,7 @@ from service.render.blend import (
     Z,
     exp2,
     gather_batch,
-    touching_lists,
+    record_lists_by_block,
 )
 from service.render.project import LOG2_ALPHA_MIN, TILE
 from service.render.simd import (
@@ -83,7 +83,7 @@ def blend_backward(records, starts, entries, width, height, background, rgb, alp
         while first < last and alive != 0:
             count = min(BATCH, last - first)
             gather_batch(records, entries, first, count, local)
-            touching_lists(local, count, tile_x, tile_y, alive, lists, lengths)
+            record_lists_by_block(local, count, tile_x, tile_y, alive, lists, lengths)
             # Sums of the batch first: its 128 rows stay in the cache while 16 blocks add to them.
             for i in range(count):
                 store(batch_sums, i * 16, splat(0.0))

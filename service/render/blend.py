@@ -86,7 +86,7 @@ def gather_batch(records, entries, first, count, local):
 
 
 @inline
-def touching_lists(local, count, tile_x, tile_y, alive, lists, lengths):
+def record_lists_by_block(local, count, tile_x, tile_y, alive, lists, lengths):
     """List for every block that isn't finished the Gaussians whose alpha reaches 1/255 on its pixel centres.
 
     The quadratic form's minimum over a rectangle lies on the edges that face the Gaussian's centre: on each, the
@@ -149,7 +149,7 @@ def blend(records, starts, entries, width, height, background, end_t, local, lis
         while first < last and alive != 0:
             count = min(BATCH, last - first)
             gather_batch(records, entries, first, count, local)
-            touching_lists(local, count, tile_x, tile_y, alive, lists, lengths)
+            record_lists_by_block(local, count, tile_x, tile_y, alive, lists, lengths)
             first += count
             for block in range(16):
                 if not (alive >> np.uint32(block)) & np.uint32(1) or lengths[block] == 0:

@@ -25,9 +25,9 @@ from jaxtyping import Float32, Float64
 from service.interfaces import Frame, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
 from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, blend
-from service.render.chain import ROW, pose_twist, scene_rows, unpack_rows
 from service.render.pack import LANES, Packed, aligned, fill, pack
 from service.render.project import RECORD, TILE, project
+from service.render.projection_gradients import ROW, pose_twist, scene_rows, unpack_rows
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
 

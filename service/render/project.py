@@ -103,7 +103,7 @@ def _add_basis(sh, at, basis, r, g, b):
 
 
 @inline
-def in_view(sphere, view, fx, fy, low_x, high_x, low_y, high_y, near):
+def in_view(sphere, view, low_x, high_x, low_y, high_y, near):
     """Whether a bounding sphere reaches into the field of view, enlarged to the clamped region."""
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
@@ -182,7 +182,7 @@ def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilatio
     entries = 0
     integers = scratch.view(np.int32)
     for block in range(spheres.shape[0]):
-        if not in_view(spheres[block], view, fx, fy, low_x, high_x, low_y, high_y, near):
+        if not in_view(spheres[block], view, low_x, high_x, low_y, high_y, near):
             continue
         if len(tile_depths) and block_hidden(spheres[block], view, pinhole, near, tiles_x, tiles_y, tile_depths):
             continue

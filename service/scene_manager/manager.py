@@ -251,7 +251,9 @@ class Scenes:
             pending=tuple(awaited),
             failed=tuple(failed),
             rasterizers=tuple(sorted({scene.rasterizer.name for scene in loaded})),
-            skipped_rasterizers=tuple(sorted({scene.passed_over for scene in loaded if scene.passed_over})),
+            skipped_rasterizers=tuple(
+                sorted({scene.skipped_rasterizers for scene in loaded if scene.skipped_rasterizers})
+            ),
         )
 
     # ------------------------------------------------------------------ on the loading thread

@@ -85,13 +85,13 @@ class ViewRenderer:
     latest: RenderedView | None = None
 
     def render(self, camera: Camera) -> RenderedView:
-        """Render."""
+        """Return a new render of the scene at full detail from this camera, and keep it as the latest."""
         self.latest = RenderedView(self.rasterizer.render([camera])[0], camera)
         return self.latest
 
-    def at(self, query: Query, pose: Pose, tolerance_px: float = 1.0, long_side: int | None = None) -> RenderedView:
-        """Return a render with the query's intrinsics at most `tolerance_px` from the pose; `long_side` in pixels."""
-        return self.near(camera_of(query, pose, long_side), tolerance_px)
+    def at(self, query: Query, pose: Pose, tolerance_px: float = 1.0) -> RenderedView:
+        """Return a render with the query's intrinsics, at most `tolerance_px` from what the pose shows."""
+        return self.near(camera_of(query, pose), tolerance_px)
 
     def near(self, camera: Camera, tolerance_px: float = 1.0) -> RenderedView:
         """Return the latest render if it shows the same within the tolerance, else a new one."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from service.jit import inline, kernel, summing
+from service.jit import inline, kernel, kernel_reordered_sums
 
 
 @kernel
@@ -110,7 +110,7 @@ def _project_points(points, t, k, shape, columns, rows):
         rows[i] = v
 
 
-@summing
+@kernel_reordered_sums
 def normal_equations(jacobian, weights, residuals, factors):
     """Return the hessian J W J^T and the right-hand side J W r, where J is the jacobian's rows times their factors."""
     count, n = jacobian.shape

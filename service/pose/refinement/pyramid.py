@@ -19,7 +19,7 @@ def clip_like_photo(
     """Return the render's colours, and where the photo is saturated, with the photo's exposure and clipped at 1.
 
     The exposure is, by channel, the median ratio of blocks that are neither dark nor clipped, at least 1. Without this
-    the photo's luma isn't a function of the render's, where single channels are clipped.
+    the photo's intensity isn't a function of the render's, where single channels are clipped.
     """
     if np.count_nonzero(photo >= config.saturated) < config.saturated_share * photo.size:
         return frame.rgb
@@ -35,7 +35,7 @@ def clip_like_photo(
     return np.minimum(brighter, np.float32(1), out=brighter)
 
 
-def luma(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
+def intensity(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
     """Return the mean of the channels, 0..1."""
     # 3 * 255 for bytes.
     scale = np.float32(1 / 765 if rgb.dtype == np.uint8 else 1 / 3)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from service.interfaces import Frame
 from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
 from service.pose.refinement.kernels import fill_residuals, linearize
-from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, luma, occluder_depth, pyramid
+from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, intensity, occluder_depth, pyramid
 from service.pose.refinement.refinement_config import RefinementConfig
 from service.types import Intrinsics, IntrinsicsCorrection
 
@@ -90,13 +90,13 @@ def linearized_levels(
 
     `with_intrinsics`: the photo's intrinsics will be estimated, too, which takes more pixels.
     """
-    image = luma(photo)
+    image = intensity(photo)
     if valid_mask is not None:
         # Before the pyramid is built, so that pixels that mix with invalid ones are invalid, too.
         image[~valid_mask] = UNKNOWN
     settings = config.pyramid
     photos = pyramid(image, levels, settings.blur_sigma_px)
-    renders = pyramid(luma(clip_like_photo(photo, frame, settings)), levels, settings.blur_sigma_px)
+    renders = pyramid(intensity(clip_like_photo(photo, frame, settings)), levels, settings.blur_sigma_px)
     depths = depth_pyramid(occluder_depth(frame, settings), levels, settings.max_depth_ratio)
     most = config.max_pixels_intrinsics if with_intrinsics else config.max_pixels
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):

@@ -20,7 +20,7 @@ from service.interfaces import Features, Matcher
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.features.rendered_views import View
 from service.pose.matching.correspondences import Correspondences, correspondences
-from service.pose.retrieval.scores import top
+from service.pose.retrieval.scores import top_indices
 from service.types import Intrinsics, Pose
 
 
@@ -53,7 +53,7 @@ AMBIGUITY = AmbiguityConfig()
 
 
 @dataclass(frozen=True, slots=True)
-class Explanation:
+class PoseAtDistance:
     """A pose that explains an image at least in part."""
 
     pose: Pose
@@ -69,7 +69,7 @@ class Explanation:
 def ambiguous_hypotheses(
     image: Features,
     intrinsics: Intrinsics,
-    answer: Explanation,
+    answer: PoseAtDistance,
     views: Sequence[View],
     scores: np.ndarray,
     matcher: Matcher,
@@ -82,7 +82,7 @@ def ambiguous_hypotheses(
     `scores` are the views' retrieval scores; `image` and `max_error_px` are in pixels of the intrinsics.
     """
     # Views near the answer show the same thing, and would only confirm it.
-    elsewhere = (i for i in top(scores, len(scores)) if not _shows_the_same(views[i], answer.pose, config))
+    elsewhere = (i for i in top_indices(scores, len(scores)) if not _shows_the_same(views[i], answer.pose, config))
     chosen = list(islice(elsewhere, config.views))
     if not chosen:
         return

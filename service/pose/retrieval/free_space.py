@@ -59,7 +59,7 @@ class Space:
     """The typical one."""
 
     @property
-    def enough(self) -> float:
+    def wanted_good_views(self) -> float:
         """How many good views are looked for."""
         area = self.filled.sum() * self.cell**2
         return float(
@@ -73,7 +73,7 @@ class Space:
         x, y, z = np.moveaxis(np.where(inside[..., None], index, 0), -1, 0)
         return inside & self.filled[x, y, z]
 
-    def clear(
+    def free_distance(
         self, points: Float64[np.ndarray, "n 3"], directions: Float64[np.ndarray, "n 3"], reach: float
     ) -> Float64[np.ndarray, "n"]:
         """Return the free distance from points of surfaces along directions, at most `reach`, in scene units."""
@@ -86,7 +86,7 @@ class Space:
     def enclosures(self, positions: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n"]:
         """Return for each position the share of all directions that end at a Gaussian within the grid."""
         starts = np.repeat((positions - self.low) / self.cell, SPACE.enclosure_rays, axis=0)
-        directions = np.tile(lattice(SPACE.enclosure_rays), (len(positions), 1))
+        directions = np.tile(fibonacci_directions(SPACE.enclosure_rays), (len(positions), 1))
         most = int(np.linalg.norm(self.filled.shape))
         met = _steps_in_the_clear(self.filled, starts, directions, SPACE.skipped_cells, most) < most
         return met.reshape(-1, SPACE.enclosure_rays).mean(1)
@@ -111,7 +111,7 @@ def _steps_in_the_clear(filled, starts, directions, first, most):
     return steps
 
 
-def survey(scene: GaussianScene) -> Space:
+def free_space_of(scene: GaussianScene) -> Space:
     """Return the space of a scene, from its Gaussians' places and sizes."""
     opaque = np.flatnonzero(scene.opacities > SPACE.min_opacity)
     opaque = opaque if len(opaque) else np.arange(scene.count)
@@ -149,7 +149,7 @@ def survey(scene: GaussianScene) -> Space:
     )
 
 
-def lattice(count: int) -> Float64[np.ndarray, "n 3"]:
+def fibonacci_directions(count: int) -> Float64[np.ndarray, "n 3"]:
     """Return evenly spread directions (a Fibonacci lattice)."""
     i = np.arange(count) + 0.5
     z, angle = 1 - 2 * i / count, np.pi * (1 + np.sqrt(5.0)) * i

@@ -87,7 +87,7 @@ class OccludedRenderer:
         self._proxy = lod_proxy(scene, rasterizer, rng, config) if scene.count > config.min_gaussians else None
 
     def render(self, camera: Camera) -> Frame:
-        """Render approximately."""
+        """Return an approximate render from this camera; of a large scene, without what is occluded."""
         depths = None
         if self._proxy:
             small = Camera(camera.intrinsics.with_long_side(self._config.render_px), camera.pose)

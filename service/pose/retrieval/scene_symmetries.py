@@ -18,8 +18,8 @@ from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.mirrored_query import mirrored_intrinsics
 from service.pose.features.rendered_views import VIEWS, View, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
-from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, Explanation, ambiguous_hypotheses
-from service.pose.retrieval.scores import retrieval_scores, top
+from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
+from service.pose.retrieval.scores import retrieval_scores, top_indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher, conf
     scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
     error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX
     # The view's own pose is the answer that others are compared with.
-    own = Explanation(pose, distance)
+    own = PoseAtDistance(pose, distance)
     found = ambiguous_hypotheses(
         view.features, intrinsics, own, views, scores, matcher, error_px, AMBIGUITY.min_inliers
     )
@@ -97,7 +97,7 @@ def _mirrored_inliers(
     scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
     error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX
     most = 0
-    for i in top(scores, config.mirror_tries):
+    for i in top_indices(scores, config.mirror_tries):
         found = correspondences(features, views[i], matcher)
         pose = estimate_absolute_pose(found.photo_px, found.points_in_world, intrinsics, error_px, config.mirror_trials)
         most = max(most, pose.num_inliers if pose else 0)

@@ -44,6 +44,6 @@ def retrieval_scores(
     return np.maximum(best - usual, 0.0).sum(0, dtype=np.float64)
 
 
-def top(scores: Float64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "k"]:
+def top_indices(scores: Float64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "k"]:
     """Return the indices of the highest scores, best first."""
     return np.argsort(-scores, kind="stable")[:count]

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
-from service.pose.retrieval.free_space import SPACE, Space, lattice, survey
+from service.pose.retrieval.free_space import SPACE, Space, fibonacci_directions, free_space_of
 from service.pose.retrieval.lod_proxy import lod_proxy
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
@@ -45,10 +45,19 @@ class PlacementConfig:
     size_candidates: int = 100
     """First candidates: on each shell, anywhere in the volume, at the distance that Gaussians' sizes suggest."""
     best: int = 50
-    offspring: int = 4
+    candidates_near_each: int = 4
     """The best of them, and how many candidates are drawn near each."""
     min_distance: float = 0.06
     """What is nearer than this share of the typical distance blocks the view."""
+    opaque_alpha: float = 0.9
+    max_depth_spread: float = 0.05
+    """A pixel shows a single surface where its alpha is greater than this, and its mean depth differs from the median
+    one by less than this share."""
+    score_quantile: float = 0.9
+    min_score_share: float = 0.5
+    """A candidate is solid if its share of such pixels is at least `min_score_share` of this quantile of all shares."""
+    voxel_share: float = 0.25
+    """Side of the voxels in which surfaces are recorded, as a share of the typical distance."""
     rounds: int = 24
     round_candidates: int = 150
     """Further rounds, at most, and the candidates of each."""
@@ -61,7 +70,9 @@ class PlacementConfig:
     """The share of them, seen by the fewest good views, that a round aims at."""
     interior_enclosure: float = 0.7
     relative_enclosure: float = 0.6
-    """Where one good view in twenty has this share of all directions closed, the others need this share of that."""
+    enclosure_quantile: float = 0.95
+    """The scene is an interior if this quantile of the solid views' enclosures (shares of closed directions) is at
+    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile."""
     min_views: int = 64
     max_views: int = 1000
     covered_share: float = 0.93
@@ -69,7 +80,7 @@ class PlacementConfig:
     floater_reach: float = 0.05
     floater_neighbours: int = 8
     """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
-    seen_again_worth: float = 0.25
+    repeat_weight: float = 0.25
     """Worth of what another view of the choice shows already, relative to what none shows."""
 
 
@@ -98,23 +109,27 @@ def find_views(
 
     The search is random: `rng` is its only source of randomness.
     """
-    space = survey(scene)
+    space = free_space_of(scene)
     search = lod_proxy(scene, rasterizer, rng)
     views = _Views(space, search, config)
-    views.judge(_shells(space, config) + _in_volume(space, rng, config) + _by_size(space, rng, config.size_candidates))
+    views.add_candidates(
+        _shells(space, config) + _in_volume(space, rng, config) + _by_size(space, rng, config.size_candidates)
+    )
     # Near good candidates others are likely good, too.
     best = np.argsort(-np.array(views.scores), kind="stable")[: config.best]
-    views.judge([_jittered(views.poses[i], space, rng) for i in best for _ in range(config.offspring)])
+    views.add_candidates(
+        [_jittered(views.poses[i], space, rng) for i in best for _ in range(config.candidates_near_each)]
+    )
     good = views.good()
     seen = views.seen(good)
     for _ in range(config.rounds):
-        before, few = _covered(seen), len(good) < space.enough
+        before, few = _covered(seen), len(good) < space.wanted_good_views
         if before > config.sufficient_coverage and not few:
             break
         # Half of the candidates aim at what is seen least, half vary the good views.
         aimed = _by_size(space, rng, config.round_candidates // 2, seen <= np.quantile(seen, config.least_seen_share))
         near = rng.choice(good, config.round_candidates // 2) if len(good) else []
-        views.judge(aimed + [_jittered(views.poses[i], space, rng, config.wide_turn) for i in near])
+        views.add_candidates(aimed + [_jittered(views.poses[i], space, rng, config.wide_turn) for i in near])
         good = views.good()
         seen = views.seen(good)
         if _covered(seen) - before < config.min_gain and not few:
@@ -128,7 +143,7 @@ def find_views(
 
 def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
     """Return the share of the opaque Gaussians that lie on surfaces which the cameras see."""
-    views = _Views(survey(scene), lod_proxy(scene, rasterizer, np.random.default_rng(0)), PLACEMENT)
+    views = _Views(free_space_of(scene), lod_proxy(scene, rasterizer, np.random.default_rng(0)), PLACEMENT)
     views.add([Camera(camera.intrinsics.with_long_side(PLACEMENT.render_px), camera.pose) for camera in cameras])
     return _covered(views.seen(np.arange(len(cameras))))
 
@@ -140,7 +155,7 @@ def _covered(seen: Int64[np.ndarray, "n"]) -> float:
 
 def floaters(scene: GaussianScene) -> float:
     """Return the share of the opaque Gaussians that have hardly any others around: no surface, but haze."""
-    space = survey(scene)
+    space = free_space_of(scene)
     size = PLACEMENT.floater_reach * space.distance
     cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
     ids = _ids(cells)
@@ -156,14 +171,14 @@ def floaters(scene: GaussianScene) -> float:
     return float(counts[alone].sum() / counts.sum())
 
 
-def solidity(frame: Frame, min_distance: float) -> float:
-    """Return the share of the image that shows one opaque surface, not nearer than `min_distance`."""
-    return float(_solid(frame, min_distance).mean())
-
-
-def _solid(frame: Frame, min_distance: float) -> Bool[np.ndarray, "h w"]:
+def shows_single_surface(
+    frame: Frame, min_distance: float, config: PlacementConfig = PLACEMENT
+) -> Bool[np.ndarray, "h w"]:
+    """Return which pixels show one opaque surface, not nearer than `min_distance`."""
+    # Where several surfaces contribute, the mean depth differs from the median one.
     apart = np.abs(frame.depth - frame.median_depth)
-    return (frame.alpha > 0.9) & (frame.median_depth > min_distance) & (apart < 0.05 * frame.median_depth)
+    opaque = frame.alpha > config.opaque_alpha
+    return opaque & (frame.median_depth > min_distance) & (apart < config.max_depth_spread * frame.median_depth)
 
 
 def search_camera(long_side: int, fov_deg: float = PLACEMENT.fov_deg) -> Intrinsics:
@@ -186,11 +201,11 @@ class _Views:
         self._surface_ids: list[Int64[np.ndarray, "_"]] = []
         """Of the voxels that each sees."""
         self._space, self._rasterizer, self._config = space, rasterizer, config
-        self._voxel = 0.25 * space.distance
+        self._voxel = config.voxel_share * space.distance
         points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
         self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
 
-    def judge(self, poses: Sequence[Pose]) -> None:
+    def add_candidates(self, poses: Sequence[Pose]) -> None:
         """Render the candidates small, except those among Gaussians and those known to be outside."""
         positions = np.stack([pose.position_in_world for pose in poses])
         enclosures = self._space.enclosures(positions)
@@ -209,7 +224,7 @@ class _Views:
         for camera, frame in zip(cameras, self._rasterizer.render(cameras, approximate=True), strict=True):
             height, width = frame.alpha.shape
             row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
-            solid = _solid(frame, nearest)
+            solid = shows_single_surface(frame, nearest, self._config)
             kept = solid[row, column]
             px = np.stack([column[kept], row[kept]], 1) + 0.5
             points = unproject(px, frame.median_depth[row, column][kept], camera.intrinsics)
@@ -222,9 +237,10 @@ class _Views:
     def good(self) -> Int64[np.ndarray, "k"]:
         """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior."""
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
-        solid = np.flatnonzero((scores >= 0.5 * np.quantile(scores, 0.9)) & (scores > 0))
+        least = self._config.min_score_share * np.quantile(scores, self._config.score_quantile)
+        solid = np.flatnonzero((scores >= least) & (scores > 0))
         # Not the maximum: a single view may stand in a closet.
-        limit = float(np.quantile(enclosures[solid], 0.95)) if len(solid) else 0.0
+        limit = float(np.quantile(enclosures[solid], self._config.enclosure_quantile)) if len(solid) else 0.0
         self._least_enclosed = (
             self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
         )
@@ -279,7 +295,7 @@ def _choice(cells: Sequence[Int64[np.ndarray, "_"]], config: PlacementConfig) ->
         taken = int(np.argmax(gains))
         new = np.unique(table[taken])
         seen += float(left[new][left[new] == worth[new]].sum())
-        left[new] *= config.seen_again_worth
+        left[new] *= config.repeat_weight
         chosen.append(taken)
     return np.array(chosen, int)
 
@@ -287,7 +303,7 @@ def _choice(cells: Sequence[Int64[np.ndarray, "_"]], config: PlacementConfig) ->
 def _shells(space: Space, config: PlacementConfig) -> list[Pose]:
     """Return poses all around the middle that look at it."""
     middle, radius = space.middle, space.radius
-    directions = lattice(config.shell_candidates)
+    directions = fibonacci_directions(config.shell_candidates)
     return [
         look_at(middle + factor * radius * d, middle, space.up) for factor in config.shell_radii for d in directions
     ]
@@ -318,7 +334,7 @@ def _by_size(
     targets = space.points[taken]
     distances = space.distances[taken] * np.exp(rng.uniform(np.log(0.4), np.log(1.6), count))
     # Not behind the next wall, as seen from the target.
-    distances = np.minimum(distances, 0.9 * space.clear(targets, -directions, float(distances.max())))
+    distances = np.minimum(distances, 0.9 * space.free_distance(targets, -directions, float(distances.max())))
     return _looking(targets - distances[:, None] * directions, targets, space.up)
 
 

@@ -24,7 +24,8 @@ class ViewpointConfig:
     min_views: int = 64
     max_views: int = 512
     spacing: float = 0.35
-    """A wide scene gets more than `min_views`, until each training camera has one within this distance (`spread`)."""
+    """A wide scene gets more than `min_views`, until each training camera has one within this distance
+    (`choose_spread_poses`)."""
     depth_cameras: int = 24
     """Training cameras, about, from whose renders the typical depth is taken."""
     placement: PlacementConfig = PLACEMENT
@@ -48,11 +49,13 @@ def index_cameras(
     # Rendering all of many cameras would take longer than the index itself.
     depths = [centre_depth(rasterizer, camera) for camera in cameras[:: -(-len(cameras) // config.depth_cameras)]]
     seen = [depth for depth in depths if depth > 0]
-    chosen = spread([camera.pose for camera in cameras], float(np.median(seen)) if seen else 1.0, config)
+    chosen = choose_spread_poses([camera.pose for camera in cameras], float(np.median(seen)) if seen else 1.0, config)
     return [Camera(sized(cameras[i].intrinsics, config.render_px), cameras[i].pose) for i in chosen]
 
 
-def spread(poses: Sequence[Pose], depth: float, config: ViewpointConfig = VIEWPOINTS) -> Int64[np.ndarray, "k"]:
+def choose_spread_poses(
+    poses: Sequence[Pose], depth: float, config: ViewpointConfig = VIEWPOINTS
+) -> Int64[np.ndarray, "k"]:
     """Return a choice of the poses, by farthest-point sampling over position and viewing direction.
 
     Distances are |difference of positions| / `depth` (the typical one of what is seen) and the chord between the axes,

@@ -69,7 +69,7 @@ APPEARANCE = AppearanceConfig()
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
+class ImagePair:
     """A photo and a render of the same size, resampled."""
 
     photo: UInt8[np.ndarray, "h w 3"]
@@ -80,7 +80,9 @@ class Pair:
     """Whether all of the photo is valid."""
 
     @classmethod
-    def of(cls, photo: UInt8[np.ndarray, "h w 3"], frame: Frame, valid: Bool[np.ndarray, "h w"] | None = None) -> Pair:
+    def of(
+        cls, photo: UInt8[np.ndarray, "h w 3"], frame: Frame, valid: Bool[np.ndarray, "h w"] | None = None
+    ) -> ImagePair:
         """Resample a photo and a render of the same size; `valid` are the photo's valid pixels, None: all."""
         height, width = frame.alpha.shape
         factor = APPEARANCE.long_side_px / max(height, width)
@@ -92,7 +94,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Blocks:
+class BlockStatistics:
     """A pair, block by block."""
 
     correlation: Float64[np.ndarray, "n"]
@@ -108,7 +110,7 @@ class Blocks:
     """Whether the whole block is, and enough of it is not saturated."""
 
     @classmethod
-    def of(cls, pair: Pair) -> Blocks:
+    def of(cls, pair: ImagePair) -> BlockStatistics:
         """Compare where the scene is opaque and the photo is valid."""
         opaque = pair.opaque > APPEARANCE.min_alpha
         if not pair.whole:  # gradients along the mask's edge are the mask's
@@ -134,13 +136,13 @@ def appearance(
     photo: UInt8[np.ndarray, "h w 3"], frame: Frame, valid: Bool[np.ndarray, "h w"] | None = None
 ) -> dict[str, float]:
     """Return the signals of how alike photo and frame look, by name; `valid` are the photo's valid pixels."""
-    pair = Pair.of(photo, frame, valid)
-    blocks = Blocks.of(pair)
+    pair = ImagePair.of(photo, frame, valid)
+    blocks = BlockStatistics.of(pair)
     agreements = gradient_correlation(blocks) + colour_correlation(pair)
     return dict(zip(GLOBAL_SIGNALS, agreements, strict=True)) | {LOCAL_COLOUR: local_colour_correlation(blocks)}
 
 
-def gradient_correlation(blocks: Blocks) -> tuple[float, float]:
+def gradient_correlation(blocks: BlockStatistics) -> tuple[float, float]:
     """Return the correlation of the gradients, -1..1: over the best three quarters, and over the best half.
 
     Blocks weigh by the render's squared gradients; shares are of that weight. A passer-by lowers the correlation of a
@@ -158,7 +160,7 @@ def gradient_correlation(blocks: Blocks) -> tuple[float, float]:
     return best(APPEARANCE.hidden_share), best(APPEARANCE.half_share)
 
 
-def local_colour_correlation(blocks: Blocks) -> float:
+def local_colour_correlation(blocks: BlockStatistics) -> float:
     """Return the correlation of the colours of all blocks whose gradients agree, 0..1; 1 where those are too few.
 
     The photo's channels are fitted by the render's channel, its luma (both factors non-negative) and an offset, so that
@@ -201,7 +203,7 @@ def visible_alpha(frame: Frame, valid: Bool[np.ndarray, "h w"] | None) -> Float3
     return frame.alpha if valid is None else frame.alpha * valid
 
 
-def colour_correlation(pair: Pair) -> tuple[float, float]:
+def colour_correlation(pair: ImagePair) -> tuple[float, float]:
     """Return the correlation of the colours of single pixels, -1..1, where scene and photo are known.
 
     Each channel has its own gain and offset (exposure, white balance); the quarter of the pixels that fits them worst

@@ -85,19 +85,19 @@ def verify(
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification.
     if supporting_matches is not None and photometric_suffices(signals, config):
-        verdict = judge(signals, uncertainty, query.focal_sigma, config=config)
+        verdict = verdict_of(signals, uncertainty, query.focal_sigma, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
     few = len(features.scores) < config.min_features
     # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
-        return judge(signals | NO_MATCHES, uncertainty, query.focal_sigma, few, config)
+        return verdict_of(signals | NO_MATCHES, uncertainty, query.focal_sigma, few, config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), config.min_valid_share)
-    return _within_prior(judge(signals, uncertainty, query.focal_sigma, few, config), images, pose)
+    return _within_prior(verdict_of(signals, uncertainty, query.focal_sigma, few, config), images, pose)
 
 
 def _photometric_signals(
@@ -141,7 +141,7 @@ def downgraded(verdict: Verdict, reason: Reason, score: float = VERIFICATION.dou
     return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
 
 
-def judge(
+def verdict_of(
     signals: Mapping[str, float],
     uncertainty: PoseUncertainty | None,
     focal_sigma: float,

@@ -33,6 +33,6 @@ def may_be_mirrored(signals: Mapping[str, float], config: MirrorConfig = MIRROR)
     return signals["gradients"] <= config.beyond_doubt
 
 
-def unlikeness(signals: Mapping[str, float]) -> float:
+def dissimilarity(signals: Mapping[str, float]) -> float:
     """Return how unlike photo and render are by their appearance signals, 0 (alike) and more."""
     return sum(1.0 - signals[name] for name in (*GLOBAL_SIGNALS, LOCAL_COLOUR))
