@@ -92,16 +92,7 @@ class Coverage:
 def measured(copy: Copy, workers: int, file: Path) -> None:
     """Run all tests once and write which of them run which line."""
     file.unlink(missing_ok=True)
-    command = [
-        "-n",
-        str(workers),
-        "--dist",
-        "loadfile",
-        "--cov=service",
-        "--cov=viewer",
-        "--cov-context=test",
-        "--cov-report=",
-    ]
+    command = ["-n", str(workers), "--dist=loadfile", "--cov", "--cov-context=test", "--cov-report="]
     done = copy.pytest(command, 3600, COVERAGE_FILE=str(file.absolute()))
     if done.returncode != 0:
         print(f"some tests fail before anything is changed:\n{done.stdout[-3000:]}", file=sys.stderr)
@@ -182,7 +173,7 @@ class Copy:
         done = self.pytest(["-x", f"@{listed}"], limit_s)
         if done.returncode in (0, 5):  # 5: there was no test
             return None
-        failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.M)
+        failed = re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - .*)?$", done.stdout, re.M)
         return LIMIT if done.returncode == -1 else failed[1] if failed else f"exit code {done.returncode}"
 
 
