@@ -1,4 +1,4 @@
-"""Everything that can go wrong and is worth telling a caller about.
+"""All errors that are reported to callers.
 
     SplatfixError
       |-- BadInput           the caller's mistake
@@ -41,7 +41,7 @@ class SplatfixError(Exception):
         self.hint = hint
         """What the caller can do; empty if the message says it."""
         self.retry_after_s = retry_after_s
-        """When it is worth another try, if that is known."""
+        """Seconds until a retry may succeed; None: unknown."""
 
     def __str__(self) -> str:
         text = f"{self.where}: {self.message}" if self.where else self.message

@@ -42,13 +42,13 @@ class SceneGradients:
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """Renders ONE scene: upload and packing have a home. Safe to call from several threads."""
+    """Renders one scene, which it keeps uploaded or packed. Safe to call from several threads."""
 
     name: str
 
     @property
     def nbytes(self) -> int:
-        """What it keeps of the scene in memory."""
+        """Bytes of memory held."""
         ...
 
     def of(self, scene: GaussianScene) -> Rasterizer:

@@ -57,7 +57,7 @@ class LoadedScene:
     """The gate's, too; beside an `image_matcher` it is the default one."""
     image_matcher: ImageMatcher | None = None
     cache_dir: Path | None = None
-    """Where prepared things (view indexes) are kept between runs; None: nowhere."""
+    """Folder in which view indexes and mapped scenes are kept between runs; None: nowhere."""
     skipped_rasterizers: str = ""
     """Why the rasterizer isn't an earlier one of RASTERIZER_ORDER."""
     warnings: tuple[str, ...] = ()

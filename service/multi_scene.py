@@ -20,7 +20,7 @@ from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request, localize
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages
-from service.pose.matching.correspondences import correspondences
+from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import retrieval_scores, top_indices
 from service.results import IterationRecord, PoseEstimate, StageTiming, Status
@@ -33,7 +33,7 @@ class SceneRankingConfig:
 
     views: int = 3
     """Of each scene, that the photo is matched with."""
-    max_error_px: float = 4.0
+    max_error_px: float = MATCH_ERROR_PX
     approximate_max_error_px: float = 12.0
     """Reprojection error of an inlier at PHOTO_PX; the second with an approximate focal length."""
     trials: int = 300
@@ -66,8 +66,8 @@ def localize_in_scenes(
 ) -> SceneEstimate:
     """Find the scene that a photo shows, and the pose in it; otherwise as `localize`.
 
-    The records of the scene that is returned are reported once it is certain. The budget is one for all scenes; those
-    for which it doesn't suffice are not searched.
+    The records of the scene that is returned are reported once it is certain. The budget in seconds is one for all
+    scenes, and those for which it doesn't suffice are not searched; a budget in renders holds for each scene.
     """
     request = request or Request()
     wall, cpu = time.perf_counter(), time.thread_time()

@@ -156,8 +156,9 @@ class Verdict:
     status: Status
     reason: Reason
     score: float
-    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance), calibrated, the same for
-    every estimator; at most 0.5 where the intrinsics or the position are in doubt. At least 0.8 is `localized`."""
+    """Probability, 0..1, that the pose is right, if right and wrong poses were equally frequent: within 5 degrees and
+    1/80 of the training cameras' median distance from the scene's focus. The same model for every estimator; at most
+    0.5 where the intrinsics or the position are in doubt. At least 0.8 is `localized`."""
     inliers: int
     """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
     photo of a sequence that its alignment alone makes clear."""

@@ -20,7 +20,7 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
     """Return a C-contiguous read-only array; copies only if it must to leave the caller's array writable."""
     result = np.ascontiguousarray(array, dtype=dtype)
     if result is array and array.flags.writeable:
-        # Freezing the caller's own array would be a surprise.
+        # The caller may still write to its own array, so a copy is frozen.
         result = array.copy()
     result.flags.writeable = False
     return result

@@ -77,6 +77,23 @@ def test_the_model_of_a_single_scene_is_tested_on_photos_that_were_left_out(tmp_
     assert set(read.below_floor(wrong)) == set(SHIPPED_MODEL.scales)
 
 
+def test_floors_set_by_hand_survive_a_fit(tmp_path: Path) -> None:
+    """A level of 0.8 and more would give each signal a floor near 0.8; the shipped one of local colour is higher."""
+    samples = scene_samples("a", 4, np.random.default_rng(4))
+    model = fit_model(samples, SHIPPED_MODEL, {})
+    by_hand, fitted_freely = "local_colour_correlation", "colours"
+    assert model.floors[by_hand] == SHIPPED_MODEL.floors[by_hand] == 0.935
+    assert model.floors[fitted_freely] != SHIPPED_MODEL.floors[fitted_freely]
+    # Without the mark the fit determines this floor, too.
+    unmarked = fit_model(samples, replace(SHIPPED_MODEL, set_by_hand={}), {})
+    assert unmarked.floors[by_hand] < 0.92
+    # The file keeps the mark, and so does a fit from it.
+    write_model(model, tmp_path / "model.json")
+    read = load_model(tmp_path / "model.json")
+    assert fit_model(samples, read, {}).floors == read.floors == model.floors
+    assert "mistake a thing for a similar one" in read.set_by_hand[by_hand].reason
+
+
 def test_a_photo_that_always_fails_moves_only_its_own_fold() -> None:
     """Were the test on the samples of the fit, the odd photo's right poses would lower the floors and pass."""
     rng = np.random.default_rng(3)

@@ -3,7 +3,7 @@
 Right poses are the estimator's answers to test photos, as they are and spoilt within reason, that lie within the
 bound. Wrong ones are made by stress:
 
-    foreign     photos of the other scenes, localized in this one      garbage   patterns, noise and text, localized
+    foreign     photos of the other scenes, localized in this one      garbage   patterns and noise, localized
     mirrored    the test photos, left and right exchanged, localized   beyond    spoilt beyond reason, localized
     moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are (by 0.002 to 0.012 units and up
                 to 0.12 degrees they are right: samples of what less exact methods answer: near)
@@ -28,6 +28,7 @@ from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.gate_fit import Sample, fit_model, summary
 from service.bench.localize import BenchScene, load_bench_scene
 from service.bench.pose_metrics import COARSE, errors, nees
+from service.estimators.search_state import SEARCH
 from service.estimators.view_index import Options
 from service.geometry import moved
 from service.localize import Request, localize, render_and_verify
@@ -35,7 +36,6 @@ from service.photos.images import encode_image, read_query, resized
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
-from service.pose.matching.match_stages import MATCHING
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.verification.gate import verify
 from service.pose.verification.gate_model import SHIPPED_MODEL, model_to_json
@@ -222,7 +222,7 @@ def _localized(one: BenchScene, kind: str, photo: str, query: Query, truth: Pose
     images = QueryImages(query, one.loaded.matcher)
     signals = render_and_verify(images, estimate.pose, one.loaded.rasterizer).signals
     verdict = replace(estimate.verdict, signals=signals)
-    sufficient = MATCHING.sufficient_inliers
+    sufficient = SEARCH.photometric_min_inliers
     matched = any(r.stage == "refine" and (r.num_inliers or 0) >= sufficient for r in estimate.records)
     return replace(_sample(one, kind, photo, truth, estimate.pose, verdict, weighed), matched=matched)
 

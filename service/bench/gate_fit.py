@@ -25,7 +25,7 @@ class FitConfig:
     penalty: float = 0.02
     """On the squared weights, for a hundred samples: keeps few samples from giving certainty."""
     below_floor: float = 0.003
-    """Share of right poses, for each signal: at most 3 % may be refused, and there are nine floors."""
+    """Share of the right poses that are below a signal's floor: with nine or ten floors at most 3 % in all."""
     bins: int = 10
     """Of the reliability diagram."""
     photo_folds: int = 4
@@ -86,8 +86,9 @@ def _folds(samples: Sequence[Sample]) -> Int64[np.ndarray, "n"]:
 
 
 def fit_model(samples: Sequence[Sample], shape: GateModel, data: Mapping[str, Any]) -> GateModel:
-    """Return a model fitted on all samples; `shape` has the scales and the signals of each part.
+    """Return a model fitted on all samples; `shape` has the scales, the signals of each part, and floors set by hand.
 
+    Those floors are kept: the samples have too few of the poses that they exclude.
     `data` describes what the samples come from; the counts of poses are added to it.
     """
     samples = [sample for sample in samples if sample.tracked is None]
@@ -100,8 +101,10 @@ def fit_model(samples: Sequence[Sample], shape: GateModel, data: Mapping[str, An
         parts[name] = Logistic(bias, dict(zip(part.weights, rest, strict=True)))
         lowest = floors(features[table.usual])[1:]
         ends |= {n: round(shape.scales[n].value_at(f), 3) for n, f in zip(part.weights, lowest, strict=True)}
+    ends |= {name: entry.floor for name, entry in shape.set_by_hand.items()}
     counts = {"poses": len(samples), "right": int(table.right.sum()), "doubted": int(table.doubted.sum())}
-    return GateModel(shape.scales, parts["with_matches"], parts["photometric"], ends, {**data, **counts})
+    fitted_on = {**data, **counts}
+    return GateModel(shape.scales, parts["with_matches"], parts["photometric"], ends, shape.set_by_hand, fitted_on)
 
 
 def summary(samples: Sequence[Sample], shape: GateModel) -> dict[str, Any]:

@@ -44,7 +44,7 @@ class IcommaConfig:
     """Constants of the published method's code."""
 
     match_weight: float = 0.8
-    """Of L_match; the photometric loss has the rest."""
+    """Weight of L_match; the photometric loss has the rest."""
     match_until: float = 0.001
     """L_match below which matching is switched off for good."""
     min_matches: int = 5
@@ -66,7 +66,7 @@ class Options:
     loss: str = "l2"
     """l1, l2, relative, feature, corner or blur."""
     long_side_px: int = RENDER_PX
-    """Of the renders."""
+    """Long side of the renders, in pixels."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
 

@@ -52,7 +52,7 @@ class Options:
     loss: str = "l2"
     """l1, l2, relative, feature, corner or blur."""
     long_side_px: int = RENDER_PX
-    """Of the renders."""
+    """Long side of the renders, in pixels."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
 

@@ -1,4 +1,4 @@
-"""What the default estimator's search knows, and its checks: verification, mirror image, ambiguity.
+"""The state of the default estimator's search, and its checks: verification, mirror image, ambiguity.
 
 `run_stage` runs a stage of the search and verifies its result; `check_mirror` and `check_ambiguity` look for reasons to
 doubt an answer that was found.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
-from service.pose.features.rendered_views import ViewRenderer
+from service.pose.features.rendered_views import VIEWS, ViewRenderer
 from service.pose.matching.match_stages import MATCHING, MatchingConfig, match_candidates
 from service.pose.refinement.refine_stage import (
     REFINE_STAGE,
@@ -41,7 +42,7 @@ from service.pose.verification.mirror_images import MIRROR, MirrorConfig, dissim
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import Query
 
-StageResult = Generator[IterationRecord, None, RefinedPose | None]
+Result = TypeVar("Result")
 CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_INCONSISTENT)
 """Doubts about a pose at which photo and render agree: another search would find the same."""
 
@@ -58,12 +59,13 @@ class SearchConfig:
     answers: AnswerConfig = ANSWERS
     mirror: MirrorConfig = MIRROR
     small_photo_factor: float = 0.77
-    """Size of the photo in the first search, relative to the second: a whole, sharp photo is found in half the time.
+    """Size of the photo in the stage `retrieve`, relative to `retrieve_full_size`: a whole, sharp photo is found in half
+    the time.
     Each of the 58 clean test photos has 75 or more matches that agree with its likeliest view, foreign ones 12."""
     small_photo_views: int = 2
     """Views that the small photo is matched with."""
     large_photo_factor: float = 1.25
-    """Size of the photo in the further searches, relative to the second one."""
+    """Size of the photo in the stage `retrieve_more_views`, relative to `retrieve_full_size`."""
     further_views_divisor: int = 16
     """One view in so many is matched before the search is given up: in a building the likeliest five may be wrong."""
     min_inliers: int = 12
@@ -73,7 +75,7 @@ class SearchConfig:
     0.05."""
     rematch_below_inliers: int = 80
     """With fewer inliers a pose is matched with a render before it is refined."""
-    photometric_min_inliers: float = 60
+    photometric_min_inliers: float = MATCHING.sufficient_inliers
     """Inliers with a view from which on the pixels alone may decide the verification."""
     max_prior_loss: float = 0.1
     """Mean residual (0..1) of a refinement from a prior pose that led nowhere; right ones have 0.005 to 0.06."""
@@ -86,7 +88,7 @@ class SearchConfig:
     min_sample_inliers: int = 12
     """Inliers of a sampled pose from which on it is rendered in full size."""
     ambiguity_photo_px: int = 256
-    """Long side of the photo in which an answer that was expected by a prior is looked for elsewhere."""
+    """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
     max_ambiguous_loss_ratio: float = 3.0
     """Times the answer's mean residual, after one refinement: beyond it an ambiguous hypothesis is none."""
 
@@ -95,16 +97,29 @@ SEARCH = SearchConfig()
 
 
 @dataclass(frozen=True, slots=True)
+class StageOutcome:
+    """What a stage led to."""
+
+    refined: RefinedPose | None
+    """None: too few matches agreed, or refinement failed."""
+    recognised: bool = False
+    """Whether a render at some pose had more matches with the photo than chance: photos of other scenes never do."""
+
+
+StageResult = Generator[IterationRecord, None, StageOutcome]
+
+
+@dataclass(frozen=True, slots=True)
 class Stage:
-    """One stage of a search: its records, which return the pose that it led to."""
+    """One stage of a search: its records, and how its outcome is verified."""
 
     records: StageResult
     variant: ImageVariant
-    """In which the photo is compared."""
+    """Size and rotation in which the photo is compared."""
     tentative: bool = False
     """Whether a doubt about the answer is no reason to end the search."""
     expected: bool = False
-    """Whether the answer was expected where it is: then the pixels alone may decide."""
+    """Whether the pose is refined from a prior: then the pixels alone may decide."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +129,7 @@ class VerifiedPose:
     refined: RefinedPose
     verdict: Verdict
     variant: ImageVariant
-    """In which the photo was compared when it was found."""
+    """Size and rotation in which the photo was compared when the pose was found."""
 
     @property
     def loss(self) -> float:
@@ -129,7 +144,7 @@ class VerifiedPose:
 
 @dataclass(slots=True)
 class SearchState:
-    """What a search works with, and what it has led to."""
+    """The tools and images of one search, and its results so far."""
 
     tools: Tools[ViewIndex]
     images: QueryImages
@@ -137,11 +152,11 @@ class SearchState:
     retrieval: Retrieval
     config: SearchConfig = field(default_factory=SearchConfig)
     best: VerifiedPose | None = None
-    """The answer with the highest score so far."""
-    accepted: bool = False
-    """Whether the last stage's answer ends the search."""
+    """The pose with the highest score so far, which is the answer."""
+    finished: bool = False
+    """Whether the latest stage ends the search: its pose is accepted, or a further search wouldn't remove the doubt."""
     recognised: bool = False
-    """Whether a render at some pose had more matches with the photo than chance: photos of other scenes never do."""
+    """Whether any stage so far recognised something (`StageOutcome`)."""
 
     @classmethod
     def of(cls, query: Query, tools: Tools[ViewIndex], config: SearchConfig) -> SearchState:
@@ -151,22 +166,19 @@ class SearchState:
         retrieval = Retrieval(images, tools.prepared, config.retrieval)
         return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
 
-    def verify(self, found: RefinedPose, supporting_matches: int | None = None) -> Verdict:
+    def verify(self, found: RefinedPose, pixels_may_decide: bool = False) -> Verdict:
         """Return the gate's verdict on a pose, from the render that refinement ended with if it is near enough."""
         images = self.images.corrected(found.correction)
         rendered, refinement = found.view_at_pose(images, self.renderer)
-        return verify(images, found.pose, rendered, refinement, supporting_matches, self.config.verification)
+        # A pose refined from a prior has no matches behind it.
+        matches = found.num_inliers or 0
+        return verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, self.config.verification)
 
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""
         if self.best is None:
             return record
         return replace(record, pose=self.best.refined.pose, correction=self.best.refined.correction)
-
-    def noted(self, record: IterationRecord) -> IterationRecord:
-        """Return the record with the best answer so far; note whether a render had enough matches with the photo."""
-        self.recognised |= record.stage == "rematch"
-        return self.with_answer(record)
 
     def answer(self) -> Answer | None:
         """Return the best answer; None: no stage led to one."""
@@ -181,25 +193,27 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     Where the answer was expected, or many matches with a view led to it, the pixels alone may decide; not with an
     estimated focal length, which makes pixels agree at wrong poses, too.
     """
-    found = yield from _changed(stage.records, state.noted)
+    outcome = yield from _changed(stage.records, state.with_answer)
+    state.recognised |= outcome.recognised
+    found = outcome.refined
     if found is None:
         return
-    # A pose refined from a prior has no matches behind it.
-    agreeing = found.num_inliers or 0
-    focal_sigma = state.images.query.focal_sigma
-    supported = stage.expected or (agreeing >= state.config.photometric_min_inliers and not focal_sigma)
-    verdict = state.verify(found, agreeing if supported else None)
+    many = (found.num_inliers or 0) >= state.config.photometric_min_inliers
+    pixels_may_decide = stage.expected or (many and not state.images.query.focal_sigma)
+    verdict = state.verify(found, pixels_may_decide)
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
     # Of a small copy a doubt may vanish in the full size.
     conclusive = verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative
-    state.accepted = verdict.status is Status.LOCALIZED or conclusive
+    state.finished = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))
 
 
-def _changed(records: StageResult, change: Callable[[IterationRecord], IterationRecord]) -> StageResult:
-    """Yield what a function makes of each record; return what the stage returns."""
+def _changed(
+    records: Generator[IterationRecord, None, Result], change: Callable[[IterationRecord], IterationRecord]
+) -> Generator[IterationRecord, None, Result]:
+    """Yield each record as a function changes it; return what the generator returns."""
     while True:
         try:
             record = next(records)
@@ -230,7 +244,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     if found is None:
         return False
     # Both may be wrong: a poor answer is no evidence for the mirror image.
-    if not state.accepted and mirrored.verify(found).status is not Status.LOCALIZED:
+    if not state.finished and mirrored.verify(found).status is not Status.LOCALIZED:
         return False
     images = mirrored.images.corrected(found.correction)
     rendered, _ = found.view_at_pose(images, mirrored.renderer)
@@ -241,7 +255,9 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     return is_mirrored
 
 
-def _search_mirrored(state: SearchState, variant: ImageVariant, max_loss: float) -> StageResult:
+def _search_mirrored(
+    state: SearchState, variant: ImageVariant, max_loss: float
+) -> Generator[IterationRecord, None, RefinedPose | None]:
     """Match the mirrored photo and refine; end early where the first refinement's residual is greater than this."""
     config, retrieval = state.config, state.retrieval
     views = (retrieval.index.views[i] for i in top_indices(retrieval.scores(variant), config.small_photo_views))
@@ -265,8 +281,8 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
         return
     images = state.images.corrected(answer.refined.correction)
     frame = state.renderer.at(images.query, answer.refined.pose).frame
-    # Of the opaque pixels: the distance in which two poses count as different.
-    distance = float(np.median(frame.median_depth[frame.alpha > 0.5]))
+    # The distance that decides whether two poses count as different; the background has none.
+    distance = float(np.median(frame.median_depth[frame.alpha > VIEWS.min_alpha]))
     answers = [answer]
     for other in _ambiguous_hypotheses(state, images, PoseAtDistance(answer.refined.pose, distance), whole):
         found = yield from _refine_ambiguous(state, other, answer)
@@ -301,7 +317,9 @@ def _ambiguous_hypotheses(
     )
 
 
-def _refine_ambiguous(state: SearchState, other: AbsolutePose, answer: VerifiedPose) -> StageResult:
+def _refine_ambiguous(
+    state: SearchState, other: AbsolutePose, answer: VerifiedPose
+) -> Generator[IterationRecord, None, RefinedPose | None]:
     """Refine an ambiguous hypothesis, unless its residual on a first render is much greater than the answer's."""
     config = state.config
     # The same camera took the photo, wherever it stood.
@@ -310,7 +328,7 @@ def _refine_ambiguous(state: SearchState, other: AbsolutePose, answer: VerifiedP
     if next(refine_stage(other, state.images, state.renderer, config.refinement, max_loss), None) is None:
         return None
     stage = rematch_and_refine(other, state.images, state.renderer, config.matching, config.refinement)
-    return (yield from _changed(stage, state.with_answer))
+    return (yield from _changed(stage, state.with_answer)).refined
 
 
 def _ranked(state: SearchState, answers: list[VerifiedPose]) -> IterationRecord:

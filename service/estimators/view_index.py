@@ -5,9 +5,10 @@
     -> refine photometrically on a small render, then on larger ones
     -> verification gate -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
-At first a small copy of the photo is compared. Only if the gate refuses the answer costlier stages follow: the photo in
-its full size, rotated as its corners suggest; larger still, with further views; then poses sampled near views. From a
-prior pose refinement is tried first; where that fails the pose is one more candidate view. `SearchConfig` says where
+At first a small copy of the photo is compared, unless its focal length is approximate. Only if the gate refuses the
+answer costlier stages follow: the photo in its full size, rotated as its corners suggest; larger still, with further
+views; then poses sampled near views. From a prior pose refinement is tried first; where that fails, a render at the
+prior pose is the first candidate view of the first search, if that is of the upright photo. `SearchConfig` says where
 sizes and thresholds come from.
 """
 
@@ -28,6 +29,7 @@ from service.estimators.search_state import (
     SearchConfig,
     SearchState,
     Stage,
+    StageOutcome,
     StageResult,
     check_ambiguity,
     check_mirror,
@@ -51,8 +53,8 @@ from service.types import Camera, Query
 @dataclass(frozen=True, slots=True)
 class Options:
     candidates: int = 5
-    """Index views that the photo is matched with in the first search, 1 to 64; in the second as many others, or a
-    sixteenth of all."""
+    """Index views that the photo in its full size is matched with, 1 to 64; then, larger, with as many others or a
+    sixteenth of all, whichever is more. The small copy before is matched with two, at most."""
     effort: Literal["fast", "normal", "exhaustive"] = "normal"
     """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, and
     with the photo turned. `normal`: then among sampled poses, if something in the photo was recognised.
@@ -79,17 +81,17 @@ def run(
     state = SearchState.of(query, tools, config)
     if query.prior:
         yield from run_stage(state, _refine_from_prior(state))
-        if state.accepted:
+        if state.finished:
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
             return state.answer()
     # A generator: a later stage is prepared only if the earlier ones failed.
     for stage in _search_stages(state, options):
         yield from run_stage(state, stage)
-        if state.accepted:
+        if state.finished:
             break
     mirrored = yield from check_mirror(state)
-    if state.accepted and not mirrored:
+    if state.finished and not mirrored:
         yield from check_ambiguity(state)
     return state.answer()
 
@@ -100,17 +102,20 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     has_cameras = bool(state.tools.scene.cameras)
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
     variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
-    name = "retrieve"
+    first = True
     if not state.images.query.focal_sigma:  # estimating the focal length needs many matches
         small = variant.scaled(config.small_photo_factor)
         views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
-        yield Stage(_search_views(name, small, deque(views), state), small, tentative=True)
-        name = "retrieve_full_size"
+        yield Stage(_search_views("retrieve", small, deque(views), state, try_prior_view=True), small, tentative=True)
+        first = False
     # Not before: comparing rotations costs as much as a search.
     variant = retrieval.rotated_variant(variant)
     views = top_indices(retrieval.scores(variant), options.candidates)
-    name = "retrieve_rotated" if variant.roll_steps_45deg else name
-    yield Stage(_search_views(name, variant, deque(views), state), variant)
+    rotated = variant.roll_steps_45deg != 0
+    name = "retrieve_rotated" if rotated else "retrieve" if first else "retrieve_full_size"
+    # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
+    prior_view = first and not rotated
+    yield Stage(_search_views(name, variant, deque(views), state, try_prior_view=prior_view), variant)
     variant = variant.scaled(config.large_photo_factor)
     ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
@@ -131,15 +136,18 @@ def _refine_from_prior(state: SearchState) -> Stage:
         start = AbsolutePose(state.images.query.prior, np.zeros(0, bool))
         config = state.config
         found = yield from refine_stage(start, state.images, state.renderer, config.refinement, config.max_prior_loss)
-        return found.refined
+        return StageOutcome(found.refined)
 
     return Stage(records(), ImageVariant(state.config.ambiguity_photo_px), expected=True)
 
 
-def _search_views(name: str, variant: ImageVariant, untried: deque[int], state: SearchState) -> StageResult:
+def _search_views(
+    name: str, variant: ImageVariant, untried: deque[int], state: SearchState, *, try_prior_view: bool = False
+) -> StageResult:
     """Go from views, the likeliest first, to a refined pose; end early where too few matches agree.
 
-    Views that were matched are taken from `untried`.
+    Views that were matched are taken from `untried`. `try_prior_view`: match with a render at the prior pose, if there
+    is one, before the views.
     """
     images, config = state.images, state.config
     index, prior = state.tools.prepared, images.query.prior
@@ -148,27 +156,27 @@ def _search_views(name: str, variant: ImageVariant, untried: deque[int], state: 
     candidates = Candidates(np.stack([pose.world_from_camera for pose in poses]), scores)
     yield IterationRecord(name, prior or poses[0], candidates=candidates)
     views = (index.views[untried.popleft()] for _ in range(len(untried)))
-    if prior and name == "retrieve":
+    if prior and try_prior_view:
         views = chain([state.renderer.at(images.query, prior).view(images.matcher)], views)
     features = state.retrieval.features(variant)
     found = yield from match_candidates(features, views, images, variant.max_error_px, config.matching)
     # Chance matches grow with their number, so a share is required, too.
     if found is None or found.num_inliers < max(config.min_inliers, config.min_inlier_share * len(found.inlier)):
-        return None
+        return StageOutcome(None)
+    rounds = 0
     # With many inliers refinement converges from the pose as it is.
     if found.num_inliers < config.rematch_below_inliers:
         rematch = yield from render_and_rematch(found, images, state.renderer, config.matching)
-        found = rematch.found
+        found, rounds = rematch.found, rematch.rounds
     if found is None:
-        return None
+        return StageOutcome(None, rounds > 0)
     outcome = yield from refine_stage(found, images, state.renderer, config.refinement)
     if outcome.restart is None:
-        return outcome.refined
-    return (
-        yield from rematch_and_refine(
-            outcome.restart, images, state.renderer, config.matching, config.refinement, outcome.refined
-        )
+        return StageOutcome(outcome.refined, rounds > 0)
+    again = yield from rematch_and_refine(
+        outcome.restart, images, state.renderer, config.matching, config.refinement, outcome.refined
     )
+    return StageOutcome(again.refined, rounds + again.rounds > 0)
 
 
 def _sample_poses(variant: ImageVariant, state: SearchState) -> StageResult:
@@ -188,5 +196,6 @@ def _sample_poses(variant: ImageVariant, state: SearchState) -> StageResult:
             best = found
         yield record_of(view.camera, matches, found, best, "sample_poses")
     if best is None or best.num_inliers < config.min_sample_inliers:
-        return None
-    return (yield from rematch_and_refine(best, images, state.renderer, config.matching, config.refinement))
+        return StageOutcome(None)
+    again = yield from rematch_and_refine(best, images, state.renderer, config.matching, config.refinement)
+    return StageOutcome(again.refined, again.rounds > 0)

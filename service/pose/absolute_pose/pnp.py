@@ -16,7 +16,7 @@ class AbsolutePoseConfig:
     min_points: int = 4
     """Fewest correspondences, and fewest inliers of a solution: three fix a pose (P3P), the fourth confirms it."""
     min_trials: int = 100
-    """RANSAC trials before the inlier ratio may end the search: an early lucky sample is no proof."""
+    """RANSAC trials before the inlier ratio may end the search: one sample with many inliers by chance is no proof."""
 
 
 ABSOLUTE_POSE = AbsolutePoseConfig()

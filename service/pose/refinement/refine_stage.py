@@ -36,9 +36,10 @@ class RefineStageConfig:
     free_focal_settled_px: float = 0.05
     """The same where the focal length is estimated: it is confounded with the distance and hardly moves the image."""
     levels: int = 2
+    """Levels of the image pyramid."""
     first_levels: int = 4
-    """Levels of the image pyramid; the second of the first render, from a pose with fewer than `trusted_inliers`."""
-    trusted_inliers: int = 60
+    """Levels on the first render if the pose has fewer than `trusted_inliers`, since it may be far off."""
+    trusted_inliers: int = MATCHING.sufficient_inliers
     """Inliers from which on the pose of the matches is the answer where refinement diverges from it."""
     max_divergence_deg: float = 10.0
     """Rotation away from a pose with that many inliers beyond which refinement diverges."""
@@ -53,7 +54,7 @@ class RefinedPose:
 
     pose: Pose
     correction: IntrinsicsCorrection
-    """Of the query's intrinsics."""
+    """Estimated correction of the query's intrinsics."""
     loss: float | None
     """Mean absolute residual (0..1); None: refinement diverged, and this is the pose of the matches."""
     num_inliers: int | None
@@ -73,15 +74,24 @@ class RefinedPose:
 
 
 @dataclass(frozen=True, slots=True)
+class RematchedPose:
+    """What `rematch_and_refine` led to."""
+
+    refined: RefinedPose | None
+    rounds: int
+    """Renders with which enough matches agreed."""
+
+
+@dataclass(frozen=True, slots=True)
 class RefineOutcome:
     """Where `refine_stage` ended."""
 
     refined: RefinedPose | None
     """None: not even the first render could be refined on."""
     restart: AbsolutePose | None = None
-    """Where to match again: the pose did not settle, or refinement diverged from a trusted one."""
+    """Where to match again: the pose did not settle, or refinement diverged from a trusted one; None: nowhere."""
     diverged: bool = False
-    """Whether `restart` is the pose that refinement began with."""
+    """Whether refinement diverged. `restart` is then the pose that it began with, if that was a trusted one."""
 
 
 def refine_stage(
@@ -190,7 +200,7 @@ def rematch_and_refine(
     matching: MatchingConfig = MATCHING,
     config: RefineStageConfig = REFINE_STAGE,
     before: RefinedPose | None = None,
-) -> Generator[IterationRecord, None, RefinedPose | None]:
+) -> Generator[IterationRecord, None, RematchedPose]:
     """Match with renders at the pose, then refine; where refinement diverges the pose of the matches is the answer.
 
     `before` is what an earlier refinement led to: the answer if no match with a render succeeds.
@@ -198,11 +208,11 @@ def rematch_and_refine(
     rematch = yield from render_and_rematch(found, images, renderer, matching)
     if rematch.found is None:
         # A pose that loses its matches after it had some is wrong.
-        return before if rematch.rounds == 0 else None
+        return RematchedPose(before if rematch.rounds == 0 else None, rematch.rounds)
     outcome = yield from refine_stage(rematch.found, images, renderer, config)
     if not outcome.diverged or outcome.restart is None:
-        return outcome.refined
-    return (yield from _as_matched(outcome.restart, renderer))
+        return RematchedPose(outcome.refined, rematch.rounds)
+    return RematchedPose((yield from _as_matched(outcome.restart, renderer)), rematch.rounds)
 
 
 def _as_matched(found: AbsolutePose, renderer: ViewRenderer) -> Generator[IterationRecord, None, RefinedPose]:

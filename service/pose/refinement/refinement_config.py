@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from service.pose.features.rendered_views import VIEWS
+
 
 @dataclass(frozen=True, slots=True)
 class PyramidConfig:
@@ -12,7 +14,7 @@ class PyramidConfig:
 
     blur_sigma_px: float = 0.7
     """Gaussian blur of both at each level: renders are softer than photos."""
-    min_alpha: float = 0.5
+    min_alpha: float = VIEWS.min_alpha
     """Pixels of the render with less show no surface."""
     edge_px: int = 2
     """Reach of an occluding edge on both sides; 0: each pixel has its own depth."""

@@ -21,13 +21,16 @@ import numpy as np
 from service.interfaces import Features, Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
+from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
+from service.pose.retrieval.free_space import SPACE
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
-from service.pose.retrieval.scene_symmetries import like_its_mirror_image, repeats_itself
+from service.pose.retrieval.scene_symmetries import SYMMETRY, like_its_mirror_image, repeats_itself
+from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera, Intrinsics, Pose
 
 VERSION = 8
-"""Raise it with any change that makes stored indexes differ from fresh ones."""
+"""Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
 
@@ -37,7 +40,7 @@ class ViewIndex:
 
     views: tuple[View, ...]
     corners: Corners
-    """Of some of the views; see pose/features/in_plane_rotation.py."""
+    """Corners of some of the views; see pose/features/in_plane_rotation.py."""
     like_its_mirror_image: bool = False
     """Whether a mirrored photo of the scene may pass for one of the scene."""
     repeats_itself: bool = True
@@ -46,7 +49,7 @@ class ViewIndex:
 
 def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:
     """Read the scene's index from the cache, or build it and store it there."""
-    # The name is a hash of all that the index depends on, so a stale one is never read.
+    # The name is a hash of all that the index depends on, so one of other values is never read.
     path = cache_dir / f"view-index-{_key(tools, viewpoints)}.npz" if cache_dir else None
     if path and path.exists():
         try:
@@ -85,15 +88,12 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
 
 
 def _key(tools: Tools[None], viewpoints: ViewpointConfig) -> str:
-    """Everything that the index depends on; the scene's digest covers its training cameras."""
-    parts = (
-        VERSION,
-        tools.scene.info.sha256,
-        tools.matcher.name,
-        viewpoints.render_px,
-        VIEWS.max_features,
-        len(tools.scene.cameras),
-    )
+    """Return a hash of what the index depends on: code, scene, matcher, rasterizer, and all values of the configs."""
+    # The scene's digest covers the training cameras, but photos may be left out.
+    scene = (tools.scene.info.sha256, len(tools.scene.cameras))
+    # Dataclasses of numbers: their repr names each value.
+    configs = (viewpoints, SPACE, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
+    parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
 

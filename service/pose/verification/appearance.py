@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.interfaces import Frame
-from service.pose.features.rendered_views import to_uint8
+from service.pose.features.rendered_views import VIEWS, to_uint8
 
 WHITE = 255
 """Value of a saturated channel."""
@@ -43,7 +43,7 @@ class AppearanceConfig:
     hidden_share: float = 0.25
     half_share: float = 0.5
     """Shares of the photo that may be occluded, for a signal and its `_half`."""
-    min_alpha: float = 0.5
+    min_alpha: float = VIEWS.min_alpha
     """Opacity from which on a pixel counts as surface."""
     same_gradients: float = 0.7
     """Correlation of a block's gradients from which on photo and render show the same there."""
@@ -98,7 +98,7 @@ class BlockStatistics:
     """A pair, block by block."""
 
     correlation: Float64[np.ndarray, "n"]
-    """Of the gradients, -1..1."""
+    """Correlation of the gradients, -1..1."""
     around: Float64[np.ndarray, "n"]
     """The same of the block with its neighbours: an occluder may agree in single blocks, by chance."""
     weight: Float64[np.ndarray, "n"]

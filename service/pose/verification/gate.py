@@ -5,8 +5,8 @@ whatever the exposure) and its colours, each over most of the photo and over its
 and whether the colours agree where the gradients do (repeated things seen one further, and mirror images, have the
 right edges and the wrong colours; see `appearance.py`); how many fresh matches between photo and render agree with
 the pose, without any fit, what share that is, and how they are spread; and by how much refinement would still move the
-pose. `gate_model.py` computes from them how probably the pose is right (within 5 degrees and 1/80 of the distance), and
-which signals are below their floors.
+pose. `gate_model.py` computes from them how probably the pose is right (within 5 degrees and 1/80 of
+the training cameras' median distance from the scene's focus), and which signals are below their floors.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class VerificationConfig:
 
     model: GateModel = SHIPPED_MODEL
     refinement: RefinementConfig = REFINEMENT
-    """Of the step that measures the uncertainty."""
+    """How the step is made that measures the uncertainty."""
     min_localized: float = 0.8
     min_uncertain: float = 0.1
     """Least probabilities of the statuses `localized` and `uncertain`."""
@@ -49,7 +49,7 @@ class VerificationConfig:
     """Scaled mean of the global appearance below which no other signal is measured: right poses of photos spoilt within
     reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
     min_features: int = 30
-    """Of a photo; with fewer, that is the reason of a refusal."""
+    """Features of a photo; with fewer, that is the reason of a refusal."""
     min_coverage: float = 0.04
     """Share of the photo in which the scene is opaque."""
     max_sigma_share: float = 0.0085
@@ -59,9 +59,11 @@ class VerificationConfig:
     max_focal_sigma: float = 0.008
     """Of the logarithm of an estimated focal length: one that is 1 % off moves the camera by 1 % of the distance."""
     focal_contradiction: float = 0.02
-    """Of the logarithm, and six standard deviations: a given focal length further off is contradicted."""
-    min_valid_share: float = 0.1
-    """Inliers of a partly invalid photo are scaled up to those of a whole one, at most by 1 / this."""
+    contradiction_sigmas: float = 3.0
+    """A given focal length is contradicted if another step would change its logarithm by more than the first, and by
+    more than this many standard deviations of that step (which `focal_inflation` enlarges)."""
+    max_inlier_scale: float = 10.0
+    """Inliers of a partly invalid photo are scaled up to those of a whole one, at most by this factor."""
 
 
 VERIFICATION = VerificationConfig()
@@ -72,19 +74,20 @@ def verify(
     pose: Pose,
     rendered: RenderedView,
     refinement: RefinementResult | None = None,
-    supporting_matches: int | None = None,
+    pixels_may_decide: bool = False,
+    supporting_matches: int = 0,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
     """Return the verdict on a pose; `rendered` is a render with the photo's intrinsics there or within a pixel of it.
 
-    `refinement` is the refinement on that render that led to the pose, if one did: it saves a linearization. Where
-    something else supports the pose already (so many matches with a view, 0: it was expected there), the pixels alone
-    may decide, and no fresh matches are made.
+    `refinement` is the refinement on that render that led to the pose, if one did: it saves a linearization. With
+    `pixels_may_decide`, for a pose that something else supports already, no fresh matches are made if the signals of
+    the pixels suffice; the verdict then reports the `supporting_matches` with a view that led to the pose.
     """
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification.
-    if supporting_matches is not None and photometric_suffices(signals, config):
+    if pixels_may_decide and photometric_suffices(signals, config):
         verdict = verdict_of(signals, uncertainty, query.focal_sigma, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
@@ -96,7 +99,7 @@ def verify(
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
-        signals["inliers"] /= max(float(valid.mean()), config.min_valid_share)
+        signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
     return _within_prior(verdict_of(signals, uncertainty, query.focal_sigma, few, config), images, pose)
 
 
@@ -187,8 +190,8 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
     scaled = {name: float(scales[name](value)) for name, value in signals.items() if name in scales}
     # A signal below its floor is why the pose was refused.
     scaled = {name: scaled[name] for name in doubtful} or scaled
-    matches = np.mean([value for name, value in scaled.items() if name.startswith("inlier")] or [1.0])
-    pixels = np.mean([value for name, value in scaled.items() if not name.startswith("inlier")] or [1.0])
+    matches = np.mean([value for name, value in scaled.items() if name in NO_MATCHES] or [1.0])
+    pixels = np.mean([value for name, value in scaled.items() if name not in NO_MATCHES] or [1.0])
     if max(matches, pixels) < config.unrecognised:
         return Reason.NO_MATCHING_VIEW
     return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_MISMATCH
@@ -207,5 +210,5 @@ def _doubt_about_intrinsics(
         # The step counts, too: a method may not have estimated the focal length at all.
         sigma = max(float(np.sqrt(uncertainty.covariance[6, 6])), off)
         return (Reason.FOCAL_UNCERTAIN if sigma > config.max_focal_sigma else None), covariance, sigma
-    contradicted = off > config.focal_contradiction and off > 3 * uncertainty.focal_sigma
+    contradicted = off > config.focal_contradiction and off > config.contradiction_sigmas * uncertainty.focal_sigma
     return (Reason.INTRINSICS_INCONSISTENT if contradicted else None), covariance, 0.0

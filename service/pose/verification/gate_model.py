@@ -2,14 +2,14 @@
 
 A logistic model without negative weights: each signal is mapped to 0..1 and cut off at both ends. Besides, each signal
 has a floor: below it a pose is in doubt, however good the other signals are, because a sum would compensate for one
-that is bad. `splatfix bench gate` fits weights and floors, and writes the file.
+that is bad. `splatfix bench gate` fits weights and floors, and writes the file; floors that were set by hand it keeps.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 MODEL_FILE = Path(__file__).with_name("model.json")
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,23 +53,34 @@ class Logistic:
 
 
 @dataclass(frozen=True, slots=True)
+class HandSetFloor:
+    """A floor that the samples of the fit don't determine."""
+
+    floor: float
+    """In the signal's unit."""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class GateModel:
     """Weights, floors and scales by the signals' names, and what they were fitted on."""
 
     scales: Mapping[str, Scale]
     with_matches: Logistic
-    """For signals of pixels and of matches."""
+    """Its signals are those of pixels and of matches."""
     photometric: Logistic
-    """For signals of pixels alone."""
+    """Its signals are those of pixels alone."""
     floors: Mapping[str, float]
-    """In the signals' units; for a signal whose scale descends, a ceiling."""
+    """In the signals' units; for a signal whose scale descends, a ceiling. Includes those that were set by hand."""
+    set_by_hand: Mapping[str, HandSetFloor] = field(default_factory=dict)
+    """Floors that a fit keeps, by the signals' names."""
     fitted_on: Mapping[str, Any] = field(default_factory=dict)
     """Scenes with their hashes and photos, and counts of right and wrong poses."""
 
     def probability(self, signals: Mapping[str, float]) -> float:
         """Return how probably a pose with these signals is right, 0..1; without signals of matches by the others."""
         # Verification by the pixels alone has a model of its own.
-        model = self.with_matches if "inliers" in signals else self.photometric
+        model = self.with_matches if self.with_matches.weights.keys() <= signals.keys() else self.photometric
         logit = model.bias + sum(weight * self.scales[name](signals[name]) for name, weight in model.weights.items())
         return float(1.0 / (1.0 + np.exp(-logit)))
 
@@ -86,11 +97,13 @@ def model_from_json(content: Mapping[str, Any]) -> GateModel:
     """Return the model that a file's content describes. Raises ValueError if it is of another version."""
     if content["version"] != FORMAT_VERSION:
         raise ValueError(f"the gate's model has version {content['version']}, this code reads {FORMAT_VERSION}")
+    set_by_hand = {name: HandSetFloor(**entry) for name, entry in content["set_by_hand"].items()}
     return GateModel(
         scales=MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
         with_matches=_logistic(content["with_matches"]),
         photometric=_logistic(content["photometric"]),
-        floors=MappingProxyType(content["floors"]),
+        floors=MappingProxyType(content["floors"] | {name: entry.floor for name, entry in set_by_hand.items()}),
+        set_by_hand=MappingProxyType(set_by_hand),
         fitted_on=MappingProxyType(content["fitted_on"]),
     )
 
@@ -110,7 +123,9 @@ def model_to_json(model: GateModel) -> dict[str, Any]:
         },
         "with_matches": {"bias": model.with_matches.bias, "weights": dict(model.with_matches.weights)},
         "photometric": {"bias": model.photometric.bias, "weights": dict(model.photometric.weights)},
-        "floors": dict(model.floors),
+        # Each floor stands in one place only, so that the two can't contradict one another.
+        "floors": {name: floor for name, floor in model.floors.items() if name not in model.set_by_hand},
+        "set_by_hand": {name: asdict(entry) for name, entry in model.set_by_hand.items()},
     }
 
 

@@ -10,7 +10,8 @@ from jaxtyping import Float32
 
 from service.geometry import reprojection_error_px
 from service.interfaces import Frame
-from service.pose.matching.correspondences import Correspondences
+from service.pose.features.rendered_views import VIEWS
+from service.pose.matching.correspondences import MATCH_ERROR_PX, Correspondences
 from service.pose.refinement.uncertainty import PoseUncertainty
 from service.types import Intrinsics, Pose, Query
 
@@ -19,15 +20,15 @@ from service.types import Intrinsics, Pose, Query
 class SignalConfig:
     """How the signals are measured."""
 
-    max_error_px: float = 4.0
-    """Reprojection error of an inlier, at the render's size; XFeat's points scatter by 1.5."""
+    max_error_px: float = MATCH_ERROR_PX
+    """Reprojection error of an inlier, at the render's size."""
     cells: int = 6
-    """Of a photo's side, over which inliers are spread."""
-    min_alpha: float = 0.5
+    """Cells along each side of the photo, in which the spread of the inliers is counted."""
+    min_alpha: float = VIEWS.min_alpha
     """Opacity from which on a pixel counts as surface."""
     undetermined: float = 1.0
     """Standard deviation of the position, relative to the distance to what is seen, from which on the last step of
-    refinement is no evidence: from a picture of nothing there is nowhere to go."""
+    refinement is no evidence: an image without structure gives no step, whatever the pose."""
     max_signal: float = 1e3
     """What an infinite signal is cut off at."""
 
