@@ -26,6 +26,10 @@ def frozen(array: np.ndarray, dtype: type | None = None) -> np.ndarray:
     return result
 
 
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
 @dataclass(frozen=True, slots=True)
 class IntrinsicsCorrection:
     """What turns assumed intrinsics into the camera's own."""

@@ -20,6 +20,7 @@ from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer, backprojected, to_uint8
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.photometric import refine_photometric
+from service.pose.retrieval import index as index_module
 from service.pose.retrieval.index import built_index, prepared_index
 from service.pose.retrieval.scores import retrieval_scores, top_indices
 from service.pose.retrieval.viewpoints import ViewpointConfig, choose_spread_poses, farthest_points
@@ -601,6 +602,24 @@ def test_another_scene_or_matcher_has_another_cache(walls_with_cameras: Gaussian
     other = replace(walls_with_cameras, info=replace(walls_with_cameras.info, sha256="1" * 64))
     prepared_index(tools_for(scene=other), tmp_path, SMALL)
     assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_an_index_of_other_values_or_another_rasterizer_has_another_cache(
+    walls_with_cameras: GaussianScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class OtherWalls(PaintedWalls):
+        name = "other_walls"
+
+    def prepare(config: ViewpointConfig, walls: PaintedWalls | None = None) -> int:
+        prepared_index(tools_for(walls, scene=walls_with_cameras), tmp_path, config)
+        return len(list(tmp_path.iterdir()))
+
+    others = [replace(SMALL, min_views=2), replace(SMALL, spacing=0.1)]
+    others += [replace(SMALL, placement=replace(SMALL.placement, max_views=9))]
+    assert [prepare(config) for config in (SMALL, *others, SMALL)] == [1, 2, 3, 4, 4]
+    assert prepare(SMALL, OtherWalls()) == 5
+    monkeypatch.setattr(index_module, "LOD", replace(index_module.LOD, opaque_alpha=0.8))
+    assert prepare(SMALL) == 6
 
 
 def test_an_index_of_a_scene_without_features_is_empty_but_there() -> None:

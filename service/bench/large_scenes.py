@@ -23,10 +23,10 @@ from jaxtyping import Float64
 from service.geometry import so3_exp
 from service.interfaces import Rasterizer
 from service.pose.descent.contribution_pruning import contributions
-from service.scene_formats.gaussians import SH_C0, RawGaussians
+from service.scene_formats.gaussians import RawGaussians
 from service.scene_formats.manifest import MANIFEST
 from service.scene_formats.similarity import moved_gaussians, moved_pose
-from service.types import Camera, GaussianScene, NamedCamera
+from service.types import SH_C0, Camera, GaussianScene, NamedCamera
 
 GAP = 0.1
 """Between two scenes of the grid, as a share of a scene's size."""

@@ -59,8 +59,8 @@ class SearchConfig:
     answers: AnswerConfig = ANSWERS
     mirror: MirrorConfig = MIRROR
     small_photo_factor: float = 0.77
-    """Size of the photo in the stage `retrieve`, relative to `retrieve_full_size`: a whole, sharp photo is found in half
-    the time.
+    """Size of the photo in the stage `retrieve`, relative to `retrieve_full_size`: a whole, sharp photo is found in
+    half the time.
     Each of the 58 clean test photos has 75 or more matches that agree with its likeliest view, foreign ones 12."""
     small_photo_views: int = 2
     """Views that the small photo is matched with."""

@@ -35,6 +35,7 @@ from service.render.simd import (
     vmax,
     vmin,
 )
+from service.types import SH_C0
 
 RECORD = 16
 """Floats of a record."""
@@ -44,7 +45,7 @@ HALF_LOG2E = np.float32(0.5 * np.log2(np.e))
 TWO_LN2 = np.float32(2 * np.log(2.0))
 LOG2_ALPHA_MIN = np.float32(-np.log2(255.0))
 
-C0 = 0.28209479177387814
+C0 = SH_C0
 C1 = 0.4886025119029199
 C20, C21, C22, C23, C24 = (
     1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396,

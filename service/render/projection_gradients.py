@@ -13,6 +13,7 @@ import numpy as np
 
 from service.jit import inline, kernel
 from service.render.project import (
+    C0,
     C1,
     C20,
     C21,
@@ -334,7 +335,7 @@ def _sh_row(rows, row, degree, d_sh):
     """Multiply the colour's gradient by the SH basis at the viewing direction."""
     red, green, blue = rows[row + 10], rows[row + 11], rows[row + 12]
     x, y, z = rows[row + 13], rows[row + 14], rows[row + 15]
-    _put(d_sh, 0, 0.28209479177387814, red, green, blue)
+    _put(d_sh, 0, C0, red, green, blue)
     if degree >= 1:
         _put(d_sh, 1, -C1 * y, red, green, blue)
         _put(d_sh, 2, C1 * z, red, green, blue)

@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from service.errors import CorruptScene
+from service.types import SH_C0
 
 MAX_GAUSSIANS = 20_000_000
 """More than any published scene; with SH degree 3 they would fill 5 GB."""
 MAX_COORDINATE = 1e9
 """Scene units. Squares of larger numbers exceed the range of float32 renderers."""
-SH_C0 = 0.28209479177387814
-"""The constant basis function: 1 / (2 sqrt(pi))."""
 
 
 @dataclass(frozen=True, slots=True)

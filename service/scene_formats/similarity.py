@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.geometry import quat_from_rotation
-from service.scene_formats.gaussians import SH_C0, RawGaussians
-from service.types import Pose
+from service.scene_formats.gaussians import RawGaussians
+from service.types import SH_C0, Pose
 
 
 def moved_gaussians(raw: RawGaussians, world_from_scene: Float64[np.ndarray, "4 4"]) -> RawGaussians:

@@ -19,12 +19,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from service.geometry import rotation_from_quat
-from service.types import GaussianScene
+from service.types import SH_C0, GaussianScene
 
 BINARY = "application/octet-stream"
 _VIEWPOINTS = 16
-_SH0 = 0.28209479177387814
-"""The constant basis function: 1 / (2 sqrt(pi))."""
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -37,7 +35,7 @@ def packed_splats(scene: GaussianScene, limit: int) -> bytes:
     rotation = rotation_from_quat(scene.quats[chosen])
     axes = rotation * scene.scales[chosen][:, None, :]
     covariance = axes @ np.swapaxes(axes, 1, 2)
-    rgb = 0.5 + _SH0 * scene.sh[chosen, 0, :]
+    rgb = 0.5 + SH_C0 * scene.sh[chosen, 0, :]
     rgba = np.concatenate([rgb, scene.opacities[chosen][:, None]], 1)
     return b"".join(
         [

@@ -14,10 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.interfaces import Rasterizer
-from service.types import Camera, GaussianScene
-
-SH_0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+from service.types import SH_C0, Camera, GaussianScene
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +41,7 @@ def contributions(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequenc
         ones = np.ones((camera.intrinsics.height, camera.intrinsics.width, 3), np.float32)
         found = rasterizer.scene_gradients(camera, ones)
         seen = found.index
-        result[seen] = np.maximum(result[seen], found.sh[:, 0].max(1) / SH_0)
+        result[seen] = np.maximum(result[seen], found.sh[:, 0].max(1) / SH_C0)
     return result
 
 

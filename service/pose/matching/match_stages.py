@@ -26,7 +26,8 @@ from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import View, ViewRenderer
 from service.pose.matching.correspondences import Correspondences, correspondences
-from service.results import IterationRecord, MatchVectors
+from service.pose.matching.render_and_match import match_record
+from service.results import IterationRecord
 from service.types import NO_CORRECTION, Camera, Pose, Query
 
 
@@ -198,11 +199,5 @@ def record_of(
     `found` is what these matches agree on, `best` the best pose so far; without one the view's own is recorded.
     """
     inlier = found.inlier if found else np.zeros(len(matches.photo_px), bool)
-    return IterationRecord(
-        stage,
-        best.pose if best else camera.pose,
-        best.correction if best else NO_CORRECTION,
-        num_matches=len(inlier),
-        num_inliers=int(inlier.sum()),
-        matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),
-    )
+    pose, correction = (best.pose, best.correction) if best else (camera.pose, NO_CORRECTION)
+    return match_record(stage, pose, matches, inlier, camera, correction=correction)

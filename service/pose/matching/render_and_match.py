@@ -15,7 +15,7 @@ from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import View, backprojected, to_uint8, view_from
 from service.pose.matching.correspondences import Correspondences, correspondences
 from service.results import IterationRecord, MatchVectors
-from service.types import Camera, Intrinsics, Pose, Query
+from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 
 
 def render_and_match(
@@ -47,13 +47,20 @@ def _photo_scale(size: Intrinsics, query: Query) -> Float32[np.ndarray, "2"]:
 
 
 def match_record(
-    stage: str, pose: Pose, matches: Correspondences, inlier: np.ndarray, camera: Camera, loss: float | None = None
+    stage: str,
+    pose: Pose,
+    matches: Correspondences,
+    inlier: np.ndarray,
+    camera: Camera,
+    loss: float | None = None,
+    correction: IntrinsicsCorrection = NO_CORRECTION,
 ) -> IterationRecord:
-    """Return the record of a step that matched."""
+    """Return the record of a step that matched the photo with the view of `camera`."""
     return IterationRecord(
         stage,
         pose,
-        loss=loss,
+        correction,
+        loss,
         num_matches=len(inlier),
         num_inliers=int(inlier.sum()),
         matches=MatchVectors.sample(matches.photo_px, matches.view_px, inlier, camera),
