@@ -53,6 +53,7 @@ class Removal:
 def removals() -> dict[str, Removal]:
     """Return the parts, and how the estimator does without each."""
     refine, matching, mirror, ambiguity = SEARCH.refinement, SEARCH.matching, SEARCH.mirror, SEARCH.ambiguity
+    # Without features of the photo all scores are equal, and sorting keeps the order.
     scores = ScoreConfig(photo_features=0)
     return {
         "nothing": Removal(),
@@ -100,6 +101,7 @@ def _refined_with(**changed: Any) -> Removal:
     config = replace(REFINEMENT, **changed)
     return _searched_with(
         refinement=replace(SEARCH.refinement, photometric=config),
+        # The gate makes a step of refinement of its own.
         verification=replace(SEARCH.verification, refinement=config),
     )
 
@@ -129,10 +131,12 @@ def run(
     outcomes: dict[tuple[str, str], list[Outcome]] = {(p, c): [] for p in chosen for c in CONDITIONS}
     for number, folder in enumerate(folders):
         with_cameras = load_bench_scene(folder, cache_dir=cache_dir)
+        # The same scene once more, as if nothing were known of its training photos.
         bare = load_bench_scene(folder, cameras="ignored", cache_dir=cache_dir)
         for i, (condition, modify) in enumerate(CONDITIONS.items()):
             one = bare if condition == BARE else with_cameras
             one.loaded.prepare(DEFAULT_ESTIMATOR)
+            # Every part answers the same files.
             trials = list(make_trials(one, "none", len(one.photos), 0, modify, folders[(number + 1) % len(folders)]))
             for part, removal in chosen.items():
                 outcomes[part, condition] += _outcomes(one, trials, removal, condition)
@@ -156,8 +160,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 def _outcomes(one: BenchScene, trials: Sequence[Trial], removal: Removal, condition: str) -> list[Outcome]:
     request = Request(options=removal.options, config=removal.config)
+    # Only in that condition is there a focal length to estimate.
     trust = "approximate" if condition == APPROXIMATE and not removal.exact_focal else "given"
     outcomes = []
+    # The renderer has no option for it, since nothing else needs biased renders.
     with unscaled_dilation() if removal.unscaled_dilation else nullcontext():
         for trial in trials:
             wall, cpu_s = time.perf_counter(), time.process_time()

@@ -86,9 +86,11 @@ def run(
     done = 0
     for one in subjects:
         one.loaded.prepare("view_index")
+        # A generator for each scene: its samples don't depend on the scenes before it.
         rng = np.random.default_rng(seed)
         others = [other for other in subjects if other is not one]
         cut = [_pixels(photo) for other in others for photo in other.photos[:OCCLUDERS]]
+        # A single scene has no other photos to cut from.
         cut = cut or [unrelated_image(number) for number in PATTERNED]
         for photo in one.photos:
             samples += _of_photo(one, photo, cut, rng)
@@ -129,6 +131,7 @@ def _of_photo(
         yield _localized(one, kind, photo.name, query, file.truth.pose)
     data = photo.path.read_bytes()
     query = read_query(data, intrinsics=photo.camera.intrinsics, background_rgb=one.background_rgb)
+    # No truth: no pose in the scene is right for the mirror image.
     yield _localized(one, "mirrored", photo.name, mirrored_query(query), None)
     images = QueryImages(query, one.loaded.matcher)
     for _ in range(MOVES):
@@ -149,6 +152,7 @@ def _of_moved_pose(
     size = rendered.camera.intrinsics
     start = Camera(images.query.intrinsics.resized(size.width, size.height), pose)
     found = refine_photometric(images.resized(size), rendered.frame, rendered.camera, start, 2)
+    # Not finite: the pose sees too little of the scene to be refined.
     if np.isfinite(found.loss):
         verdict = render_and_verify(images, found.pose, rasterizer)
         yield _sample(one, "drifted", photo.name, truth, found.pose, verdict)
@@ -211,6 +215,7 @@ def _moved(
     """Return the pose turned and shifted in a random direction, by a distance even on a logarithmic scale."""
     turn, shift = rng.standard_normal((2, 3))
     turn *= np.radians(rng.uniform(0, most_deg)) / np.linalg.norm(turn)
+    # Small and large errors are equally interesting, so the scale is logarithmic.
     units = np.exp(rng.uniform(*np.log(between)))
     shift *= units / one.units.units_per_scene_unit / np.linalg.norm(shift)
     return moved(pose, np.concatenate([turn, shift]))
@@ -220,6 +225,7 @@ def _localized(one: BenchScene, kind: str, photo: str, query: Query, truth: Pose
     estimate = localize(query, one.loaded, Request(options=Options(effort="fast")))
     weighed = nees(estimate, truth) if truth else None
     images = QueryImages(query, one.loaded.matcher)
+    # The search may have verified by the pixels alone; the fit needs the signals of matches, too.
     signals = render_and_verify(images, estimate.pose, one.loaded.rasterizer).signals
     verdict = replace(estimate.verdict, signals=signals)
     sufficient = SEARCH.photometric_min_inliers

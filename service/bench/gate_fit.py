@@ -72,6 +72,7 @@ class _Table:
     @classmethod
     def of(cls, samples: Sequence[Sample]) -> _Table:
         right, kinds = np.array([s.right for s in samples]), np.array([s.kind for s in samples])
+        # Photos spoilt beyond reason may be refused: they don't lower the floors.
         usual = right & ~np.char.startswith(kinds, "beyond")
         matched, doubted = np.array([s.matched for s in samples]), np.array([s.doubted for s in samples])
         return cls(right, doubted, usual, matched, kinds, _folds(samples))
@@ -97,6 +98,7 @@ def fit_model(samples: Sequence[Sample], shape: GateModel, data: Mapping[str, An
     for name, part in (("photometric", shape.photometric), ("with_matches", shape.with_matches)):
         features = scaled(samples, part, shape)
         weights = fitted(features[~table.doubted], table.right[~table.doubted])
+        # The model file is read by people, and more digits mean nothing.
         bias, *rest = np.round(weights, 2).tolist()
         parts[name] = Logistic(bias, dict(zip(part.weights, rest, strict=True)))
         lowest = floors(features[table.usual])[1:]
@@ -132,6 +134,7 @@ def _tested(features: Float64[np.ndarray, "n k"], table: _Table) -> Float64[np.n
         here = table.folds == fold
         others = ~here & ~table.doubted
         weights, floor = fitted(features[others], table.right[others]), floors(features[~here & table.usual])
+        # As in the gate: floors cap the score.
         doubtful = (features[here] < floor).any(1)
         score = probabilities(features[here], weights)
         tested[here] = np.minimum(score, np.where(doubtful, VERIFICATION.doubtful_score, 1.0))
@@ -167,6 +170,7 @@ def fitted(features: Float64[np.ndarray, "n k"], right: Bool[np.ndarray, "n"]) -
     By Newton's steps on the free weights; one that would turn negative is fixed at 0.
     """
     weights = np.zeros(features.shape[1])
+    # How many there are of each is the choice of the bench, so both classes have the same total weight.
     each = np.where(right, 0.5 / max(right.sum(), 1), 0.5 / max((~right).sum(), 1)) * len(right)
     penalty = FIT.penalty * np.r_[0.0, np.ones(features.shape[1] - 1)] * len(right) / 100
     free = np.ones(len(weights), bool)
@@ -177,6 +181,7 @@ def fitted(features: Float64[np.ndarray, "n k"], right: Bool[np.ndarray, "n"]) -
         step = np.zeros_like(weights)
         step[free] = np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
         weights = weights + step * min(1.0, FIT.max_step / max(np.abs(step).max(), 1e-9))
+        # A negative weight would mean that a better signal speaks against the pose.
         below = np.r_[False, weights[1:] < 0]
         weights[below], free[below] = 0.0, False
         if np.abs(step).max() < 1e-6:
@@ -197,6 +202,7 @@ def _counts(
 ) -> dict[str, Any]:
     """Return how many of each kind are called localized, apart from those that are in doubt for other reasons."""
     called = (tested >= VERIFICATION.min_localized) & ~doubted
+    # They have no right pose, so they are counted apart from wrong poses.
     nothing = np.isin(kinds, ["foreign", "garbage"])
     wrong = ~right & ~nothing
     return {

@@ -102,6 +102,7 @@ def run(
     bench_scene = load_bench_scene(
         Path(folder), data, layout=layout, background=background, cameras=cameras, matcher=matcher, cache_dir=cache_dir
     )
+    # Preparing is a matter of the scene, and its time isn't a photo's.
     began = time.perf_counter()
     bench_scene.loaded.prepare(estimator)
     prepare_s = time.perf_counter() - began
@@ -147,6 +148,7 @@ def measure(
     The first trial is localized twice, of which the first time, with compilation and allocation, isn't counted.
     """
     outcomes, lines = [], []
+    # Not kept: its time would include compilation.
     localize_one(todo[0])
     for done, trial in enumerate(todo, 1):
         wall, cpu = time.perf_counter(), time.process_time()
@@ -174,6 +176,7 @@ def load_bench_scene(
     cache_dir: Path | None = None,
 ) -> BenchScene:
     """Return a data set's test photos, and its scene without their cameras. Raises SceneError, UnknownName."""
+    # The layout says which photos are for testing.
     data_set = read_data_set(data or folder, layout, folder)
     scene = _load_scene(folder, data_set, background)
     # A scene without training cameras takes its units from the test photos.
@@ -212,6 +215,7 @@ def make_trials(
     others = _read_occluders(occluders) if occluders else ()
     for index, photo in enumerate(bench_scene.photos):
         numbers = range(len(range(index, count, len(bench_scene.photos))))
+        # With fewer trials than photos the last photos have none.
         if not numbers:
             continue
         sent = prepare_photo(photo, modifications, bench_scene.background_rgb, seed, others)
@@ -227,6 +231,7 @@ def _read_occluders(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES) if folder.is_dir() else []
     if not files:
         raise SceneNotFound("there are no photos to cut occluders from.", where=str(folder))
+    # Spread over the folder: neighbouring photos show the same.
     step = -(-len(files) // MAX_OCCLUDERS)
     return [read_query(file.read_bytes()).rgb.astype(np.float32) / 255 for file in files[::step]]
 

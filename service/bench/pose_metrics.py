@@ -69,6 +69,7 @@ class Outcome:
 
 def errors(estimate: Pose, truth: Pose, units: Units) -> tuple[float, float]:
     """Return the rotation error in degrees and the distance in normalized units."""
+    # Normalized units make scenes of different units comparable.
     angle, distance = pose_distance(estimate, truth)
     return angle, distance * units.units_per_scene_unit
 

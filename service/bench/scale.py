@@ -70,6 +70,7 @@ def run(
             file = write_folder(large, at, folder, cameras=cameras == "given", compressed=compressed)
             facts = {"gaussians": large.count, "sh_degree": large.sh_degree, "file": file.name}
             facts |= {"cameras": cameras, "file_bytes": file.stat().st_size}
+            # The file on disk is all that the measurement needs.
             del large
             # A new process, whose peak of memory is this size's alone.
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
@@ -111,9 +112,11 @@ def measure_folder(folder: Path, units: Units) -> dict[str, Any]:
     before = _memory()
     loaded = timed("load", lambda: LoadedScene.load(folder, cache_dir=cache))
     index = timed("index", lambda: loaded.prepare(DEFAULT_ESTIMATOR))
+    # Read before the queries: it is the peak of loading and indexing.
     peak = _memory()["VmHWM"]
     outcomes = _outcomes(folder, loaded, units)
     after = _memory()
+    # One copy of the scene in memory at a time.
     del loaded
     again = timed("load_again", lambda: LoadedScene.load(folder, cache_dir=cache))
     timed("index_again", lambda: again.prepare(DEFAULT_ESTIMATOR))
@@ -145,6 +148,7 @@ def _warm_up() -> None:
 def _outcomes(folder: Path, loaded: LoadedScene, units: Units) -> list[Outcome]:
     outcomes = []
     photos = find_photos(folder)
+    # The first photo twice: its first time includes allocation, and isn't counted.
     for photo in [photos[0], *photos]:
         data = photo.path.read_bytes()
         wall, cpu = time.perf_counter(), time.process_time()

@@ -52,6 +52,7 @@ def start_pose(
         return _perturbed_in_world(truth, units, *_WORLD_PERTURBATIONS[kind], rng)
     matrix = truth.world_from_camera.copy()
     if kind == "inplace":
+        # A normalized Gaussian 3-vector is a uniformly random direction.
         axis = rng.normal(size=3)
         angle = np.radians(rng.uniform(*INPLACE_DEG))
         matrix[:3, :3] = matrix[:3, :3] @ so3_exp(angle * axis / np.linalg.norm(axis))
@@ -79,6 +80,7 @@ def _perturbed_in_world(
     shift: Float64[np.ndarray, "3"] = rng.uniform(*lengths, 3) * signs[3:]
     matrix = np.eye(4)
     matrix[:3, :3] = rotation @ truth.world_from_camera[:3, :3]
+    # Ranges of the protocol are in normalized units.
     offset = (truth.position_in_world - units.focus_in_world) * units.units_per_scene_unit
     # About the focus, as the protocol rotates in the normalized world frame.
     moved = rotation @ offset + shift

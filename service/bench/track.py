@@ -164,11 +164,13 @@ def smooth_path(stations: Sequence[Pose], units: Units, frames: int, config: Seq
     lengths = [_frames_between(a, b, units, config) for a, b in pairwise(dense)]
     along = np.concatenate([[0.0], np.cumsum(lengths)])
     position = np.arange(frames) % max(1.0, 2 * along[-1])
+    # The second half of the way goes back.
     position = np.where(position > along[-1], 2 * along[-1] - position, position)
     return [_pose(_spline(knots, t)) for t in np.interp(position, along, at)]
 
 
 def _nearest_neighbour_order(stations: Sequence[Pose], units: Units, config: SequenceConfig) -> list[Pose]:
+    # Training cameras have any order; a path through them in it would jump to and fro.
     left = list(stations)
     tour = [left.pop(0)]
     while left:
@@ -195,6 +197,7 @@ def _pose(vector: Float64[np.ndarray, "7"]) -> Pose:
 
 def _spline(knots: Float64[np.ndarray, "n 7"], t: float) -> Float64[np.ndarray, "7"]:
     """Return the Catmull-Rom spline through the knots at `t`, in knots."""
+    # The last knot belongs to the last segment.
     i = min(int(t), len(knots) - 2)
     u = t - i
     a, b, c, d = (knots[min(max(j, 0), len(knots) - 1)] for j in range(i - 1, i + 3))
@@ -207,6 +210,7 @@ def _render_frames(
     rng = np.random.default_rng(seed)
     for number, pose in enumerate(path):
         rgb = rasterizer.render([Camera(intrinsics, pose)])[0].rgb
+        # A camera's exposure changes slowly along a video.
         gain = np.float32(config.gain ** np.sin(2 * np.pi * number / config.gain_period))
         noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(config.noise_sigma)
         yield encode_image(rgb * gain + noise, quality=config.jpeg_quality)

@@ -105,6 +105,7 @@ def run(
             weight = config.match_weight
             value = weight * distance + (1 - weight) * value
             by_twist = weight * by_match + (1 - weight) * by_twist
+            # Near the optimum noise of the matches would dominate, so the photometric loss goes on alone.
             off_since = step if distance < config.match_until else None
         if off_since is not None:
             # The exponent is 1 / decay_steps at the very step that switched matching off.
@@ -139,8 +140,10 @@ def match_loss(matches: Correspondences, intrinsics: Intrinsics, pose: Pose) -> 
     if not np.any(seen):
         return 0.0, np.zeros(6)
     points = points[seen]
+    # Relative to the image, so that L_match doesn't depend on the photo's resolution.
     size = np.array([intrinsics.width, intrinsics.height])
     offsets = (project(points, intrinsics) - matches.photo_px[seen]) / size
+    # The chain rule through the pinhole projection, u = f x / z.
     x, y, z = points.T
     by_point = 2 * offsets / size / len(points) * np.stack([intrinsics.fx / z, intrinsics.fy / z], 1)
     by_xyz = np.stack([by_point[:, 0], by_point[:, 1], -(by_point[:, 0] * x + by_point[:, 1] * y) / z], 1)

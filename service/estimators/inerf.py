@@ -81,6 +81,7 @@ def run(
     yield IterationRecord("start", start)
     for step in range(options.steps):
         adam.rate = options.rate * config.decay ** (step / config.decay_steps)
+        # New pixels in each step: stochastic gradient descent, as in the paper.
         chosen = _on_pixels(loss, draw_mask()) if draw_mask else loss
         value, gradient = loss_and_gradient(tools.rasterizer, intrinsics, pose_of.pose(numbers), chosen)
         numbers = numbers - adam.step(pose_of.gradient(numbers, gradient))
@@ -122,6 +123,7 @@ def _on_pixels(loss: Loss, mask: Float32[np.ndarray, "h w 1"]) -> Loss:
 
     def of(render: Float32[np.ndarray, "h w 3"]) -> tuple[float, Float32[np.ndarray, "h w 3"]]:
         value, gradient = loss(render)
+        # A loss of few pixels would make the trace noisy.
         return value, gradient * mask
 
     return of

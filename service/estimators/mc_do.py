@@ -143,6 +143,7 @@ def run(
     query: Query, tools: Tools[Prepared], options: Options, config: MonteCarloConfig = MONTE_CARLO
 ) -> Generator[IterationRecord, None, None]:
     """Run the stages that the options leave in; see the module. A record's pose is the best one so far."""
+    # Without a prior the records before the first hypothesis need some pose.
     pose = query.prior or tools.prepared.viewpoints[0]
     images = QueryImages(query, tools.matcher)
     yield IterationRecord("start", pose)
@@ -188,6 +189,7 @@ def _sample(
             # From this support on DO converges: further hypotheses would cost renders for nothing.
             if scored[-1].support > config.enough_support:
                 break
+        # Of all rounds: an early hypothesis may stay the best one.
         scored.sort(key=lambda h: -h.support)
         best = scored[: config.shown]
         yield IterationRecord("sample_poses", best[0].pose, candidates=_candidates(best))
@@ -225,6 +227,7 @@ def _optimize_decoupled(
         if solved is None:
             yield _record("decouple", best, matches, None, view)
             break
+        # A later iteration may be worse, as its matches are others.
         if solved.support > most:
             best, most = solved.pose, solved.support
         step_deg, step_units = pose_distance(pose, solved.pose)
@@ -238,6 +241,7 @@ def _descend(start: Pose, images: QueryImages, tools: Tools[Prepared], options: 
     intrinsics = sized(images.query.intrinsics, options.render_px)
     loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     focus = tools.prepared.focus
+    # The loss doesn't fall in every step, so the last pose need not be the best.
     best, least = start, np.inf
     for step in descend(tools.rasterizer, intrinsics, start, loss, focus, options.refinement_steps):
         if step.loss < least:

@@ -115,6 +115,7 @@ def run(
     images = QueryImages(query, tools.matcher)
     loss = loss_against(options.loss, images.resized(intrinsics), images.valid_mask(intrinsics))
     yield IterationRecord("start", start)
+    # The prior itself is one of the hypotheses.
     hypotheses = [_Hypothesis(start, focus)]
     hypotheses += [_drawn(start, config.start_deg, config.start_units, tools) for _ in range(options.hypotheses - 1)]
     for step in range(options.steps):
@@ -129,6 +130,7 @@ def run(
             hypothesis.update(*loss_and_gradient(tools.rasterizer, intrinsics, pose, loss), rates)
             if hypothesis.loss < least:
                 best, least = pose, hypothesis.loss
+        # All hypotheses of every step would fill the trace.
         shown = _candidates(hypotheses) if step % config.recorded_every == 0 else None
         yield IterationRecord("descend", best, loss=least, candidates=shown)
 
@@ -142,6 +144,7 @@ def _resampled(
     keep = min(len(hypotheses), max(config.min_parents, round(len(hypotheses) * config.kept_share / 2**round_number)))
     parents = ranked[:keep]
     children = [
+        # In turn, so that each kept hypothesis has as many others around it.
         _drawn(parents[i % keep].pose, config.child_deg, config.child_units, tools)
         for i in range(len(hypotheses) - keep)
     ]

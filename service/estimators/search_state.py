@@ -201,6 +201,7 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     many = (found.num_inliers or 0) >= state.config.photometric_min_inliers
     pixels_may_decide = stage.expected or (many and not state.images.query.focal_sigma)
     verdict = state.verify(found, pixels_may_decide)
+    # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
     # Of a small copy a doubt may vanish in the full size.
@@ -333,6 +334,7 @@ def _refine_ambiguous(
 
 def _ranked(state: SearchState, answers: list[VerifiedPose]) -> IterationRecord:
     """Make the answer with the least residual the best one; return the record that names the others."""
+    # Residuals decide: verification has accepted all of them.
     (best, _), *others = rank_answers([answer.loss for answer in answers], state.config.answers)
     state.best = answers[best]
     alternatives = None

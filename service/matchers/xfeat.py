@@ -62,6 +62,7 @@ class XFeat:
         An image whose sides are multiples of 32 is not resampled, which is faster and more precise.
         """
         height, width = rgb.shape[:2]
+        # The network normalizes its input, so the sum of the channels serves as well as their mean.
         gray = rgb[..., 0].astype(np.float32) + rgb[..., 1] + rgb[..., 2]
         with torch.inference_mode():
             image = torch.from_numpy(gray)[None, None]
@@ -75,6 +76,7 @@ class XFeat:
             heat = torch.nn.functional.pixel_shuffle(probability, CELL_PX)[0].contiguous().numpy()
         points, scores = _strongest(heat, reliability[0, 0].numpy(), limit, self._config)
         descriptors = _sampled(dense, points / CELL_PX)
+        # Interpolation between cells shortens them; matching takes their inner product for the cosine.
         descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
         scale = np.array([width / size[1], height / size[0]], np.float32)
         return Features(points * scale, scores, descriptors)

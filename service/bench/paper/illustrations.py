@@ -50,6 +50,7 @@ def figure_1(one: BenchScene, config: FigureConfig = FIGURES) -> bytes:
     sidewards = config.translation_units * truth.world_from_camera[:3, 0]
     shifted = _moved(one, truth, np.zeros(3), sidewards)
     both = _moved(one, truth, np.radians(config.start_deg), np.array(config.start_units))
+    # One iteration of DO shows the vectors of the start, before anything is solved.
     first = {"hypotheses": 0, "iterations": 1, "refinement_steps": 0}
     causes = [
         _shown(f"(a) {name}", trial, one, _run(one, trial, start, "mc_do", first).records, 1)[0]
@@ -76,6 +77,7 @@ def _moved(one: BenchScene, pose: Pose, angles: np.ndarray, shift: np.ndarray) -
     """Rotate the camera about the focus by angles (rad) per axis, then translate it (normalized units); world axes."""
     rotation = np.eye(3)
     for axis in range(3):
+        # About the x axis first, as the start poses are rotated.
         rotation = so3_exp(angles[axis] * np.eye(3)[axis]) @ rotation
     matrix = pose.world_from_camera.copy()
     matrix[:3, :3] = rotation @ matrix[:3, :3]
@@ -117,6 +119,7 @@ def _shown(
 def _path(name: str, estimate: PoseEstimate, truth: Pose, one: BenchScene) -> figures.Path3D:
     poses = [record.pose for record in estimate.records]
     positions = np.stack([pose.position_in_world for pose in poses]) * one.units.units_per_scene_unit
+    # The errors are drawn on a logarithmic scale, which has no zero.
     return figures.Path3D(name, positions, np.array([max(pose_distance(p, truth)[0], 1e-3) for p in poses]))
 
 
@@ -141,6 +144,7 @@ def figures_2_and_3(
         names.append(scene)
     if not names:
         return None
+    # As in the tables: a star for the two-core profile.
     starred = {m.name: f"{m.name}*" if m.profile else m.name for m in MAIN}
     columns = ["start", *(starred[m] for m in METHODS), "photo"]
     return figures.pictures(blended, columns, names), figures.pictures(plain, columns, names)
@@ -158,6 +162,7 @@ def _most_answered(lines: Sequence[Line]) -> dict[str, Line]:
 def _photo_and_camera(one: BenchScene, trial: Trial, long_side_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], Camera]:
     query = _query(one, trial)
     intrinsics = query.intrinsics.with_long_side(long_side_px)
+    # In the size of the renders, with which it is blended.
     photo = resized(query.rgb.astype(np.float32), intrinsics.width, intrinsics.height)
     return np.rint(photo).astype(np.uint8), Camera(intrinsics, trial.truth.pose)
 

@@ -165,6 +165,7 @@ def _check_config(spec: RunSpec, subjects: Mapping[str, BenchScene]) -> None:
                     where=str(spec.out),
                     hint="Name another folder.",
                 )
+    # A later call may add methods and scenes to the folder, but not change those it has.
     merged = {part: stored.get(part, {}) | entries for part, entries in now.items()}
     file.write_text(json.dumps(merged, indent=1) + "\n", encoding="utf-8")
 
@@ -196,6 +197,7 @@ def _todo(spec: RunSpec, subjects: Mapping[str, BenchScene]) -> Iterator[tuple[s
     """Yield all queries: a few of every cell and scene first, then more (see `waves`)."""
     for fast, slow in spec.waves:
         for cell in spec.cells:
+            # Slow methods would hold up the first results of all others.
             most = slow if cell.method.name in SLOW else fast
             for scene, one in subjects.items():
                 chosen = _photos_of_cell(one, cell)
@@ -233,6 +235,7 @@ def _answer(scene: str, one: BenchScene, cell: Cell, trial: Trial, spec: RunSpec
     line |= {"within_1deg_0p01": outcome.within((1.0, 0.01))}
     line |= {"stages_cpu_ms": {timing.stage: 1e3 * timing.cpu_s for timing in estimate.timings}}
     line |= {"world_from_camera": estimate.pose.world_from_camera.tolist(), "code": code_digest()}
+    # Curves are only drawn of these, and fill the file.
     if method.name in STEP_CURVES and cell.study == "table2":
         line["curve"] = _curve(estimate, trial, one, spec.curve_points)
     return line
@@ -242,6 +245,7 @@ def _curve(estimate: PoseEstimate, trial: Trial, one: BenchScene, points: int) -
     """Return errors at evenly spread records of the trace: number, degrees, normalized units."""
     records = estimate.records
     stride = max(1, -(-len(records) // points))
+    # The last record is the answer, and always belongs to the curve.
     kept = sorted({*range(0, len(records), stride), len(records) - 1})
     found = []
     for number in kept:
@@ -276,6 +280,7 @@ def _key(line: Mapping[str, Any]) -> Key:
 def code_digest() -> str:
     """Return a digest of the source that determines results; a report lists the versions of its lines."""
     root, digest = Path(__file__).parents[2], hashlib.sha256()
+    # Web, jobs and viewer don't change a pose.
     for folder in ("estimators", "pose", "render", "matchers"):
         for file in sorted((root / folder).rglob("*.py")):
             digest.update(file.read_bytes())

@@ -71,6 +71,7 @@ def tables(lines: Sequence[Line], config: Mapping[str, Any]) -> list[Table]:
         *_ranges(lines),
         *_resolutions(lines, config),
     ]
+    # A run may cover only some of the studies.
     return [table for table in found if table.rows]
 
 
@@ -114,11 +115,13 @@ def _share(lines: Sequence[Line], holds: Callable[[Line], bool]) -> str:
 
 
 def _fraction(value: float) -> str:
+    # As printed in the supplement: no zero before the point.
     return f"{value:.2f}".removeprefix("0")
 
 
 def _named(methods: Sequence[str], lines: Sequence[Line]) -> tuple[str, ...]:
     """Return the methods' names, with a star where their numbers are of the two-core profile."""
+    # A profile changes the method, so its numbers must not pass for the paper's.
     marked = {line["method"] for line in lines if line["profile"]}
     return tuple(f"{method}*" if method in marked else method for method in methods)
 
@@ -176,6 +179,7 @@ def _error_tables(lines: Sequence[Line], scenes: Sequence[str], config: Mapping[
                 values = [f"{scale * reduce([line[key] for line in e]):.3g}" if e else "" for e in here]
                 rows.append((scene, what, "here", *values))
                 part = "rotation_deg" if key == "rotation_deg" else "translation_units"
+                # Published errors are in degrees and units only.
                 if scale == 1.0 and (known := _published_of(f"table{number}", scene, part, methods)):
                     rows.append((scene, what, "published", *known))
         yield Table(
@@ -191,6 +195,7 @@ def _error_tables(lines: Sequence[Line], scenes: Sequence[str], config: Mapping[
 
 def _table_1(lines: Sequence[Line], scenes: Sequence[str]) -> Iterator[Table]:
     chosen, known = _of(lines, study="table1"), published()["table1"]
+    # The supplement has means over data sets, not of scenes.
     groups = ("NeRF-Synthetic", "Mip-NeRF 360", "Deep Blending", "mean")
     rows = []
     for bound, key, holds in (
@@ -235,6 +240,7 @@ def _table_5(lines: Sequence[Line]) -> Iterator[Table]:
         "translation_0p01": ("< 0.01", lambda line: line["translation_units"] <= 0.01),
     }
     rows = []
+    # The row without a name is the descent alone; the default estimator is added for comparison.
     for row, method in [*((row or "descent", f"mc_do:{row or 'descent'}") for row in ABLATION), ("", "view_index")]:
         here = _of(chosen, method=method)
         if here:
@@ -305,6 +311,7 @@ def _resolutions(lines: Sequence[Line], config: Mapping[str, Any]) -> Iterator[T
                 size = (f"{facts['gaussians']:,}", f"{facts['megabytes']:.0f}")
                 share = _share(here, lambda line: line["within_5deg_0p05"])
                 rows.append((f"{pixels} px", scene, *size, *(f"{_stage_s(here, s):.2f}" for s in STAGES), share))
+    # Measured on other scenes and another machine, so it is a note and no column.
     paper = published()["section_c"]
     note = (
         f"Median CPU seconds. Published: MC {paper['mc_s']} s and DO {paper['do_s']} s ({paper['do_iterations']} "
