@@ -92,6 +92,11 @@ def until(condition, seconds: float = 20) -> None:
         time.sleep(0.005)
 
 
+def until_ready(client: httpx.Client) -> None:
+    """Wait until the scenes are loaded and prepared, which takes long where other processes use the CPU."""
+    until(lambda: client.get("/readyz").status_code == 200, 120)
+
+
 @contextmanager
 def fake_estimators() -> Iterator[ModuleType]:
     """The estimators of tests/fake_estimators, registered as any: by lying in the package's folder."""
@@ -107,7 +112,7 @@ def fake_estimators() -> Iterator[ModuleType]:
 @contextmanager
 def ready_service(**changes) -> Iterator[httpx.Client]:
     with serving(create_app(settings(**changes), {"room": make_scene()})) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         yield client
 
 

@@ -14,7 +14,19 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import yaml
-from api_server import ROOT, assert_problem, create_app, events, finished, photo, post, serving, settings, until
+from api_server import (
+    ROOT,
+    assert_problem,
+    create_app,
+    events,
+    finished,
+    photo,
+    post,
+    serving,
+    settings,
+    until,
+    until_ready,
+)
 from PIL import Image
 from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 
@@ -190,7 +202,7 @@ def test_a_full_queue_refuses_and_a_cancelled_job_makes_room(client, stepping):
 
 def test_many_at_once_are_served_or_refused_and_nothing_else(stepping):
     with serving(create_app(settings(workers=2, queue_size=8, rate_limit=""), {"room": make_scene()})) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         with ThreadPoolExecutor(16) as senders:
             answers = list(senders.map(lambda seed: post(client, prefer="", seed=str(seed)), range(100)))
         # 200: on a busy machine a job is sometimes done before its answer is written.
@@ -223,7 +235,7 @@ def test_old_finished_jobs_are_forgotten(stepping):
 def test_the_list_of_jobs_has_pages_and_filters(stepping):
     scenes = {name: make_scene(name) for name in ("attic", "cellar")}
     with serving(create_app(settings(), scenes)) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         made = [post(client, scene=("attic", "cellar")[k % 2], seed=str(k)).json()["id"] for k in range(5)]
         failed = post(client, photo(size=(64, 48)), scene="attic", options={"fail": "bug"}).json()
 
@@ -383,7 +395,7 @@ def test_scenes_are_described(shared):
 def test_the_only_scene_needs_no_name_but_one_of_two_does(stepping):
     scenes = {name: make_scene(name) for name in ("attic", "cellar")}
     with serving(create_app(settings(), scenes)) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         assert post(client, scene="cellar").json()["result"]["scene"]["id"] == "cellar"
         unnamed = post(client)
         assert (unnamed.status_code, unnamed.json()["code"]) == (404, "scene_not_found")
@@ -395,7 +407,7 @@ def test_a_corrupt_scene_is_told_and_harms_no_other(stepping, tmp_path):
         (tmp_path / name).mkdir()
         (tmp_path / name / "scene.ply").write_bytes(text)
     with serving(create_app(settings(scenes=[tmp_path], cache_dir=tmp_path))) as client:
-        until(lambda: not client.get("/readyz").json()["pending"])
+        until(lambda: not client.get("/readyz").json()["pending"], 120)
         ready = client.get("/readyz")
         assert (ready.status_code, len(ready.json()["failed"])) == (503, 2)
         states = {s["id"]: (s["state"], s["error"]["code"]) for s in client.get("/scenes").json()["scenes"]}
@@ -416,7 +428,7 @@ def test_a_scene_still_loading_is_not_ready(stepping):
         assert (ready.status_code, ready.json()["pending"]) == (503, ["scene room: preparing"])
         assert client.get("/livez").status_code == 200
         scene.matcher.go_on.set()
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
 
 
 class HeldMatcher(BlindMatcher):

@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from api_server import ROOT, assert_problem, create_app, serving, settings, until
+from api_server import ROOT, assert_problem, create_app, serving, settings, until_ready
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 
 from service.geometry import look_at, rotation_from_quat
@@ -44,7 +44,7 @@ def place(tmp_path_factory) -> Iterator[tuple[httpx.Client, str, Path]]:
     key = add_key(folder / "keys.json", "tester", "admin")
     changes = {"estimator": "view_index", "scenes": [room], "cache_dir": folder / "cache"}
     with serving(create_app(settings(**changes, keys_file=folder / "keys.json"))) as client:
-        until(lambda: client.get("/readyz").status_code == 200, 110)
+        until_ready(client)
         client.headers["Authorization"] = f"Bearer {key}"
         yield client, key, folder
 

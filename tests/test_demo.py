@@ -20,7 +20,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
-from api_server import ROOT, create_app, serving, settings, until
+from api_server import ROOT, create_app, serving, settings, until_ready
 from documents import blocks, lines_of
 
 from service import jit
@@ -148,7 +148,7 @@ def folder(studio, tmp_path_factory) -> Path:
 def url(studio, cache) -> Iterator[str]:
     app = create_app(settings(estimator="view_index", cache_dir=cache), {"studio": studio})
     with serving(app) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         yield str(client.base_url).rstrip("/")
 
 

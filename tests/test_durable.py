@@ -11,7 +11,7 @@ from types import ModuleType
 
 import httpx
 import pytest
-from api_server import assert_problem, create_app, events, finished, photo, post, serving, settings, until
+from api_server import assert_problem, create_app, events, finished, photo, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
 import service.jobs.photo_store
@@ -25,7 +25,7 @@ def app(folder: Path, **changes):
 
 
 def ready(client: httpx.Client) -> None:
-    until(lambda: client.get("/readyz").status_code == 200)
+    until_ready(client)
 
 
 # ------------------------------------------------------------------ restarts
@@ -172,7 +172,7 @@ def test_a_photo_that_cannot_be_written_is_not_accepted(stepping, tmp_path, monk
             assert "No space left" in told.json()["failed"][0]
         assert client.get("/jobs").json()["jobs"] == []
         assert list((tmp_path / "photos").iterdir()) == []
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         assert post(client).json()["state"] == "succeeded"
 
 

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import test_api
 import test_sequences
-from api_server import GO_ON, create_app, events, finished, post, serving, settings, until
+from api_server import GO_ON, create_app, events, finished, post, serving, settings, until, until_ready
 from stand_ins import PHOTO, TURNED, make_scene, packed, set_up_engine
 from subprocess_engine import SubprocessEngine
 from test_scenes import ply
@@ -300,7 +300,7 @@ def test_a_scene_that_was_unloaded_stays_away(engine, folder):
 def remote(plugins) -> Iterator:
     """A service whose engine is a subprocess."""
     with serving(create_app(settings(), {"room": make_scene()}, subprocess=True)) as client:
-        until(lambda: client.get("/readyz").status_code == 200, 60)
+        until_ready(client)
         yield client
 
 
@@ -346,7 +346,7 @@ SLOW = {"steps": 20, "pause_s": 0.1}
 def test_a_service_whose_engine_dies_makes_the_attempt_again(stepping):
     app = create_app(settings(crashes=2), {"room": make_scene()}, subprocess=True)
     with serving(app) as client:
-        until(lambda: client.get("/readyz").status_code == 200, 60)
+        until_ready(client)
         job = post(client, prefer="", options=SLOW).json()
         path = job["links"]["self"]
         until(lambda: client.get(path).json()["records"] == 2)
@@ -363,7 +363,7 @@ def test_a_service_whose_engine_dies_makes_the_attempt_again(stepping):
 def test_a_job_that_kills_its_engine_is_given_up(stepping):
     app = create_app(settings(crashes=1), {"room": make_scene()}, subprocess=True)
     with serving(app) as client:
-        until(lambda: client.get("/readyz").status_code == 200, 60)
+        until_ready(client)
         path = post(client, prefer="", options=SLOW).headers["location"]
         until(lambda: client.get(path).json()["records"] == 2)
         app.state.parts.engine.child.kill()

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from api_server import assert_problem, create_app, events, finished, serving, settings, until
+from api_server import assert_problem, create_app, events, finished, serving, settings, until_ready
 from stand_ins import make_scene
 
 from service.geometry import look_at
@@ -79,7 +79,7 @@ def taken_over(plugins, tmp_path_factory) -> Iterator[SimpleNamespace]:
     app = create_app(settings(data_dir=folder, crashes=1), {"studio": make_scene("studio")}, keys)
     with serving(app) as client:
         client.headers["Authorization"] = f"Bearer {KEY}"
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         yield SimpleNamespace(client=client, folder=folder)
 
 

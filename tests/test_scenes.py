@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from api_server import assert_problem, create_app, finished, post, serving, settings, until
+from api_server import assert_problem, create_app, finished, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
 from service.errors import BadInput
@@ -63,7 +63,7 @@ def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
     with service_on(folder) as client:
         for name in ("attic", "cellar", "hall"):
             client.post(f"/scenes/{name}/load")
-        until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]), 60)
+        until(lambda: all(scene["state"] == "ready" for scene in client.get("/scenes").json()["scenes"]), 120)
         for asked, expected in (("auto", {"attic", "cellar", "hall"}), (["hall", "attic", "hall"], {"hall", "attic"})):
             job = post(client, scene=asked).json()
             assert (job["state"], job["requested_scene"]) == ("succeeded", asked)
@@ -98,7 +98,7 @@ def states(client: httpx.Client) -> dict[str, str]:
 
 
 def ready(client: httpx.Client) -> None:
-    until(lambda: client.get("/readyz").status_code == 200)
+    until_ready(client)
 
 
 # ------------------------------------------------------------------ in and out of memory
@@ -111,7 +111,7 @@ def test_only_what_is_preloaded_is_awaited_and_the_rest_comes_when_asked_for(ste
         refused = post(client, scene="attic")
         assert_problem(refused, 503, "scene_not_ready", "scene")
         assert refused.headers["retry-after"]
-        until(lambda: states(client)["attic"] == "ready")
+        until(lambda: states(client)["attic"] == "ready", 120)
         assert post(client, scene="attic").json()["state"] == "succeeded"
 
 
@@ -126,7 +126,7 @@ def test_the_scene_not_asked_for_longest_makes_room(stepping, folder):
         ready(client)
         assert post(client, scene="attic").json()["state"] == "succeeded"  # cellar is now the older one
         post(client, scene="hall")
-        until(lambda: states(client) == {"attic": "ready", "cellar": "unloaded", "hall": "ready"})
+        until(lambda: states(client) == {"attic": "ready", "cellar": "unloaded", "hall": "ready"}, 120)
         told = {s["id"]: s["memory_bytes"] for s in client.get("/scenes").json()["scenes"]}
         assert told == {"attic": size, "cellar": None, "hall": size}
 
@@ -142,7 +142,7 @@ def test_a_scene_in_use_is_not_dropped_for_another(stepping, folder):
         stepping.GO_ON.set()
         finished(client, held)
         assert client.post("/scenes/hall/load").status_code == 202
-        until(lambda: states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready"})
+        until(lambda: states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready"}, 120)
 
 
 def test_unloading_waits_for_the_jobs_and_lets_no_new_one_in(stepping, folder):
@@ -157,7 +157,7 @@ def test_unloading_waits_for_the_jobs_and_lets_no_new_one_in(stepping, folder):
         until(lambda: states(client)["attic"] == "unloaded")
         assert_problem(post(client, scene="attic"), 409, "scene_unloaded")
         assert client.post("/scenes/attic/load").json()["state"] == "loading"
-        until(lambda: states(client)["attic"] == "ready")
+        until(lambda: states(client)["attic"] == "ready", 120)
         assert post(client, scene="attic").json()["state"] == "succeeded"
 
 
@@ -207,7 +207,7 @@ def test_an_uploaded_scene_is_used_kept_and_deleted(uploading, stepping, tmp_pat
     )
     made = client.put("/scenes/house", content=packed)
     assert made.status_code == 201
-    until(lambda: states(client)["house"] == "ready")
+    until(lambda: states(client)["house"] == "ready", 120)
     assert sorted(p.name for p in (stored / "house").iterdir()) == ["scene.ply", "transforms.json"]
     held = post(client, prefer="", scene="house", options={"hold": True}).headers["location"]
     assert_problem(client.delete("/scenes/house"), 409, "scene_in_use", "scene")

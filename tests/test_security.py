@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import httpx
 import pytest
 import uvicorn
-from api_server import assert_problem, create_app, finished, photo, post, serving, settings, until
+from api_server import assert_problem, create_app, finished, photo, post, serving, settings, until, until_ready
 from rich.console import Console
 from stand_ins import make_scene
 from websockets.exceptions import InvalidStatus
@@ -44,7 +44,7 @@ def locked(stepping, ring, tmp_path):
     app = create_app(settings(keys_file=tmp_path / "keys.json"), {"room": make_scene()})
     app.include_router(Relay(SimpleNamespace(port=9)).router)  # a viewer that nobody starts
     with serving(app) as client:
-        until(lambda: client.get("/readyz").status_code == 200)
+        until_ready(client)
         yield client
         stepping.GO_ON.set()
 
@@ -387,7 +387,7 @@ def test_logs_have_ids_and_no_secrets(stepping, ring, tmp_path, caplog):
     logger.addHandler(handler)
     try:
         with caplog.at_level(logging.DEBUG), serving(create_app(changes, {"room": make_scene()})) as client:
-            until(lambda: client.get("/readyz").status_code == 200)
+            until_ready(client)
             client.get("/", params={"key": ring["admin"]})
             answer = send(client, ring["localize"], **{"X-Request-ID": "my-request.1"})
             assert answer.headers["x-request-id"] == "my-request.1"
