@@ -211,7 +211,7 @@ def archive_target() -> Target:
 
 
 class HeicChild:
-    """Does what heic_child.py does, without starting Python each time. A crash of the decoder is no finding."""
+    """Does what heic_decoder_process.py does without starting Python each time. That the decoder crashes is no finding."""
 
     def __init__(self) -> None:
         self._process: tuple[int, BinaryIO, BinaryIO] | None = None
@@ -224,7 +224,7 @@ class HeicChild:
         if len(head) < 4:
             _, status = os.waitpid(pid, 0)
             self._process = None
-            raise subprocess.CalledProcessError(status, "heic_child")
+            raise subprocess.CalledProcessError(status, "heic_decoder_process")
         return SimpleNamespace(stdout=told.read(*struct.unpack("<I", head)))
 
     def _started(self) -> tuple[int, BinaryIO, BinaryIO]:
@@ -237,26 +237,27 @@ class HeicChild:
         return pid, os.fdopen(ask, "wb"), os.fdopen(told, "rb")
 
     def _serve(self, asked: BinaryIO, tell: BinaryIO) -> NoReturn:
-        from service.photos import heic_child
+        from service.photos import heic_decoder_process
         from service.photos.images import DEFAULTS
 
         for number in (signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGBUS, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
         while head := asked.read(4):
             signal.alarm(_HANG_S)
-            answer = b"".join(heic_child.decoded(asked.read(*struct.unpack("<I", head)), DEFAULTS.max_pixels))
+            data = asked.read(*struct.unpack("<I", head))
+            answer = b"".join(heic_decoder_process.decoded(data, DEFAULTS.max_pixels))
             tell.write(struct.pack("<I", len(answer)) + answer)
             tell.flush()
         os._exit(0)
 
 
 def photo_target(kind: str) -> Target:
-    import service.photos.images
+    import service.photos.heic
     from service.errors import InvalidImage
     from service.photos.images import read_query
 
     if kind == "heic":
-        service.photos.images.subprocess = SimpleNamespace(
+        service.photos.heic.subprocess = SimpleNamespace(
             run=HeicChild().run,
             CalledProcessError=subprocess.CalledProcessError,
             TimeoutExpired=subprocess.TimeoutExpired,

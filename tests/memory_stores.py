@@ -44,7 +44,7 @@ class MemoryJobStore:
 
     def accept(self, job: NewJob) -> StoredJob:
         with self._lock:
-            if known := self.repeated(job.client, job.idempotency_key, job.digest):
+            if known := self.find_by_key(job.client, job.idempotency_key, job.digest):
                 return known
             given = {field.name: getattr(job, field.name) for field in fields(NewJob)}
             fresh: dict[str, Any] = {
@@ -55,7 +55,7 @@ class MemoryJobStore:
             self._rows[job.id] = _Row(StoredJob(**given, **fresh))
             return self._rows[job.id].job
 
-    def repeated(self, client: str, key: str | None, digest: str) -> StoredJob | None:
+    def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
         with self._lock:
             jobs = [row.job for row in self._rows.values()]
         known = next((j for j in jobs if key is not None and (j.client, j.idempotency_key) == (client, key)), None)
@@ -63,7 +63,7 @@ class MemoryJobStore:
             raise IdempotencyConflict("the key was used for another request.", where="header.idempotency-key")
         return known
 
-    def knows(self, client: str, key: str) -> bool:
+    def has_key(self, client: str, key: str) -> bool:
         with self._lock:
             return any((r.job.client, r.job.idempotency_key) == (client, key) for r in self._rows.values())
 
@@ -228,7 +228,7 @@ class MemoryPhotoStore:
     def original(self, job_id: str) -> bytes:
         return self._read(self._sent, job_id)
 
-    def settle(self, job_id: str, jpeg: bytes | None) -> None:
+    def discard_original(self, job_id: str, jpeg: bytes | None) -> None:
         if jpeg is not None:
             self._kept[job_id] = jpeg
         self._sent.pop(job_id, None)
@@ -240,7 +240,7 @@ class MemoryPhotoStore:
         self._sent.pop(job_id, None)
         self._kept.pop(job_id, None)
 
-    def unsettled(self) -> set[str]:
+    def with_original(self) -> set[str]:
         return set(self._sent)
 
     def ids(self) -> set[str]:

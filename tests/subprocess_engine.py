@@ -18,7 +18,7 @@ from typing import Any
 from service.errors import SceneNotReady
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, OnRecord
-from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
 from service.types import SceneInfo
 
 SetUp = Callable[[EmbeddedEngine], None]
@@ -56,8 +56,8 @@ class SubprocessEngine:
             self.child.start()
             theirs.close()
             threading.Thread(target=self._receive, args=(self._pipe,), daemon=True).start()
-            for scene, awaited in self._scenes.values():
-                self._send(_Call("add", (scene, awaited)))
+            for scene, required in self._scenes.values():
+                self._send(_Call("add", (scene, required)))
             self._send(_Call("start", ()))
 
     def close(self) -> None:
@@ -71,11 +71,11 @@ class SubprocessEngine:
 
     # ------------------------------------------------------------------ scenes
 
-    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
+    def add(self, scene: StoredScene, *, required: bool = False) -> None:
         with self._lock:
-            self._scenes[scene.id] = scene, awaited
+            self._scenes[scene.id] = scene, required
             if self._pipe is not None:
-                self._ask("add", scene, awaited)
+                self._ask("add", scene, required)
 
     def remove(self, scene_id: str) -> None:
         self._ask("remove", scene_id)
@@ -93,7 +93,7 @@ class SubprocessEngine:
     def require(self, scene_id: str) -> SceneInfo:
         return self._ask("require", scene_id)
 
-    def readiness(self) -> Readiness:
+    def readiness(self) -> SceneReadiness:
         return self._ask("readiness")
 
     def load(self, scene_id: str) -> SceneStatus:
@@ -210,7 +210,7 @@ def _run(pipe: Connection, config: EngineConfig, set_up: SetUp) -> None:
                 engine.when_settled(*arguments, lambda: send(number, "value", None))
                 return
             elif name == "add":
-                value = engine.add(arguments[0], awaited=arguments[1])
+                value = engine.add(arguments[0], required=arguments[1])
             else:
                 value = getattr(engine, name)(*arguments)
             send(number, "value", value)

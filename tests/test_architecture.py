@@ -58,11 +58,11 @@ SAME_FLOOR = {
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
 WRAPPED = {
     "PIL": {"service/photos/images.py"},
-    "pi_heif": {"service/photos/heic_child.py"},
+    "pi_heif": {"service/photos/heic_decoder_process.py"},
     "cv2": {
         "service/photos/images.py",
         "service/photos/intrinsics.py",
-        "service/photos/video_child.py",
+        "service/photos/video_decoder_process.py",
         "service/matchers",
         "service/pose",
         "viewer/comparison_images.py",

@@ -42,7 +42,7 @@ from service.jobs.engine import Engine, HeldScenes, LocalizeTask, SequenceSource
 from service.jobs.model import JobRecord
 from service.localize import Cancelled
 from service.photos.images import read_query
-from service.photos.sequence import Reading
+from service.photos.sequence import SequenceOptions
 from service.photos.sequence import packed as packed_photos
 from service.results import StageTiming, Status
 from service.scene_manager.status import AUTO, PictureSpec, StoredScene
@@ -83,7 +83,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module", params=KINDS)
 def engine(request, plugins, folder) -> Iterator[Engine]:
-    """With `room` in memory, `attic` awaited, and files that are loaded when they are asked for."""
+    """With `room` in memory, `attic` required, and files that are loaded when they are asked for."""
     config = EngineConfig("stepping", matcher="sift", rasterizer="cpu")
     if request.param == "subprocess":
         made: Engine = SubprocessEngine(config, partial(set_up_engine, {"room": packed(make_scene())}, GO_ON))
@@ -92,7 +92,7 @@ def engine(request, plugins, folder) -> Iterator[Engine]:
         assert isinstance(made, EmbeddedEngine)
         EmbeddedEngine.add_loaded(made, "room", make_scene())
     assert isinstance(made, Engine)
-    made.add(StoredScene("torn", folder / "torn.ply"), awaited=True)
+    made.add(StoredScene("torn", folder / "torn.ply"), required=True)
     made.start()
     until(lambda: not made.readiness().pending, 60)
     yield made
@@ -201,7 +201,7 @@ def test_a_photo_is_localized_with_a_stream_of_records(engine, held):
 
 def test_a_sequence_is_localized_photo_by_photo(engine, held):
     files = [(f"{k}.jpg", test_api.photo()) for k in range(3)]
-    source = SequenceSource(packed_photos(files), Reading(10, times_s=(0.5, 1.0, 4.0)))
+    source = SequenceSource(packed_photos(files), SequenceOptions(10, times_s=(0.5, 1.0, 4.0)))
     seen: list[tuple[JobRecord, Query | None]] = []
     sequence = replace(task(held, "s", steps=2), source=source)
     answer = engine.localize(sequence, lambda record, shown: seen.append((record, shown)))
@@ -351,7 +351,7 @@ def test_a_service_whose_engine_dies_makes_the_attempt_again(stepping):
         path = job["links"]["self"]
         until(lambda: client.get(path).json()["records"] == 2)
         with client.stream("GET", job["links"]["events"], timeout=60) as stream:
-            app.state.parts.engine.child.kill()
+            app.state.app_state.engine.child.kill()
             told = events("".join(stream.iter_text()))
         restart = [name for name, _, _ in told].index("restarted")
         assert told[restart][1:] == ("", {"attempt": 2})
@@ -366,6 +366,6 @@ def test_a_job_that_kills_its_engine_is_given_up(stepping):
         until_ready(client)
         path = post(client, prefer="", options=SLOW).headers["location"]
         until(lambda: client.get(path).json()["records"] == 2)
-        app.state.parts.engine.child.kill()
+        app.state.app_state.engine.child.kill()
         job = finished(client, path)
         assert (job["state"], job["attempt"], job["error"]["code"]) == ("interrupted", 1, "interrupted")

@@ -109,7 +109,7 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
 
 def on_scene(s: SimpleNamespace, scene: str) -> str:
     """Return the ended job, as if it had been on another scene."""
-    writer = s.app.state.parts.jobs._store._writer
+    writer = s.app.state.app_state.jobs._store._writer
     writer.execute("UPDATE jobs SET scene = ? WHERE id = ?", (scene, s.done))
     return s.done
 
@@ -156,7 +156,7 @@ def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> ht
         patch.setattr(service.jobs.photo_store, "write_durably", full)
         patch.setattr(service.scene_manager.scene_store.os, "fsync", full)
         patch.setattr(service.scene_manager.scene_store.shutil, "rmtree", undeletable)
-        writer = s.app.state.parts.jobs._store._writer
+        writer = s.app.state.app_state.jobs._store._writer
         (pages,) = writer.execute("PRAGMA page_count").fetchone()
         writer.execute(f"PRAGMA max_page_count = {pages}")
         writer.execute("PRAGMA query_only = 1")
@@ -190,7 +190,7 @@ def failing_geopose(s: SimpleNamespace, **options) -> httpx.Response:
 
 def impatient_geopose(s: SimpleNamespace) -> httpx.Response:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(s.app.state.parts.settings, "max_wait_s", 0.3)
+        patch.setattr(s.app.state.app_state.settings, "max_wait_s", 0.3)
         return failing_geopose(s, steps=10**6, pause_s=0.1)
 
 
@@ -203,7 +203,7 @@ def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
         def gone(*_: object) -> None:
             raise Interrupted("told to.")
 
-        patch.setattr(s.app.state.parts.engine, "localize", gone)
+        patch.setattr(s.app.state.app_state.engine, "localize", gone)
         return geopose(s)
 
 
@@ -296,13 +296,13 @@ def recovered(s: SimpleNamespace) -> str:
     """A job after a restart, whose scene isn't there yet."""
     from service.jobs.live_job import LiveJob
 
-    s.app.state.parts.jobs._live[s.done] = LiveJob(s.done, "slow")
-    s.client.event_hooks["response"].append(lambda _: s.app.state.parts.jobs._live.pop(s.done, None))
+    s.app.state.app_state.jobs._live[s.done] = LiveJob(s.done, "slow")
+    s.client.event_hooks["response"].append(lambda _: s.app.state.app_state.jobs._live.pop(s.done, None))
     return s.done
 
 
 def localized(s: SimpleNamespace) -> str:
-    store = s.app.state.parts.jobs._store
+    store = s.app.state.app_state.jobs._store
     writer, result = store._writer, store.result(s.done)
     writer.execute("UPDATE jobs SET status = 'localized' WHERE id = ?", (s.done,))
     writer.execute("UPDATE jobs SET result = ? WHERE id = ?", (encode(replace(result, geo_anchor=None)), s.done))
@@ -313,7 +313,7 @@ def localized(s: SimpleNamespace) -> str:
 
 
 def fileless(s: SimpleNamespace) -> SimpleNamespace:
-    engine = s.app.state.parts.engine
+    engine = s.app.state.app_state.engine
     engine._manager.add(Entry("hall", None, loaded=make_scene("hall"), state="ready"))
     return s
 
@@ -364,14 +364,14 @@ def test_a_bug_in_any_operation_is_told_without_details(stepping):
     app = create_app(settings(), {"good": make_scene("good")})
     assert set(telling("internal_error")) == set(OPERATIONS) - {"live", "get_version"}
     with serving(app) as client:
-        parts = app.state.parts
-        del app.state.parts
+        app_state = app.state.app_state
+        del app.state.app_state
         for name in telling("internal_error"):
             # The queue's state is asked for before anything else; that it fails is no less a bug.
             answer = plainly(client, name)
             assert_problem(answer, 500, "internal_error")
-            assert "parts" not in answer.text
-        app.state.parts = parts
+            assert "app_state" not in answer.text
+        app.state.app_state = app_state
 
 
 WRITING = {name for name, (method, _, _) in OPERATIONS.items() if method != "GET"}

@@ -22,7 +22,7 @@ from api_server import assert_problem, create_app, events, finished, serving, se
 from stand_ins import make_scene
 
 from service.geometry import look_at
-from service.jobs.release_0_1 import old_result
+from service.jobs.migrate_0_1 import old_result
 from service.jobs.sqlite_store import SqliteJobStore
 from service.results import HINTS, Reason
 from service.types import GeoAnchor, Pose

@@ -198,10 +198,10 @@ def test_keys_belong_to_their_client(store):
     with pytest.raises(IdempotencyConflict):
         store.accept(new_job("d", idempotency_key="k", digest="e"))
     with pytest.raises(IdempotencyConflict):
-        store.repeated("c", "k", "e")
-    assert store.repeated("c", "k", "d").id == "a"
-    assert store.repeated("c", None, "d") is None
-    assert (store.knows("c", "k"), store.knows("third", "k")) == (True, False)
+        store.find_by_key("c", "k", "e")
+    assert store.find_by_key("c", "k", "d").id == "a"
+    assert store.find_by_key("c", None, "d") is None
+    assert (store.has_key("c", "k"), store.knows("third", "k")) == (True, False)
 
 
 def test_a_lost_attempt_is_made_again_and_its_late_result_is_refused(store):
@@ -325,12 +325,12 @@ def photos(request, tmp_path) -> PhotoStore:
 def test_a_photo_is_kept_as_sent_then_as_shown_then_not_at_all(photos):
     photos.accept("a", b"sent")
     photos.accept("b", b"other")
-    assert (photos.original("a"), photos.unsettled(), photos.ids()) == (b"sent", {"a", "b"}, {"a", "b"})
+    assert (photos.original("a"), photos.with_original(), photos.ids()) == (b"sent", {"a", "b"}, {"a", "b"})
     with pytest.raises(PhotoGone):
         photos.kept("a")
-    photos.settle("a", b"shown")
-    photos.settle("b", None)
-    assert (photos.kept("a"), photos.unsettled(), photos.ids()) == (b"shown", set(), {"a"})
+    photos.discard_original("a", b"shown")
+    photos.discard_original("b", None)
+    assert (photos.kept("a"), photos.with_original(), photos.ids()) == (b"shown", set(), {"a"})
     for read in (photos.original, photos.kept):
         with pytest.raises(PhotoGone):
             read("b")

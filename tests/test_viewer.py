@@ -95,7 +95,7 @@ def test_playback_stays_within_the_records(moves: list[str | int]) -> None:
     for move in moves:
         if move == "grow":
             count += 3
-            playback.grow(count)
+            playback.set_count(count)
         elif isinstance(move, int):
             playback.go(move) if move % 2 else playback.step(move)
         else:
@@ -106,19 +106,19 @@ def test_playback_stays_within_the_records(moves: list[str | int]) -> None:
 
 def test_playback_follows_a_live_job_until_someone_looks_back() -> None:
     playback = Playback()
-    playback.grow(5)
+    playback.set_count(5)
     assert playback.index == 4
     playback.step(-2)
-    playback.grow(8)
+    playback.set_count(8)
     assert playback.index == 2
     playback.go(7)
-    playback.grow(9)
+    playback.set_count(9)
     assert playback.index == 8
 
 
 def test_play_starts_over_at_the_end_and_stops_there() -> None:
     playback = Playback()
-    playback.grow(3)
+    playback.set_count(3)
     playback.toggle()
     seen = [playback.index]
     while playback.playing:

@@ -156,7 +156,7 @@ def test_nothing_grows_however_long_a_job_is(fake: FakeService, viewer: Viewer) 
         browser.wait(lambda: browser.widget("step")["max"] == 4 and "agree" in browser.text(), "the start")
         (client,) = viewer.server.get_clients().values()
         count = lambda: (len(client.scene._handle_from_node_name), len(browser.widgets))  # noqa: E731
-        browser.wait(lambda: LAST_NODES <= set(browser.nodes), "the 3D")
+        browser.wait(lambda: set(browser.nodes) >= LAST_NODES, "the 3D")
         until(lambda: _nothing_more_comes(browser), "the end of the start")
         before = count()
         for record in records(80)[5:]:
@@ -222,7 +222,7 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
 def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
     fake: FakeService, viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job_display, "ARRIVAL_S", 0.0)
+    monkeypatch.setattr(job_display, "FOLLOW_AFTER_OPEN_S", 0.0)
     job = fake.job("j")
     fake.loading_s = 0.5
     with _browser(viewer, "/jobs/j") as browser:
@@ -409,7 +409,7 @@ def test_a_step_comes_as_widgets_first_and_only_what_changed(
         place = lambda: browser.nodes["/trajectory/current"]["position"]  # noqa: E731
         there = [r.pose.position_in_world for r in records(5)]
         browser.wait(lambda: np.allclose(place(), there[4], atol=1e-6) and _background(browser) == "exact", "the end")
-        browser.wait(lambda: LAST_NODES <= set(browser.nodes), "the job's own 3D")
+        browser.wait(lambda: set(browser.nodes) >= LAST_NODES, "the job's own 3D")
         until(lambda: _nothing_more_comes(browser), "the end of the start")
         before = len(browser.frames)
         browser.set("step", 2)
@@ -513,7 +513,7 @@ def test_no_browser_can_open_a_public_tunnel(
     asked = threading.Event()
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: asked.set())
     if not forbidden:  # shows that the message is the right one: without the ban it has its effect
-        monkeypatch.setattr(viewer_server, "forbid_sharing", lambda server: None)
+        monkeypatch.setattr(viewer_server, "disable_public_tunnels", lambda server: None)
     viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
     try:
         with _browser(viewer) as browser:
@@ -529,7 +529,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
     other: Any = object.__new__(viser.ViserServer)
     other._websock_server, other.stop = SimpleNamespace(_handlers={}), stopped.set
     with pytest.raises(RuntimeError, match="tunnel"):
-        viser_internals.forbid_sharing(other)
+        viser_internals.disable_public_tunnels(other)
     assert stopped.is_set()
 
 

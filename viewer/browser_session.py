@@ -51,7 +51,7 @@ class BrowserSession:
         """Start the session's threads."""
         self._connect_widgets()
         self._connect_player()
-        self._shared.lists.listen(self._lists_changed)
+        self._shared.lists.add_listener(self._lists_changed)
         self._lists_changed()
         self._background.start()
         # Last, so that no action runs before everything is connected.
@@ -67,7 +67,7 @@ class BrowserSession:
             # Idle work is done in small parts, between which new actions are taken first.
             for action in actions or [self._idle]:
                 self._try(action)
-        self._shared.lists.ignore(self._lists_changed)
+        self._shared.lists.remove_listener(self._lists_changed)
         self._job.close()
         # Widgets form reference cycles, which Python would otherwise collect only after many more browsers.
         gc.collect()

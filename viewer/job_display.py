@@ -15,7 +15,7 @@ from viewer.scene_3d import Scene3D
 from viewer.scene_display import SceneDisplay
 from viewer.step_display import StepDisplay
 
-ARRIVAL_S = 2.0
+FOLLOW_AFTER_OPEN_S = 2.0
 """Time after a job was opened in which the view follows its newest pose."""
 
 
@@ -73,11 +73,11 @@ class JobDisplay:
         if self._scene_display.show(stream.job.scene, stream.records[count - 1].pose if count else None):
             self._opened = time.monotonic()
         count = len(stream.records)  # again, as more may have arrived while the scene was loaded
-        self._playback.grow(count)
+        self._playback.set_count(count)
         self._controls.set_step_count(count)
         self._scene.trajectory.show(stream.records[:count], stream.job)
         # The view follows a job that has just been opened; later on it is the user's.
-        if count and (self.step.empty or time.monotonic() < self._opened + ARRIVAL_S):
+        if count and (self.step.empty or time.monotonic() < self._opened + FOLLOW_AFTER_OPEN_S):
             self._scene.look_from_behind(stream.records[count - 1].pose)
         self._show()
 

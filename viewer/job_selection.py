@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from viewer.controls import NO_JOB, NO_SCENE, Controls
 from viewer.job_display import JobDisplay
-from viewer.job_list import JobList
 from viewer.panel_html import headline_html, job_label
 from viewer.scene_display import SceneDisplay
+from viewer.service_lists import ServiceLists
 
 
 class JobSelection:
     """All methods are called from the session's thread; they raise ServiceError or ValueError."""
 
     def __init__(
-        self, controls: Controls, lists: JobList, job: JobDisplay, scene: SceneDisplay, job_id: str | None
+        self, controls: Controls, lists: ServiceLists, job: JobDisplay, scene: SceneDisplay, job_id: str | None
     ) -> None:
         """`job_id`: the job in the page's path; None: follow the newest."""
         self._controls, self._lists, self._job, self._scene = controls, lists, job, scene

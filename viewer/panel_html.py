@@ -26,10 +26,10 @@ from viewer.colours import (
 )
 from viewer.comparison_images import Mode
 from viewer.match_geometry import MatchView, pose_error
-from viewer.service_client import Job, JobOutcome, JobSummary
+from viewer.service_client import Job, JobOutcome, ListedJob
 
 
-def job_label(job: JobSummary) -> str:
+def job_label(job: ListedJob) -> str:
     """Return a job's line in the list of jobs; the id's first digits make it unique."""
     started = datetime.fromisoformat(job.created).astimezone()
     return f"{started:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"

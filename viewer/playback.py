@@ -20,7 +20,7 @@ class Playback:
         """Whether the newest record is shown."""
         return self.index >= self.count - 1
 
-    def grow(self, count: int) -> None:
+    def set_count(self, count: int) -> None:
         """Set the number of records; if live and not playing, show the newest one."""
         self.count = count
         if self.live and not self.playing:

@@ -16,7 +16,7 @@ from viewer.match_geometry import matches_at_pose
 from viewer.scene_3d import Scene3D
 from viewer.scene_cache import SceneContent
 from viewer.service_client import Job, Splats
-from viewer.viser_internals import forbid_sharing
+from viewer.viser_internals import disable_public_tunnels
 
 MAX_SPLATS = 120_000
 """4 MB of the file."""
@@ -36,7 +36,7 @@ def replay_html(stream: JobStream, content: SceneContent) -> str:
     # viser records what a server shows, so a server on loopback runs for as long as the recording takes.
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
-        forbid_sharing(server)
+        disable_public_tunnels(server)
         scene = Scene3D(_RecordingCanvas(server))
         scene.show_scene(_with_fewer_splats(content), None)
         scene.splats.send()

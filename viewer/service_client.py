@@ -55,7 +55,7 @@ class Splats:
 
 
 @dataclass(frozen=True, slots=True)
-class JobSummary:
+class ListedJob:
     """A job as the list of jobs has it."""
 
     id: str
@@ -134,10 +134,10 @@ class ServiceClient:
         """Return the `limit` most important Gaussians of a scene. Raises ValueError, too, for a truncated response."""
         return parse_splats(self._bytes(f"/scenes/{scene_id}/splats", {"max": limit}))
 
-    def jobs(self) -> list[JobSummary]:
+    def jobs(self) -> list[ListedJob]:
         """Return the newest jobs, the newest first."""
         jobs = json.loads(self._bytes("/jobs", {"limit": _JOBS_LISTED}))["jobs"]
-        return [JobSummary(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in jobs]
+        return [ListedJob(j["id"], j["state"], j["scene"], j["created"], j["status"]) for j in jobs]
 
     def job(self, job_id: str) -> Job:
         """Return a job."""

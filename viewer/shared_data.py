@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from viewer.job_list import JobList
 from viewer.job_stream import JobStreams
 from viewer.scene_cache import SceneCache
 from viewer.service_client import ServiceClient
+from viewer.service_lists import ServiceLists
 
 
 class SharedData:
@@ -13,7 +13,7 @@ class SharedData:
 
     def __init__(self, client: ServiceClient) -> None:
         self.client = client
-        self.lists = JobList(client)
+        self.lists = ServiceLists(client)
         self.streams = JobStreams(client)
         self.scenes = SceneCache(client)
 

@@ -12,7 +12,7 @@ import viser
 from viewer.browser_session import BrowserSession
 from viewer.service_client import ServiceClient
 from viewer.shared_data import SharedData
-from viewer.viser_internals import disconnect_all, forbid_sharing, requested_path
+from viewer.viser_internals import disable_public_tunnels, disconnect_all, requested_path
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class Viewer:
         if port not in (0, self.server.get_port()):  # viser silently takes the next free port
             self.server.stop()
             raise OSError(f"port {port} is taken")
-        forbid_sharing(self.server)
+        disable_public_tunnels(self.server)
         self.server.gui.configure_theme(
             dark_mode=True, show_logo=False, show_share_button=False, brand_color=(230, 126, 20)
         )

@@ -19,7 +19,7 @@ def requested_path(server: viser.ViserServer, client_id: int) -> str:
         return "/"
 
 
-def forbid_sharing(server: viser.ViserServer) -> None:
+def disable_public_tunnels(server: viser.ViserServer) -> None:
     """Remove viser's handler by which any browser could open a public tunnel to this server.
 
     Raises RuntimeError, after stopping the server, if the handler isn't found.

@@ -21,7 +21,7 @@ from service.results import PoseEstimate
 from service.scene_manager import scene_images
 from service.scene_manager.manager import Entry, Scenes
 from service.scene_manager.splat_sample import packed_splats
-from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
 from service.tracking import localize_sequence
 from service.types import Query, SceneInfo
 from service.versions import versions
@@ -64,12 +64,12 @@ class EmbeddedEngine:
 
     # ------------------------------------------------------------------ scenes
 
-    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
-        self._manager.add(Entry(scene.id, scene.path, awaited=awaited))
+    def add(self, scene: StoredScene, *, required: bool = False) -> None:
+        self._manager.add(Entry(scene.id, scene.path, required=required))
 
     def add_loaded(self, scene_id: str, loaded: LoadedScene) -> None:
-        """Add a scene that is in memory already and has no file; it is awaited."""
-        self._manager.add(Entry(scene_id, None, loaded=loaded, awaited=True))
+        """Add a scene that is in memory already and has no file; it is required."""
+        self._manager.add(Entry(scene_id, None, loaded=loaded, required=True))
 
     def remove(self, scene_id: str) -> None:
         self._manager.remove(scene_id)
@@ -86,7 +86,7 @@ class EmbeddedEngine:
     def require(self, scene_id: str) -> SceneInfo:
         return self._manager.get(scene_id).scene.info
 
-    def readiness(self) -> Readiness:
+    def readiness(self) -> SceneReadiness:
         return self._manager.readiness()
 
     def load(self, scene_id: str) -> SceneStatus:
@@ -158,14 +158,14 @@ def run_task(
     else:
         found = SceneEstimate(localize(task.source, scenes[0], request, step), scenes[0])
     anchor = found.loaded.scene.info.geo_anchor
-    return JobResult(without_trace(found.estimate), task.decode, anchor, versions()), found.loaded
+    return JobResult(with_last_record_only(found.estimate), task.decode, anchor, versions()), found.loaded
 
 
 def _run_sequence(
     source: SequenceSource, request: Request, loaded: LoadedScene, on_record: OnRecord | None
 ) -> JobResult:
     trajectory = Trajectory()
-    photos = read_sequence(source.data, source.reading)
+    photos = read_sequence(source.data, source.options)
     with closing(photos), closing(localize_sequence(photos, loaded, request)) as poses:
         for found in poses:
             record = trajectory.add(found)
@@ -173,9 +173,9 @@ def _run_sequence(
             if on_record:
                 on_record(record, shown)
     result = trajectory.result(loaded.scene.info.geo_anchor)
-    return replace(result, estimate=without_trace(result.estimate))
+    return replace(result, estimate=with_last_record_only(result.estimate))
 
 
-def without_trace(estimate: PoseEstimate) -> PoseEstimate:
+def with_last_record_only(estimate: PoseEstimate) -> PoseEstimate:
     """Return the estimate with its last record only, of which nothing but the answer is left."""
     return replace(estimate, records=(replace(estimate.records[-1], matches=None, candidates=None),))

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from service.jobs.model import JobRecord, JobResult
-from service.photos.sequence import Reading
+from service.photos.sequence import SequenceOptions
 from service.results import StageTiming
-from service.scene_manager.status import PictureSpec, Readiness, SceneContents, SceneStatus, StoredScene
+from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
 from service.types import Query, SceneInfo
 
 
@@ -38,7 +38,7 @@ class SequenceSource:
     """Several photos, or a video, and how they are read."""
 
     data: bytes
-    reading: Reading
+    options: SequenceOptions
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,15 +80,15 @@ class Engine(Protocol):
     """
 
     def start(self) -> None:
-        """Begin to load the scenes that are awaited."""
+        """Begin to load the scenes that are required."""
         ...
 
     def close(self) -> None:
         """Stop loading and give the scenes' memory back."""
         ...
 
-    def add(self, scene: StoredScene, *, awaited: bool = False) -> None:
-        """Make a scene known without loading it; the engine isn't ready before those that are awaited are."""
+    def add(self, scene: StoredScene, *, required: bool = False) -> None:
+        """Make a scene known without loading it; the engine isn't ready before those that are required are."""
         ...
 
     def remove(self, scene_id: str) -> None:
@@ -111,8 +111,8 @@ class Engine(Protocol):
         """Return what is known of a scene in memory. Raises SceneError, and has it loaded if it may be."""
         ...
 
-    def readiness(self) -> Readiness:
-        """Return whether the scenes that are awaited are loaded and prepared."""
+    def readiness(self) -> SceneReadiness:
+        """Return whether the scenes that are required are loaded and prepared."""
         ...
 
     def load(self, scene_id: str) -> SceneStatus:

@@ -58,7 +58,7 @@ class LiveJob:
     def memory_bytes(self) -> int:
         return self.shown.rgb.nbytes if self.shown else 0
 
-    def beat(self) -> None:
+    def mark_alive(self) -> None:
         """Record that its thread is alive."""
         self._heard = time.monotonic()
 
@@ -67,13 +67,13 @@ class LiveJob:
 
     def begin(self, attempt: int) -> None:
         """Begin an attempt, without the records of the one before."""
-        self.beat()
+        self.mark_alive()
         self.progress = attempt, []
         self.announce()
 
     def add(self, record: JobRecord) -> None:
         """Publish a record."""
-        self.beat()
+        self.mark_alive()
         self.records.append(record)
         self.announce()
 

@@ -116,7 +116,7 @@ class NewJob:
     """Whose it is: the scope of idempotency keys."""
     idempotency_key: str | None
     digest: str
-    """Of the request's meaning: decides whether a repeated key means the same."""
+    """SHA-256 of the validated request and its photo: decides whether a repeated key means the same."""
     created: float
     """Seconds since 1970, like all times here."""
     deadline: float | None
@@ -142,9 +142,9 @@ class StoredJob(NewJob):
     attempt: int
     """How often it was started."""
     lost: int
-    """Attempts whose worker didn't live to their end."""
+    """Attempts whose lease expired before they ended."""
     cancelled: bool
-    """Somebody wants it to end."""
+    """Cancellation was requested."""
     started: float | None
     finished: float | None
     photo_until: float | None

@@ -27,7 +27,7 @@ class PhotoStore(Protocol):
         """Return what was sent. Raises PhotoGone."""
         ...
 
-    def settle(self, job_id: str, jpeg: bytes | None) -> None:
+    def discard_original(self, job_id: str, jpeg: bytes | None) -> None:
         """Replace what was sent by a JPEG for looking at, or by nothing; by nothing, too, if there is no space."""
         ...
 
@@ -39,7 +39,7 @@ class PhotoStore(Protocol):
         """Delete all of a job; without effect if there is nothing."""
         ...
 
-    def unsettled(self) -> set[str]:
+    def with_original(self) -> set[str]:
         """Return the ids of the jobs whose photo is there as it was sent."""
         ...
 
@@ -67,7 +67,7 @@ class FolderPhotoStore:
     def original(self, job_id: str) -> bytes:
         return self._read(f"{job_id}.upload")
 
-    def settle(self, job_id: str, jpeg: bytes | None) -> None:
+    def discard_original(self, job_id: str, jpeg: bytes | None) -> None:
         if jpeg is not None:
             path = self._folder / f"{job_id}.jpg"
             try:
@@ -83,7 +83,7 @@ class FolderPhotoStore:
         for suffix in ("upload", "jpg"):
             (self._folder / f"{job_id}.{suffix}").unlink(missing_ok=True)
 
-    def unsettled(self) -> set[str]:
+    def with_original(self) -> set[str]:
         return {path.stem for path in self._folder.glob("*.upload")}
 
     def ids(self) -> set[str]:

@@ -113,7 +113,7 @@ class JobQueue:
                 if self._closed.is_set():
                     return
                 worker.job = self._queue.popleft()
-                worker.job.beat()
+                worker.job.mark_alive()
             try:
                 self._run(worker.job)
             except Exception:

@@ -12,7 +12,7 @@ from service.errors import InvalidPrior, InvalidRequest
 from service.jobs.engine import LocalizeTask, SequenceSource
 from service.jobs.model import JobSpec
 from service.photos.images import read_query
-from service.photos.sequence import Reading, check_sequence, is_sequence, read_sequence
+from service.photos.sequence import SequenceOptions, check_sequence, is_sequence, read_sequence
 from service.results import StageTiming
 from service.types import Query
 
@@ -76,9 +76,11 @@ def _read_sequence(
             where="scene",
             hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
         )
-    reading = Reading(max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb)
-    check_sequence(data, reading)
-    return next(read_sequence(data, reading)).query, SequenceSource(data, reading)
+    options = SequenceOptions(
+        max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb
+    )
+    check_sequence(data, options)
+    return next(read_sequence(data, options)).query, SequenceSource(data, options)
 
 
 def _require_ascending(times_s: Sequence[float] | None) -> None:

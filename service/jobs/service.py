@@ -97,8 +97,8 @@ class Jobs:
                 self._enqueue_when_ready(job)
         for orphan in self._photos.ids() - self._store.ids():
             self._photos.delete(orphan)
-        for job_id in self._photos.unsettled() - self._live.keys():
-            self._photos.settle(job_id, None)
+        for job_id in self._photos.with_original() - self._live.keys():
+            self._photos.discard_original(job_id, None)
         self._maintenance.start()
 
     # ------------------------------------------------------------------ from outside
@@ -108,7 +108,7 @@ class Jobs:
 
         Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed.
         """
-        if known := self._store.repeated(order.client, order.idempotency_key, order.digest):
+        if known := self._store.find_by_key(order.client, order.idempotency_key, order.digest):
             return known
         held = self._engine.hold(order.spec.scene)
         try:
@@ -191,9 +191,9 @@ class Jobs:
     def running(self) -> int:
         return self._store.count("running")
 
-    def room(self, client: str, key: str | None) -> None:
+    def require_queue_capacity(self, client: str, key: str | None) -> None:
         """Raises QueueFull if a new job would be refused; a repeated one never is."""
-        if self._queue.full() and not (key and self._store.knows(client, key)):
+        if self._queue.full() and not (key and self._store.has_key(client, key)):
             raise QueueFull(f"{self._queue.waiting()} jobs are waiting.", hint="Try again later.")
 
     def stuck_workers(self) -> int:

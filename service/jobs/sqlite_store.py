@@ -1,7 +1,7 @@
 """Jobs on disk (SQLite, WAL): what is accepted here survives a crash. The only file with sqlite3.
 
-Every change of state is a compare-and-set on (state, attempt), so a job can't end twice, whatever threads or
-processes believe. Commits are `synchronous=FULL`: when a method returns, its change is on disk. Specs, photos' data,
+Every change of state is a compare-and-set on (state, attempt), so a job can't end twice, even if several
+threads or processes try to end it. Commits are `synchronous=FULL`: when a method returns, its change is on disk. Specs, photos' data,
 records and results are JSON text of `codec`.
 """
 
@@ -19,6 +19,7 @@ from typing import Any
 
 from service.errors import Failure, IdempotencyConflict, JobNotFound, StorageFailed
 from service.jobs.codec import decode, encode
+from service.jobs.migrate_0_1 import old_failure, old_photo, old_result, old_spec
 from service.jobs.model import (
     ENDED,
     Batch,
@@ -33,7 +34,6 @@ from service.jobs.model import (
     Retention,
     StoredJob,
 )
-from service.jobs.release_0_1 import old_failure, old_photo, old_result, old_spec
 from service.results import Status
 
 _VERSION_1 = """
@@ -144,11 +144,11 @@ class SqliteJobStore:
                 known = _select(writer, "WHERE id = ?", job.id)[0]
         return known
 
-    def repeated(self, client: str, key: str | None, digest: str) -> StoredJob | None:
+    def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
         with self._reading:
             return _repeated(self._reader, client, key, digest)
 
-    def knows(self, client: str, key: str) -> bool:
+    def has_key(self, client: str, key: str) -> bool:
         with self._reading:
             return bool(_select(self._reader, "WHERE client = ? AND idempotency_key = ?", client, key))
 

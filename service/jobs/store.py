@@ -25,11 +25,11 @@ class JobStore(Protocol):
         """Store a new job, or return the one that has its idempotency key. Raises IdempotencyConflict."""
         ...
 
-    def repeated(self, client: str, key: str | None, digest: str) -> StoredJob | None:
+    def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
         """Return the job that has the client's idempotency key. Raises IdempotencyConflict."""
         ...
 
-    def knows(self, client: str, key: str) -> bool:
+    def has_key(self, client: str, key: str) -> bool:
         """Return whether the client has used that idempotency key."""
         ...
 

@@ -90,7 +90,7 @@ class Worker:
             _log.warning("job %s: attempt %d was lost to another", job.id, attempt)
             return
         except EngineLost:
-            # Without its lease it counts as lost: a job that its engine dies of must not be tried for ever.
+            # Without its lease it counts as lost: a job that crashes its engine must not be tried without end.
             _log.error("job %s: its engine ended in attempt %d", job.id, attempt)
             live.held = None
             self.running.discard((job.id, attempt))
@@ -177,7 +177,7 @@ class Worker:
         took_s = job.finished - job.started if job.finished and job.started else None
         self._observer.ended(job.estimator, job.state, job.status, took_s)
         wanted = live.shown is not None and (job.keep_photo or self._config.photo_grace_s > 0)
-        self._photos.settle(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
+        self._photos.discard_original(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
         self.live.pop(live.id, None)
         if live.held is not None:
             self._engine.release(live.held.token)
@@ -200,7 +200,7 @@ class Worker:
                 result = write()
             except StorageFailed as error:
                 self.note_storage(error)
-                live.beat()
+                live.mark_alive()
                 if self.closing.wait(_RETRY_S):
                     return None
             else:

@@ -1,5 +1,5 @@
 """Encoded photos, videos and sequences to `Query`: decoded in bounded time and memory, upright, undistorted.
 
 `images` reads one photo, `intrinsics` its camera, `video` a video's frames; `sequence` reads several photos or a video
-one by one. The `*_child` programs run decoders that hostile files can crash in processes of their own.
+one by one. The `*_decoder_process` programs run decoders that hostile files can crash in processes of their own.
 """

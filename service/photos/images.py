@@ -11,16 +11,9 @@ their EXIF in messengers.
 
 from __future__ import annotations
 
-import base64
-import json
 import logging
-import os
-import re
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from io import BytesIO
-from pathlib import Path
 from typing import Literal
 
 import cv2
@@ -32,12 +25,14 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from service.errors import InvalidImage
+from service.photos.heic import decode_heic
 from service.photos.intrinsics import require_size, undistorted
+from service.photos.jpeg_scans import count_scans
 from service.types import Intrinsics, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
-class PhotoConfig:
+class DecodeConfig:
     """Limits against hostile files, and the size and focal length that a photo is given."""
 
     max_pixels: int = 64 * 1024 * 1024
@@ -63,7 +58,7 @@ class PhotoConfig:
     """In long sides; see the module's docstring."""
 
 
-DEFAULTS = PhotoConfig()
+DEFAULTS = DecodeConfig()
 
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before the size
 # is checked.
@@ -74,9 +69,6 @@ _DECODERS = (
     ("HEIC", None, DEFAULTS.max_pixels, lambda d: d[4:8] == b"ftyp"),
 )
 """Name, Pillow's decoder (none: a process of its own), the most pixels, and whether a file begins like one."""
-_JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]")
-"""Excludes a stuffed byte, and a restart within a scan."""
-_JPEG_SCAN, _JPEG_END = 0xDA, 0xD9
 _ORIENTATIONS = {
     1: (False, False, False),
     2: (False, True, False),
@@ -104,7 +96,7 @@ def read_query(
     `intrinsics` refer to the upright photo in its full size; without them the focal length is EXIF's or a default.
     Transparent parts are invalid in the query's mask and filled with `background_rgb` (0..1): with the scene's, a
     cut-out object has the same edges as in a render. `long_side` is the target in pixels, exceeded by
-    `PhotoConfig.oversize` at most.
+    `DecodeConfig.oversize` at most.
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
@@ -247,7 +239,7 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
             where="photo",
             hint="Send it smaller: more than about 2 megapixels don't help.",
         )
-    if isinstance(photo, JpegImageFile) and (scans := _count_scans(data)) > DEFAULTS.max_scans:
+    if isinstance(photo, JpegImageFile) and (scans := count_scans(data)) > DEFAULTS.max_scans:
         raise InvalidImage(
             f"a JPEG of {scans} scans; the limit is {DEFAULTS.max_scans}.", where="photo", hint="Save it again."
         )
@@ -255,22 +247,11 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
 
 
 def _heic(data: bytes, max_pixels: int) -> Image.Image:
-    """Decode in another process, which may crash; of a larger photo only the header. Raises ValueError."""
-    # -I and an almost empty environment: the process finds its libraries, and nothing of ours.
-    command = [sys.executable, "-I", str(Path(__file__).with_name("heic_child.py")), str(max_pixels)]
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
-    limit_s = DEFAULTS.max_heic_s
-    try:
-        output = subprocess.run(command, input=data, capture_output=True, timeout=limit_s, check=True, env=kept).stdout
-    except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
-        raise ValueError(f"its decoder crashed or took too long ({type(error).__name__})") from error
-    line, _, pixels = output.partition(b"\n")
-    head = json.loads(line)
-    if "error" in head:
-        raise ValueError(head["error"])
-    size = head["width"], head["height"]
-    photo = Image.frombuffer(head["mode"], size, pixels) if pixels else _HeaderOnly(*size)
-    photo.info["exif"] = base64.b64decode(head["exif"])
+    """Decode in another process; of a larger photo only the header. Raises ValueError."""
+    decoded = decode_heic(data, max_pixels, DEFAULTS.max_heic_s)
+    size = decoded.width, decoded.height
+    photo = Image.frombuffer(decoded.mode, size, decoded.pixels) if decoded.pixels else _HeaderOnly(*size)
+    photo.info["exif"] = decoded.exif
     return photo
 
 
@@ -280,18 +261,6 @@ class _HeaderOnly(Image.Image):
     def __init__(self, width: int, height: int) -> None:
         super().__init__()
         self._size = width, height
-
-
-def _count_scans(data: bytes) -> int:
-    """Count a JPEG's scans, up to its end: phones append videos."""
-    at, scans = 2, 0  # behind the start-of-image marker
-    while found := _JPEG_MARKER.search(data, at):
-        kind, at = found[0][-1], found.end()
-        if kind == _JPEG_END:
-            break
-        scans += kind == _JPEG_SCAN
-        at += int.from_bytes(data[at : at + 2])  # the segment's length
-    return scans
 
 
 def _target(size: tuple[int, int], long_side: int) -> tuple[int, int]:

@@ -32,7 +32,7 @@ class SequencePhoto:
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class SequenceOptions:
     """Which photos of a sequence are read, and what is known of their camera."""
 
     limit: int
@@ -67,44 +67,44 @@ def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
     return file.getvalue()
 
 
-def check_sequence(data: bytes, reading: Reading) -> None:
+def check_sequence(data: bytes, options: SequenceOptions) -> None:
     """Check count, times and sizes by the files' headers alone. Raises InvalidImage, InvalidRequest."""
     if is_video(data):
-        if reading.times_s is not None:
+        if options.times_s is not None:
             raise InvalidRequest("a video has its own times.", where="times_s")
-        _check_count(-(-frame_count(data) // reading.every), reading)
+        _check_count(-(-frame_count(data) // options.every), options)
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         entries = archive.infolist()
-        _check_count(-(-len(entries) // reading.every), reading)
-        if reading.times_s is not None and len(reading.times_s) != len(entries):
-            raise InvalidRequest(f"{len(reading.times_s)} times for {len(entries)} photos.", where="times_s")
+        _check_count(-(-len(entries) // options.every), options)
+        if options.times_s is not None and len(options.times_s) != len(entries):
+            raise InvalidRequest(f"{len(options.times_s)} times for {len(entries)} photos.", where="times_s")
         sizes: list[tuple[int, int]] = []
         # Photos that are skipped may be broken: they are never decoded.
-        for index in range(0, len(entries), reading.every):
+        for index in range(0, len(entries), options.every):
             with _at_photo(index):
                 sizes.append(photo_size(archive.read(entries[index])))
                 _check_size(sizes[-1], sizes[0])
 
 
-def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, None, None]:
+def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePhoto, None, None]:
     """Yield the photos, decoded one at a time. Raises InvalidImage, InvalidIntrinsics.
 
     Count and size are checked again: a video's header need not be true, and its frames are counted as they come.
     """
-    given = {"intrinsics": reading.intrinsics, "long_side": PHOTO_LONG_SIDE}
+    given = {"intrinsics": options.intrinsics, "long_side": PHOTO_LONG_SIDE}
     first: tuple[int, int] | None = None
-    for count, (index, name, time_s, source) in enumerate(_sources(data, reading), 1):
-        _check_count(count, reading)
+    for count, (index, name, time_s, source) in enumerate(_sources(data, options), 1):
+        _check_count(count, options)
         with _at_photo(index):
             # The prior is of the first pose; later ones start from the pose before.
-            prior = reading.prior if first is None else None
+            prior = options.prior if first is None else None
             if isinstance(source, bytes):
-                query = read_query(source, prior=prior, background_rgb=reading.background_rgb, **given)
+                query = read_query(source, prior=prior, background_rgb=options.background_rgb, **given)
             else:
                 query = query_of(source, prior=prior, **given)
             if first is None:
-                query = replace(query, region=reading.region)
+                query = replace(query, region=options.region)
             # One camera: intrinsics that are refined with one photo hold for the next.
             size = query.photo_intrinsics.width, query.photo_intrinsics.height
             first = first or size
@@ -112,22 +112,24 @@ def read_sequence(data: bytes, reading: Reading) -> Generator[SequencePhoto, Non
         yield SequencePhoto(name, time_s, query)
 
 
-def _sources(data: bytes, reading: Reading) -> Iterator[tuple[int, str, float, bytes | UInt8[np.ndarray, "h w 3"]]]:
+def _sources(
+    data: bytes, options: SequenceOptions
+) -> Iterator[tuple[int, str, float, bytes | UInt8[np.ndarray, "h w 3"]]]:
     """Yield number, name, time, and the file or the decoded frame."""
     if is_video(data):
-        for frame in read_video(data, reading.every):
+        for frame in read_video(data, options.every):
             yield frame.number, f"frame {frame.number}", frame.time_s, frame.rgb
         return
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        for index, entry in list(enumerate(archive.infolist()))[:: reading.every]:
-            time_s = float(index) if reading.times_s is None else reading.times_s[index]
+        for index, entry in list(enumerate(archive.infolist()))[:: options.every]:
+            time_s = float(index) if options.times_s is None else options.times_s[index]
             yield index, entry.filename.partition("/")[2], time_s, archive.read(entry)
 
 
-def _check_count(count: int, reading: Reading) -> None:
-    if count > reading.limit:
+def _check_count(count: int, options: SequenceOptions) -> None:
+    if count > options.limit:
         raise InvalidImage(
-            f"a sequence may have {reading.limit} photos or frames; these are more.",
+            f"a sequence may have {options.limit} photos or frames; these are more.",
             where="photo",
             hint="Send every=N to use each Nth, or several jobs.",
         )

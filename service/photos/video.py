@@ -1,4 +1,4 @@
-"""A video's frames, one after the other, decoded by `video_child.py` in a process of its own.
+"""A video's frames, one after the other, decoded by `video_decoder_process.py` in a process of its own.
 
 MP4, MOV, WebM, Matroska and AVI, recognized by their first bytes, so that playlists, which such decoders follow, never
 reach it. The size is checked before the first frame is decoded, and again for each frame; frames are counted as they
@@ -31,7 +31,7 @@ MAX_FRAME_PIXELS = 4096 * 2304
 """4K, of cinema and television."""
 MAX_EVERY = 1000
 """Frames that one request may skip between two: each is decoded all the same, within `_FRAME_S`."""
-_CHILD = Path(__file__).with_name("video_child.py")
+_CHILD = Path(__file__).with_name("video_decoder_process.py")
 _FRAME_S = 60
 """Wall time for one message; a thousand frames of 4K, of which the last one is wanted, take 20 s."""
 _STILL_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis", b"jxl ")

@@ -30,7 +30,7 @@ from service.errors import (
     SplatfixError,
 )
 from service.localize import DEFAULT_MATCHER, LoadedScene
-from service.scene_manager.status import AUTO, Readiness, SceneContents, SceneState, SceneStatus
+from service.scene_manager.status import AUTO, SceneContents, SceneReadiness, SceneState, SceneStatus
 from service.scene_manager.warm_up import warm_up
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ _GRACE_S = 5.0
 
 @dataclass(slots=True)
 class Entry:
-    """One scene and how far it has come."""
+    """One scene, the state of loading it, and who uses it."""
 
     id: str
     path: Path | None
@@ -50,7 +50,7 @@ class Entry:
     error: Exception | None = None
     wanted: bool = True
     """Load it when it is asked for."""
-    awaited: bool = False
+    required: bool = False
     """The service isn't ready without it."""
     jobs: int = 0
     """That use it, waiting or running: while there are any it stays."""
@@ -60,7 +60,7 @@ class Entry:
     """To call when it is loaded, or failed to."""
 
     def status(self) -> SceneStatus:
-        """Return what can be said of it."""
+        """Return the scene's state, and its contents if it is loaded."""
         failure = Failure.of(self.error) if self.error else None
         loaded = self.loaded
         if loaded is None:
@@ -103,7 +103,7 @@ class Scenes:
     def start(self) -> None:
         self._thread.start()
         for entry in self.entries():
-            if entry.awaited:
+            if entry.required:
                 self._request(entry)
 
     def close(self) -> None:
@@ -240,19 +240,19 @@ class Scenes:
                 return
         do()
 
-    def readiness(self) -> Readiness:
+    def readiness(self) -> SceneReadiness:
         entries = self.entries()
-        awaited = [f"scene {e.id}: {e.state}" for e in entries if e.awaited and e.state in _UNDER_WAY]
+        required = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.state in _UNDER_WAY]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
         loaded = [e.loaded for e in entries if e.loaded]
-        return Readiness(
-            ready=usable and not awaited,
-            pending=tuple(awaited),
+        return SceneReadiness(
+            ready=usable and not required,
+            pending=tuple(required),
             failed=tuple(failed),
             rasterizers=tuple(sorted({scene.rasterizer.name for scene in loaded})),
             skipped_rasterizers=tuple(
-                sorted({scene.skipped_rasterizers for scene in loaded if scene.skipped_rasterizers})
+                sorted({scene.skipped_rasterizer for scene in loaded if scene.skipped_rasterizer})
             ),
         )
 

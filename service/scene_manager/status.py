@@ -59,7 +59,7 @@ class SceneContents:
 
 
 @dataclass(frozen=True, slots=True)
-class Readiness:
+class SceneReadiness:
     """Whether photos can be localized at full speed, and what is missing."""
 
     ready: bool

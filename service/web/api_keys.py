@@ -36,7 +36,7 @@ class Caller:
     """Of the key."""
     role: Role
 
-    def may(self, role: Role) -> bool:
+    def has_role(self, role: Role) -> bool:
         """Return whether the caller's role includes another."""
         return ROLES.index(self.role) >= ROLES.index(role)
 

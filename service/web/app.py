@@ -41,10 +41,10 @@ from service.web.middleware.proxy import Proxy
 from service.web.middleware.route_lookup import RouteLookup
 from service.web.openapi import description, description_as_yaml
 from service.web.pages import add_pages
-from service.web.problems import install
+from service.web.problems import add_error_handlers
 from service.web.route_policy import RoutePolicy, declare, require_policies
 from service.web.routes import router
-from service.web.routes.dependencies import Parts
+from service.web.routes.dependencies import AppState
 from service.web.settings import Settings
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
@@ -61,7 +61,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     engine = engine or EmbeddedEngine(settings.engine)
     named = _named_scenes(settings)
     for scene in named:
-        engine.add(scene, awaited=settings.preload is None or scene.id in settings.preload)
+        engine.add(scene, required=settings.preload is None or scene.id in settings.preload)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
     viewer = ViewerChild(settings.loopback_url, keys.make_temporary("viewer", "read")) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
@@ -69,7 +69,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         async with AsyncExitStack() as stack:
-            app.state.parts = await _start(stack, settings, engine, named, keys, metrics)
+            app.state.app_state = await _start(stack, settings, engine, named, keys, metrics)
             if viewer and relay:
                 stack.push_async_callback(relay.close)
                 stack.push_async_callback(_cancelled, asyncio.create_task(viewer.supervise()))
@@ -81,7 +81,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
         lifespan=lifespan,
         generate_unique_id_function=lambda route: route.name,
     )
-    install(app)
+    add_error_handlers(app)
     app.include_router(router)
     add_pages(app)
     if relay:
@@ -110,7 +110,7 @@ async def _start(
     named: list[StoredScene],
     keys: KeyRing,
     metrics: Metrics,
-) -> Parts:
+) -> AppState:
     """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
     folder = stack.enter_context(data_folder(settings.data_dir))
     scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
@@ -126,16 +126,16 @@ async def _start(
     await to_thread.run_sync(jobs.start)
     limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
     _add_gauges(metrics, engine, jobs, settings.workers)
-    return Parts(settings, engine, scene_store, jobs, keys, metrics, *limits)
+    return AppState(settings, engine, scene_store, jobs, keys, metrics, *limits)
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
     """Add the layers from the innermost to the outermost, which a request passes first."""
 
-    async def check_room(client: str, idempotency_key: str | None) -> None:
-        await to_thread.run_sync(app.state.parts.jobs.room, client, idempotency_key)
+    async def check_queue(client: str, idempotency_key: str | None) -> None:
+        await to_thread.run_sync(app.state.app_state.jobs.require_queue_capacity, client, idempotency_key)
 
-    app.add_middleware(Limits, settings=settings, check_room=check_room)
+    app.add_middleware(Limits, settings=settings, check_queue=check_queue)
     app.add_middleware(Authentication, rules=access_rules(settings, keys))
     app.add_middleware(RouteLookup, routes=app.routes)
     if settings.cors_origins:

@@ -202,7 +202,7 @@ async def refuse(response: Response, scope: Scope, receive: Receive, send: Send)
     await send({"type": "http.response.body", "body": b""})
 
 
-def install(app: FastAPI) -> None:
+def add_error_handlers(app: FastAPI) -> None:
     """Make the app answer every error with a problem document."""
 
     async def answer(request: Request, error: Exception) -> Response:
@@ -231,7 +231,7 @@ def _allowed(request: Request) -> set[str]:
     return methods
 
 
-def described(errors: Sequence[Any]) -> tuple[str, str]:
+def field_and_message(errors: Sequence[Any]) -> tuple[str, str]:
     """Return the field of pydantic's first error, and the messages of all, joined."""
     places = [".".join(str(part) for part in e["loc"]) for e in errors]
     messages = [e["msg"] if p == places[0] else f"{p}: {e['msg']}" for p, e in zip(places, errors, strict=True)]
@@ -240,5 +240,5 @@ def described(errors: Sequence[Any]) -> tuple[str, str]:
 
 def invalid_request(errors: Sequence[Any]) -> InvalidRequest:
     """Convert FastAPI's validation errors; their location begins with the part of the request (query, path, header)."""
-    where, message = described(errors)
+    where, message = field_and_message(errors)
     return InvalidRequest(message, where=where)

@@ -109,7 +109,7 @@ class Authentication:
             return
         if caller is None:
             raise Unauthorized("an API key is needed here.", hint="Send it: Authorization: Bearer KEY.")
-        if not caller.may(needed):
+        if not caller.has_role(needed):
             raise Forbidden(f"the key's role is {caller.role}, needed is {needed}.")
 
     def _redirect_with_cookie(self, scope: Scope, caller: Caller) -> Response:

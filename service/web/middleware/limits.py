@@ -1,6 +1,8 @@
-"""Requests are refused before their body is read: too frequent, too large, too many at once, or no room in the queue.
+"""Limits of requests: how frequent, how large, how many at once, and whether the queue has capacity.
 
-Each route's policy declares which of these limits count for it, and how large its body may be.
+What is known from the head is checked before the body is read (429, 413, 503). While the body arrives, one that is
+longer than allowed without having announced it, as chunked ones don't, is refused (413), and so is one that takes too
+long (408). Each route's policy declares which of these limits count for it, and how large its body may be.
 """
 
 from __future__ import annotations
@@ -26,13 +28,13 @@ from service.web.settings import Settings
 class Limits:
     """ASGI middleware. Needs the route's policy in the request's state, and the caller if there is one.
 
-    `check_room(client, idempotency key)` raises QueueFull if one more job can't be queued.
+    `check_queue(client, idempotency key)` raises QueueFull if one more job can't be queued.
     """
 
     def __init__(
-        self, app: ASGIApp, settings: Settings, check_room: Callable[[str, str | None], Awaitable[None]]
+        self, app: ASGIApp, settings: Settings, check_queue: Callable[[str, str | None], Awaitable[None]]
     ) -> None:
-        self._app, self._settings, self._check_room = app, settings, check_room
+        self._app, self._settings, self._check_room = app, settings, check_queue
         self._limit: RateLimitItem | None = parse(settings.rate_limit) if settings.rate_limit else None
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._uploads = 0

@@ -1,4 +1,4 @@
-"""Dependencies of the routes: the app's parts, the caller, the sub-path, the job of an id."""
+"""Dependencies of the routes: the app's state, the caller, the sub-path, the job of an id."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from service.web.settings import Settings
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class AppState:
     """Everything that routes use; one per app."""
 
     settings: Settings
@@ -37,7 +37,7 @@ class Parts:
     rendering: anyio.CapacityLimiter
     """Limits the images that are rendered at once for clients: each thread of a renderer keeps working memory."""
 
-    async def drawn(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
+    async def render_in_thread(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
         """Render an image for a client in a thread, and count it in the metrics."""
         began = time.perf_counter()
         picture = await to_thread.run_sync(draw, limiter=self.rendering)
@@ -45,30 +45,30 @@ class Parts:
         return picture
 
 
-def _parts(request: Request) -> Parts:
-    return request.app.state.parts
+def _app_state(request: Request) -> AppState:
+    return request.app.state.app_state
 
 
 def _root(request: Request) -> str:
     return request.scope.get("root_path", "")
 
 
-def _job(parts: PartsOf, job_id: Annotated[str, Path(description="The job's id.")]) -> StoredJob:
-    return parts.jobs.get(job_id)  # not async: reads the disk
+def _job(app_state: AppStateOf, job_id: Annotated[str, Path(description="The job's id.")]) -> StoredJob:
+    return app_state.jobs.get(job_id)  # not async: reads the disk
 
 
 def _caller(request: Request) -> Caller | None:
     return request.state.caller
 
 
-def job_document(parts: Parts, job_id: str, root: str) -> JobOut:
+def job_document(app_state: AppState, job_id: str, root: str) -> JobOut:
     """Describe a job in full, as it stands. Not for the event loop: reads the disk. Raises JobNotFound."""
-    job = parts.jobs.get(job_id)
-    result = parts.jobs.result(job) if job.state == "succeeded" else None
+    job = app_state.jobs.get(job_id)
+    result = app_state.jobs.result(job) if job.state == "succeeded" else None
     return resources.job_out(job, result, root)
 
 
-PartsOf = Annotated[Parts, Depends(_parts)]
+AppStateOf = Annotated[AppState, Depends(_app_state)]
 CallerOf = Annotated[Caller | None, Depends(_caller)]
 RootOf = Annotated[str, Depends(_root)]
 JobOf = Annotated[StoredJob, Depends(_job)]

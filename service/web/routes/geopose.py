@@ -11,8 +11,8 @@ from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
 from service.photos.sequence import is_sequence
 from service.web.problems import problem_answer, problem_of_failure
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import PartsOf
-from service.web.routes.localize import accepted
+from service.web.routes.dependencies import AppStateOf
+from service.web.routes.localize import create_job
 from service.web.schemas import geopose_protocol as gpp
 from service.web.schemas import resources
 from service.web.schemas.conversion import result_out
@@ -47,7 +47,7 @@ router = APIRouter()
 async def geopose(
     wanted: gpp.GeoPoseRequest,
     request: Request,
-    parts: PartsOf,
+    app_state: AppStateOf,
     scene: Annotated[str | None, Query(description="Default: the nearest scene with a `geo_anchor`.")] = None,
     accept: Annotated[str, Header(description=f"`{GEOPOSE}`: return only the pose, as OGC GeoPose 1.0")] = "",
 ) -> Response:
@@ -60,25 +60,25 @@ async def geopose(
     # The protocol has one image for each reading.
     if is_sequence(photo):
         raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
-    named = scene or gpp.nearest_scene(await to_thread.run_sync(parts.engine.scenes), wanted)
-    scene_id = (await to_thread.run_sync(parts.engine.scene, named)).id
-    anchor = (await to_thread.run_sync(parts.engine.require, scene_id)).geo_anchor
+    named = scene or gpp.nearest_scene(await to_thread.run_sync(app_state.engine.scenes), wanted)
+    scene_id = (await to_thread.run_sync(app_state.engine.scene, named)).id
+    anchor = (await to_thread.run_sync(app_state.engine.require, scene_id)).geo_anchor
     if anchor is None:
         raise NoGeoAnchor(f"scene '{scene_id}' has no geo_anchor.", where="scene")
-    wait_s = parts.settings.max_wait_s
+    wait_s = app_state.settings.max_wait_s
     fields = LocalizeFields(scene=scene_id, intrinsics=intrinsics, deadline_s=wait_s)
-    job = await accepted(request, parts, Body(photo, "", {}), fields)
-    if live := parts.jobs.live(job.id):
+    job = await create_job(request, app_state, Body(photo, "", {}), fields)
+    if live := app_state.jobs.live(job.id):
         await live.wait(wait_s)
-    job = await to_thread.run_sync(parts.jobs.get, job.id)
+    job = await to_thread.run_sync(app_state.jobs.get, job.id)
     if not job.ended:
         # The protocol has no second request to fetch the result with.
-        await to_thread.run_sync(parts.jobs.cancel, job)
+        await to_thread.run_sync(app_state.jobs.cancel, job)
         raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
     if job.failure:
         return problem_answer(problem_of_failure(job.failure, request.url.path), request.url.path)
     resources.require_pose(job)
-    result = result_out(await to_thread.run_sync(parts.jobs.result, job))
+    result = result_out(await to_thread.run_sync(app_state.jobs.result, job))
     answer = gpp.response_of(wanted, result, anchor)
     if GEOPOSE in accept:
         return Response(answer.geopose.model_dump_json(), media_type=GEOPOSE)

@@ -19,7 +19,7 @@ from service.jobs.model import JobFilter, JobRecord, JobState
 from service.results import Status
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SMALL_BODY, route_policy
-from service.web.routes.dependencies import JPEG, JobOf, PartsOf, RootOf, job_document
+from service.web.routes.dependencies import JPEG, AppStateOf, JobOf, RootOf, job_document
 from service.web.schemas import resources
 from service.web.schemas.conversion import record_camera, record_out, result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
@@ -32,7 +32,7 @@ router = APIRouter()
 @router.get("/jobs", tags=["jobs"], responses=errors("invalid_request"))
 @route_policy(role="read")
 def list_jobs(
-    parts: PartsOf,
+    app_state: AppStateOf,
     root: RootOf,
     scene: str | None = None,
     estimator: str | None = None,
@@ -45,31 +45,31 @@ def list_jobs(
     """List the stored jobs that match all given filters, newest first, in pages."""
     wanted = JobFilter(scene, estimator, state, status, photo, before)
     # One more than the page has: whether there is a next page.
-    page = parts.jobs.page(wanted, limit + 1)
+    page = app_state.jobs.page(wanted, limit + 1)
     given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
     query = {name: value for name, value in given.items() if value is not None}
     more = f"{root}/jobs?{urlencode(query | {'before': page[limit - 1].number})}" if len(page) > limit else None
     return JobList(
         jobs=[resources.job_summary_out(job, root) for job in page[:limit]],
         next=more,
-        queued=parts.jobs.waiting(),
-        running=parts.jobs.running(),
+        queued=app_state.jobs.waiting(),
+        running=app_state.jobs.running(),
     )
 
 
 @router.get("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found"))
 @route_policy(role="read")
-def get_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
+def get_job(job: JobOf, app_state: AppStateOf, root: RootOf) -> JobOut:
     """Return a job; with its result or its error if it has ended."""
-    return job_document(parts, job.id, root)
+    return job_document(app_state, job.id, root)
 
 
 @router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
 @route_policy(role="localize", body=SMALL_BODY, rate_limited=True)
-def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
+def cancel_job(job: JobOf, app_state: AppStateOf, root: RootOf) -> JobOut:
     """Cancel a job: at once if it is queued, after its current step if it runs, without effect if it has ended."""
-    parts.jobs.cancel(job)
-    return job_document(parts, job.id, root)
+    app_state.jobs.cancel(job)
+    return job_document(app_state, job.id, root)
 
 
 @router.get(
@@ -80,7 +80,7 @@ def cancel_job(job: JobOf, parts: PartsOf, root: RootOf) -> JobOut:
 )
 @route_policy(role="read")
 async def job_events(
-    job: JobOf, parts: PartsOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
+    job: JobOf, app_state: AppStateOf, root: RootOf, last_event_id: Annotated[str, Header()] = ""
 ) -> AsyncIterator[ServerSentEvent]:
     """Stream a job as server-sent events: `record` for each step from the first on, then `result` or `error`.
 
@@ -90,17 +90,17 @@ async def job_events(
     data: `result` if the job succeeded, else `error`. `Last-Event-ID` resumes, also after a restart of the service.
     """
     stream = _EventStream.after(last_event_id)
-    if live := parts.jobs.live(job.id):
+    if live := app_state.jobs.live(job.id):
         async for _ in live.changes():
             attempt, records = live.progress
             if attempt:  # 0: queued again after a restart of the service
                 for event in await stream.events(attempt, records):
                     yield event
-    job = await to_thread.run_sync(parts.jobs.get, job.id)
-    for event in await stream.events(job.attempt, await to_thread.run_sync(parts.jobs.records, job)):
+    job = await to_thread.run_sync(app_state.jobs.get, job.id)
+    for event in await stream.events(job.attempt, await to_thread.run_sync(app_state.jobs.records, job)):
         yield event
     if job.ended:  # else the service is shutting down; the client reconnects with Last-Event-ID
-        ended = await to_thread.run_sync(job_document, parts, job.id, root)
+        ended = await to_thread.run_sync(job_document, app_state, job.id, root)
         name = "result" if ended.result else "error"
         yield ServerSentEvent(event=name, id="end", raw_data=ended.model_dump_json())
 
@@ -145,20 +145,20 @@ def _record_texts(records: Sequence[JobRecord]) -> list[str]:
     responses=JPEG | errors("job_not_found", "photo_gone", "job_not_ready"),
 )
 @route_policy(role="read")
-async def job_photo(job: JobOf, parts: PartsOf) -> Response:
+async def job_photo(job: JobOf, app_state: AppStateOf) -> Response:
     """Return the photo as the estimator gets it: upright, undistorted, reduced if large.
 
     It is deleted some time after the job, unless the request has `keep_photo`.
     """
-    photo = await to_thread.run_sync(parts.jobs.photo, job, limiter=parts.rendering)
+    photo = await to_thread.run_sync(app_state.jobs.photo, job, limiter=app_state.rendering)
     return Response(photo, media_type="image/jpeg")
 
 
 @router.get("/jobs/{job_id}/trace", tags=["jobs"], responses=errors("job_not_found"))
 @route_policy(role="read")
-def job_trace(job: JobOf, parts: PartsOf) -> Trace:
+def job_trace(job: JobOf, app_state: AppStateOf) -> Trace:
     """Return all records of the latest attempt so far."""
-    return resources.trace_out(job, parts.jobs.records(job))
+    return resources.trace_out(job, app_state.jobs.records(job))
 
 
 @router.get(
@@ -170,7 +170,7 @@ def job_trace(job: JobOf, parts: PartsOf) -> Trace:
 @route_policy(role="read")
 async def job_render(
     job: JobOf,
-    parts: PartsOf,
+    app_state: AppStateOf,
     index: Annotated[
         Literal["last"] | Annotated[int, Field(ge=0)], Path(description="Index of the record; `last`: the latest.")
     ],
@@ -180,11 +180,11 @@ async def job_render(
     ] = "pose",
 ) -> Response:
     """Render the scene from the camera of a record."""
-    record = await to_thread.run_sync(parts.jobs.record, job, None if index == "last" else index)
+    record = await to_thread.run_sync(app_state.jobs.record, job, None if index == "last" else index)
     seen_by = record_camera(record.step, job.photo.intrinsics, of_matches=camera == "matches")
     wanted = PictureSpec(seen_by.pose, seen_by.intrinsics)
-    render = partial(parts.engine.render, job.scene, wanted)
-    return Response(await parts.drawn(job.scene, render), media_type="image/jpeg")
+    render = partial(app_state.engine.render, job.scene, wanted)
+    return Response(await app_state.render_in_thread(job.scene, render), media_type="image/jpeg")
 
 
 @router.get(
@@ -200,7 +200,7 @@ async def job_render(
     | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
 )
 @route_policy(role="read")
-def export_pose(job: JobOf, parts: PartsOf, format: Annotated[ExportFormat, Path()]) -> Response:
+def export_pose(job: JobOf, app_state: AppStateOf, format: Annotated[ExportFormat, Path()]) -> Response:
     """Return the pose in the format of another program, unless the job is `not_localized`.
 
     `colmap`: an entry of `images.txt`, with its camera in a comment. `nerfstudio`: an entry of `frames` in
@@ -209,5 +209,5 @@ def export_pose(job: JobOf, parts: PartsOf, format: Annotated[ExportFormat, Path
     an `images.txt`, a `transforms.json`, or a trajectory with the photos' times; `geopose` has the last one only.
     """
     resources.require_pose(job)
-    created, result = datetime.fromtimestamp(job.created, UTC), result_out(parts.jobs.result(job))
+    created, result = datetime.fromtimestamp(job.created, UTC), result_out(app_state.jobs.result(job))
     return Response(exported(format, job.photo.name, created, result), media_type=EXPORT_TYPES[format])

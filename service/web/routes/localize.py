@@ -13,7 +13,7 @@ from service.jobs.model import ENDED, StoredJob
 from service.jobs.service import JobOrder
 from service.web.middleware.limits import client_of
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import Parts, PartsOf, RootOf, job_document
+from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
@@ -83,7 +83,7 @@ _ACCEPTED = {
 async def localize_photo(
     request: Request,
     response: Response,
-    parts: PartsOf,
+    app_state: AppStateOf,
     root: RootOf,
     prefer: Annotated[str, Header(description="`wait=N`: wait up to N s for the job to end before answering")] = "",
     idempotency_key: Annotated[
@@ -100,21 +100,21 @@ async def localize_photo(
     Several photos of one camera, or a video, are one job: the camera is tracked from each frame to the next, an event
     `record` has each frame's answer, and `frames` of the result has all of them.
     """
-    body = await read_body(request, parts.settings.max_frames)
-    job = await accepted(request, parts, body, read_fields(body.fields), idempotency_key)
-    wait_s = min(wait_preference(prefer), parts.settings.max_wait_s)
+    body = await read_body(request, app_state.settings.max_frames)
+    job = await create_job(request, app_state, body, read_fields(body.fields), idempotency_key)
+    wait_s = min(wait_preference(prefer), app_state.settings.max_wait_s)
     if wait_s:
-        if live := parts.jobs.live(job.id):
+        if live := app_state.jobs.live(job.id):
             await live.wait(wait_s)
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
-    answer = await to_thread.run_sync(job_document, parts, job.id, root)
+    answer = await to_thread.run_sync(job_document, app_state, job.id, root)
     response.headers["Location"] = f"{root}/jobs/{job.id}"
     response.status_code = 200 if answer.state in ENDED else 202
     return answer
 
 
-async def accepted(
-    request: Request, parts: Parts, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
+async def create_job(
+    request: Request, app_state: AppState, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
 ) -> StoredJob:
     """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
     client = client_of(request.scope)
@@ -123,10 +123,10 @@ async def accepted(
         sha256 = hashlib.sha256(body.photo).hexdigest()
         # Of the validated fields: the same request as form and as JSON is the same job.
         digest = hashlib.sha256((fields.model_dump_json() + sha256).encode()).hexdigest()
-        spec = job_spec(fields, parts.settings.estimator)
-        return parts.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))
+        spec = job_spec(fields, app_state.settings.estimator)
+        return app_state.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))
 
-    return await to_thread.run_sync(accept, limiter=parts.decoding)
+    return await to_thread.run_sync(accept, limiter=app_state.decoding)
 
 
 def wait_preference(header: str) -> float:

@@ -13,7 +13,7 @@ from service.scene_manager import splat_sample as splats
 from service.scene_manager.scene_images import PICTURE_TYPES
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
-from service.web.routes.dependencies import JPEG, PartsOf, RootOf
+from service.web.routes.dependencies import JPEG, AppStateOf, RootOf
 from service.web.schemas import resources
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.job_spec import checked_intrinsics, pose_from
@@ -27,16 +27,16 @@ router = APIRouter()
 
 @router.get("/scenes", tags=["scenes"], responses=errors())
 @route_policy(role="read")
-def list_scenes(parts: PartsOf, root: RootOf) -> SceneList:
+def list_scenes(app_state: AppStateOf, root: RootOf) -> SceneList:
     """List the scenes with their states."""
-    return SceneList(scenes=[resources.scene_summary_out(scene, root) for scene in parts.engine.scenes()])
+    return SceneList(scenes=[resources.scene_summary_out(scene, root) for scene in app_state.engine.scenes()])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))
 @route_policy(role="read")
-def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
+def get_scene(scene_id: str, app_state: AppStateOf, root: RootOf) -> SceneOut:
     """Return a scene with its training cameras."""
-    return resources.scene_out(parts.engine.scene(scene_id), parts.engine.contents(scene_id), root)
+    return resources.scene_out(app_state.engine.scene(scene_id), app_state.engine.contents(scene_id), root)
 
 
 @router.put(
@@ -59,30 +59,30 @@ def get_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneOut:
 async def upload_scene(
     scene_id: str,
     request: Request,
-    parts: PartsOf,
+    app_state: AppStateOf,
     root: RootOf,
     file: Annotated[str, Query(description="Name of the file; its suffix decides the format.")] = "scene.ply",
 ) -> SceneOut:
     """Upload a scene: the body is a scene file, or a ZIP of a scene folder. It is checked, stored and loaded."""
     # Before the upload of perhaps gigabytes.
-    known = await to_thread.run_sync(parts.engine.scenes)
+    known = await to_thread.run_sync(app_state.engine.scenes)
     if any(scene.id == scene_id for scene in known):
         raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
-    with await to_thread.run_sync(parts.scene_store.draft, scene_id) as draft:
+    with await to_thread.run_sync(app_state.scene_store.draft, scene_id) as draft:
         async for chunk in request.stream():
             await to_thread.run_sync(draft.write, chunk)
         stored = await to_thread.run_sync(draft.commit, file)
-    await to_thread.run_sync(parts.engine.add, stored)
-    return resources.scene_out(await to_thread.run_sync(parts.engine.load, scene_id), None, root)
+    await to_thread.run_sync(app_state.engine.add, stored)
+    return resources.scene_out(await to_thread.run_sync(app_state.engine.load, scene_id), None, root)
 
 
 @router.post(
     "/scenes/{scene_id}/load", status_code=202, tags=["scenes"], responses=errors("scene_not_found", body=True)
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
-def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+def load_scene(scene_id: str, app_state: AppStateOf, root: RootOf) -> SceneSummary:
     """Load a scene into memory and prepare it; also a scene whose loading failed."""
-    return resources.scene_summary_out(parts.engine.load(scene_id), root)
+    return resources.scene_summary_out(app_state.engine.load(scene_id), root)
 
 
 @router.post(
@@ -92,9 +92,9 @@ def load_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     responses=errors("scene_not_found", "bad_input", body=True),
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
-def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
+def unload_scene(scene_id: str, app_state: AppStateOf, root: RootOf) -> SceneSummary:
     """Remove a scene from memory once the last job on it has ended. It accepts no new jobs until it is loaded again."""
-    return resources.scene_summary_out(parts.engine.unload(scene_id), root)
+    return resources.scene_summary_out(app_state.engine.unload(scene_id), root)
 
 
 @router.delete(
@@ -104,15 +104,15 @@ def unload_scene(scene_id: str, parts: PartsOf, root: RootOf) -> SceneSummary:
     responses=errors("scene_not_found", "scene_in_use", "storage_failed", body=True),
 )
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
-def delete_scene(scene_id: str, parts: PartsOf) -> None:
+def delete_scene(scene_id: str, app_state: AppStateOf) -> None:
     """Delete an uploaded scene and its files; not a scene of the settings, nor one that jobs use."""
-    parts.engine.scene(scene_id)  # raises SceneNotFound
-    stored = parts.scene_store.find(scene_id)
+    app_state.engine.scene(scene_id)  # raises SceneNotFound
+    stored = app_state.scene_store.find(scene_id)
     if stored is None or not stored.uploaded:
         raise SceneInUse("this scene is in the service's settings; it can only be unloaded.", where="scene")
     # First from the engine, which refuses while jobs use it.
-    parts.engine.remove(scene_id)
-    parts.scene_store.delete(scene_id)
+    app_state.engine.remove(scene_id)
+    app_state.scene_store.delete(scene_id)
 
 
 @router.get(
@@ -122,10 +122,10 @@ def delete_scene(scene_id: str, parts: PartsOf) -> None:
     responses=JPEG | errors(*SCENE_ERRORS),
 )
 @route_policy(role="read")
-async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
+async def scene_thumbnail(scene_id: str, app_state: AppStateOf) -> Response:
     """Return a small image of the scene from its middle training camera."""
-    draw = partial(parts.engine.thumbnail, scene_id)
-    return Response(await parts.drawn(scene_id, draw), media_type="image/jpeg")
+    draw = partial(app_state.engine.thumbnail, scene_id)
+    return Response(await app_state.render_in_thread(scene_id, draw), media_type="image/jpeg")
 
 
 @router.get(
@@ -143,12 +143,12 @@ async def scene_thumbnail(scene_id: str, parts: PartsOf) -> Response:
 @route_policy(role="read")
 async def scene_splats(
     scene_id: str,
-    parts: PartsOf,
+    app_state: AppStateOf,
     limit: Annotated[int, Query(alias="max", ge=1, le=MAX_SPLATS, description="Most Gaussians to return.")] = 200_000,
 ) -> Response:
     """Return the most important Gaussians of the scene for drawing, as little-endian binary."""
-    pack = partial(parts.engine.splats, scene_id, limit)
-    return Response(await to_thread.run_sync(pack, limiter=parts.rendering), media_type=splats.BINARY)
+    pack = partial(app_state.engine.splats, scene_id, limit)
+    return Response(await to_thread.run_sync(pack, limiter=app_state.rendering), media_type=splats.BINARY)
 
 
 @router.post(
@@ -164,9 +164,9 @@ async def scene_splats(
     ),
 )
 @route_policy(role="read", body=SMALL_BODY, rate_limited=True)
-async def render_scene(scene_id: str, wanted: RenderIn, parts: PartsOf) -> Response:
+async def render_scene(scene_id: str, wanted: RenderIn, app_state: AppStateOf) -> Response:
     """Render a colour image or a depth map of a scene from any pose."""
     intrinsics = None if wanted.intrinsics is None else checked_intrinsics(wanted.intrinsics)
     spec = PictureSpec(pose_from(wanted.pose, "pose"), intrinsics, wanted.format, wanted.quality)
-    draw = partial(parts.engine.render, scene_id, spec)
-    return Response(await parts.drawn(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])
+    draw = partial(app_state.engine.render, scene_id, spec)
+    return Response(await app_state.render_in_thread(scene_id, draw), media_type=PICTURE_TYPES[wanted.format])

@@ -8,7 +8,7 @@ from service.errors import NoKeys
 from service.versions import versions
 from service.web.metrics import METRICS_TYPE
 from service.web.route_policy import SMALL_BODY, route_policy
-from service.web.routes.dependencies import CallerOf, PartsOf
+from service.web.routes.dependencies import AppStateOf, CallerOf
 from service.web.schemas import resources
 from service.web.schemas.error_examples import errors
 from service.web.schemas.system import Capabilities, Liveness, Readiness, Token
@@ -21,9 +21,9 @@ router = APIRouter()
 
 @router.get("/capabilities", tags=["service"], responses=errors())
 @route_policy(role="read")
-def get_capabilities(parts: PartsOf) -> Capabilities:
+def get_capabilities(app_state: AppStateOf) -> Capabilities:
     """Return the estimators with their options, the matchers, renderers and scene formats."""
-    return resources.capabilities(parts.settings)
+    return resources.capabilities(app_state.settings)
 
 
 @router.get("/version", tags=["service"], responses=errors(always=_CANNOT_FAIL))
@@ -42,9 +42,9 @@ async def live() -> Liveness:
 
 @router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not ready"}} | errors())
 @route_policy(role=None)
-def ready(parts: PartsOf, response: Response) -> Readiness:
+def ready(app_state: AppStateOf, response: Response) -> Readiness:
     """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work."""
-    scenes, problems = parts.engine.readiness(), parts.jobs.problems()
+    scenes, problems = app_state.engine.readiness(), app_state.jobs.problems()
     readiness = Readiness(
         ready=scenes.ready and not problems,
         pending=list(scenes.pending),
@@ -63,15 +63,15 @@ def ready(parts: PartsOf, response: Response) -> Readiness:
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}} | errors(),
 )
 @route_policy(role="read")
-def get_metrics(parts: PartsOf) -> Response:
+def get_metrics(app_state: AppStateOf) -> Response:
     """Return the metrics: requests, queue, jobs by stage and status, memory by scene, workers."""
-    return Response(parts.metrics.exposition(), media_type=METRICS_TYPE)
+    return Response(app_state.metrics.exposition(), media_type=METRICS_TYPE)
 
 
 @router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))
 @route_policy(role="read", body=SMALL_BODY, rate_limited=True)
-def make_token(parts: PartsOf, caller: CallerOf) -> Token:
+def make_token(app_state: AppStateOf, caller: CallerOf) -> Token:
     """Make a token with the role of the caller's key, valid for some minutes, to open a page: `/viewer/?token=…`."""
     if caller is None:
         raise NoKeys("the service has no keys: its pages need none.", where="header.authorization")
-    return Token(token=parts.keys.token(caller, TOKEN_S), expires_in_s=TOKEN_S)
+    return Token(token=app_state.keys.token(caller, TOKEN_S), expires_in_s=TOKEN_S)

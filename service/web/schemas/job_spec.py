@@ -23,7 +23,7 @@ from service.localize import DEFAULT_ESTIMATOR
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.prior_region import inside_prior
 from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion
-from service.web.problems import described
+from service.web.problems import field_and_message
 from service.web.schemas.conversion import OPENCV_FROM_OPENGL
 from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields, PoseIn, PriorIn
 
@@ -33,7 +33,7 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
     try:
         return LocalizeFields.model_validate(values)
     except ValidationError as error:
-        where, message = described(error.errors())
+        where, message = field_and_message(error.errors())
         raise FIELD_ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
 
 
@@ -76,7 +76,7 @@ def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
     try:
         return options_adapter(kind).validate_python(dict(values))
     except ValidationError as error:
-        where, message = described(error.errors())
+        where, message = field_and_message(error.errors())
         raise InvalidOptions(message, where=f"options.{where}") from error
 
 
@@ -103,10 +103,10 @@ def checked_intrinsics(values: Mapping[str, Any]) -> Intrinsics:
         raise
 
 
-def prior_from(prior: PriorIn, where: str = "prior") -> tuple[Pose | None, PriorRegion | None]:
-    """Return a prior's approximate pose and its region, each None if not given. Raises InvalidPrior, at `where`."""
+def prior_from(prior: PriorIn) -> tuple[Pose | None, PriorRegion | None]:
+    """Return a prior's approximate pose and its region, each None if not given. Raises InvalidPrior, at `prior`."""
     has_pose = any(getattr(prior, name) is not None for name in (*_POSE_FIELDS, "quaternion_wxyz"))
-    pose = pose_from(prior, where) if has_pose or prior.box is None else None
+    pose = pose_from(prior, "prior") if has_pose or prior.box is None else None
     spreads = [name for name in ("sigma_deg", "sigma_units", "covariance") if getattr(prior, name) is not None]
     try:
         if spreads:
@@ -118,7 +118,7 @@ def prior_from(prior: PriorIn, where: str = "prior") -> tuple[Pose | None, Prior
             raise InvalidPrior("the pose lies outside the box.", where="box", hint="Leave one of them out.")
         return pose, box
     except InvalidPrior as error:
-        error.where = f"{where}.{error.where}"
+        error.where = f"prior.{error.where}"
         raise
 
 

@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable
 
-from viewer.service_client import JobSummary, ServiceClient, ServiceError
+from viewer.service_client import ListedJob, ServiceClient, ServiceError
 
 log = logging.getLogger(__name__)
 
@@ -15,11 +15,11 @@ _POLL_S = 0.5
 Listener = Callable[[], None]
 
 
-class JobList:
+class ServiceLists:
     """Polls on one background thread, never in viser's pool of callbacks, which long requests would exhaust."""
 
     def __init__(self, client: ServiceClient) -> None:
-        self.jobs: tuple[JobSummary, ...] | None = None
+        self.jobs: tuple[ListedJob, ...] | None = None
         """Newest first; up to date while there are listeners; None before the first answer."""
         self.scenes: tuple[str, ...] = ()
         """Ids of the scenes in the service's memory."""
@@ -38,13 +38,13 @@ class JobList:
         self._closed.set()
         self._has_listeners.set()
 
-    def listen(self, listener: Listener) -> None:
-        """Call `listener` on the background thread whenever one of the lists has changed, until `ignore`."""
+    def add_listener(self, listener: Listener) -> None:
+        """Call `listener` on the background thread whenever one of the lists has changed, until `remove_listener`."""
         with self._lock:
             self._listeners.add(listener)
         self._has_listeners.set()
 
-    def ignore(self, listener: Listener) -> None:
+    def remove_listener(self, listener: Listener) -> None:
         """Remove a listener; without listeners polling pauses."""
         with self._lock:
             self._listeners.discard(listener)

@@ -1,9 +1,9 @@
 """Decode one HEIC photo in a process of its own: its decoders are known to crash on hostile files.
 
-    python -I heic_child.py MAX_PIXELS < photo.heic
+    python -I heic_decoder_process.py MAX_PIXELS < photo.heic
 
 Writes a line of JSON, {"error"} or {"width", "height", "mode", "exif" (base64)}, and then the pixels, unless there are
-more than MAX_PIXELS. Started by `images` only; imports nothing of the service. The only file with pi_heif.
+more than MAX_PIXELS. Started by `heic` only; imports nothing of the service. The only file with pi_heif.
 """
 
 from __future__ import annotations

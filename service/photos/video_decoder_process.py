@@ -1,6 +1,6 @@
 """Decode one video in a process of its own: decoders of video are known to crash on hostile files.
 
-    python -I video_child.py EVERY MAX_FRAME_PIXELS < video
+    python -I video_decoder_process.py EVERY MAX_FRAME_PIXELS < video
 
 Each message is two big-endian lengths of 4 bytes, JSON, and pixels (RGB, upright). The first one is of the video,
 {"frames"}, the others of each EVERYth frame, {"number", "time_s", "width", "height"}; {"end"} or {"error", "hint"} is
