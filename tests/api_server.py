@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import httpx
 import numpy as np
@@ -32,6 +33,7 @@ from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.engine import Engine
 from service.localize import LoadedScene
 from service.web.api_keys import KeyRing
+from service.web.schemas.error_examples import EXAMPLES
 from service.web.settings import Settings
 
 ROOT = Path(__file__).parents[1]
@@ -90,6 +92,27 @@ def until(condition, seconds: float = 20) -> None:
     while not condition():
         assert time.monotonic() < deadline, "waited for too long"
         time.sleep(0.005)
+
+
+def assert_as_shown(problem: dict[str, Any]) -> None:
+    """The text of an error is that of its example in openapi.yaml, but for names, numbers and lists of names."""
+    shown = EXAMPLES[problem["code"]].model_dump()
+    for field in ("detail", "where", "hint"):
+        assert _without_values(problem[field]) == _without_values(shown[field]), field
+
+
+def _without_values(text: str) -> str:
+    for pattern, stands in (
+        (r"can't run here: .*", "can't run here: REASON"),
+        (r"'[^' ]*'", "'NAME'"),
+        ("/scenes/[^/]+/", "/scenes/NAME/"),
+        (r"\b[0-9a-f]{16}\b", "ID"),
+        (r"(known|it has): [^.]+", r"\1: NAMES"),
+        (r"\d+/(second|hour)", "RATE"),
+        (r"\d+(\.\d+)?", "NUMBER"),
+    ):
+        text = re.sub(pattern, stands, text)
+    return text
 
 
 def until_ready(client: httpx.Client) -> None:

@@ -211,7 +211,7 @@ def archive_target() -> Target:
 
 
 class HeicChild:
-    """Does what heic_decoder_process.py does without starting Python each time. That the decoder crashes is no finding."""
+    """Does what heic_decoder_process.py does without starting Python each time. A crash in it is no finding."""
 
     def __init__(self) -> None:
         self._process: tuple[int, BinaryIO, BinaryIO] | None = None

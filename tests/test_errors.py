@@ -7,7 +7,7 @@ import json
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,6 +15,7 @@ import httpx
 import pytest
 from api_server import (
     PROBLEM,
+    assert_as_shown,
     assert_problem,
     create_app,
     documented,
@@ -33,6 +34,7 @@ from test_scenes import TRANSFORMS, ply
 import service.jobs.photo_store
 import service.scene_manager.scene_store
 from service.errors import BadInput, SceneError, SplatfixError
+from service.estimators import ESTIMATORS
 from service.jobs.codec import encode
 from service.localize import LoadedScene
 from service.scene_manager.manager import Entry
@@ -61,7 +63,7 @@ def stepping() -> Iterator:
 
 def write_scenes(folder: Path) -> None:
     """One that is well, and one for each thing that can be wrong; all but `plain` have a place on Earth."""
-    broken = {"torn": b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n", "odd": b"?"}
+    broken = {"torn": ply(9)[:-1], "odd": b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"}
     for name in ("good", "plain", "away", "slow", "fat", *broken):
         (folder / name).mkdir(parents=True)
         (folder / name / "scene.ply").write_bytes(broken.get(name) or ply(20_000 if name == "fat" else 50))
@@ -178,6 +180,13 @@ def delete_with_full_disk(s: SimpleNamespace) -> httpx.Response:
     return with_full_disk(s, lambda: s.client.delete(path))
 
 
+def delete_in_use(s: SimpleNamespace) -> httpx.Response:
+    path = uploaded(s)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(s.app.state.app_state.engine._manager.entry("extra"), "jobs", 2)
+        return s.client.delete(path)
+
+
 def failing_geopose(s: SimpleNamespace, **options) -> httpx.Response:
     """GeoPoseProtocol has no options: the estimator gets them behind its back."""
     import service.estimators.stepping as plugin  # type: ignore[import-not-found]
@@ -217,9 +226,11 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
         "/localize", content=photo(), headers={"Content-Type": "image/jpeg"}
     ),
     ("localize_photo", "invalid_image"): lambda s: send_photo(s, b"x"),
-    ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(s, intrinsics={}),
-    ("localize_photo", "invalid_prior"): lambda s: send_photo(s, prior={}),
-    ("localize_photo", "invalid_options"): lambda s: send_photo(s, options={"no": 1}),
+    ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(
+        s, intrinsics=dict.fromkeys(("width", "height", "cx", "cy", "fx", "fy"), 9) | {"fx": 0}
+    ),
+    ("localize_photo", "invalid_prior"): lambda s: send_photo(s, prior={"world_from_camera": [*EYE[:3], [1, 0, 0, 1]]}),
+    ("localize_photo", "invalid_options"): lambda s: send_photo(s, options={"topk": 1}),
     ("localize_photo", "unknown_name"): lambda s: send_photo(s, estimator="magic"),
     ("localize_photo", "backend_missing"): lambda s: send_photo(s, estimator="absent"),
     ("localize_photo", "idempotency_conflict"): twice,
@@ -233,7 +244,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("geopose", "invalid_intrinsics"): lambda s: geopose(s, params={"model": "MAGIC", "modelParams": [1]}),
     ("geopose", "no_pose"): geopose,
     ("geopose", "deadline_exceeded"): impatient_geopose,
-    ("geopose", "estimator_fault"): lambda s: failing_geopose(s, fail="fault"),
+    ("geopose", "estimator_fault"): lambda s: failing_geopose(s, steps=0),
     ("geopose", "interrupted"): interrupted_geopose,
     ("geopose", "storage_failed"): lambda s: with_full_disk(s, lambda: geopose(s)),
     ("list_jobs", "invalid_request"): lambda s: s.client.get("/jobs?limit=0"),
@@ -252,7 +263,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("unload_scene", "scene_not_found"): lambda s: s.client.post("/scenes/none/unload"),
     ("unload_scene", "bad_input"): lambda s: fileless(s).client.post("/scenes/hall/unload"),
     ("delete_scene", "scene_not_found"): lambda s: s.client.delete("/scenes/none"),
-    ("delete_scene", "scene_in_use"): lambda s: s.client.delete("/scenes/good"),
+    ("delete_scene", "scene_in_use"): delete_in_use,
     ("delete_scene", "storage_failed"): delete_with_full_disk,
     ("upload_scene", "invalid_request"): lambda s: s.client.put("/scenes/new?file=a.exe", content=b"x"),
     ("upload_scene", "scene_exists"): lambda s: s.client.put("/scenes/good", content=ply()),
@@ -318,6 +329,15 @@ def fileless(s: SimpleNamespace) -> SimpleNamespace:
     return s
 
 
+# Code -> the operation whose answer its example shows; the other examples are compared where they come up.
+SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_photo"} | {
+    **dict.fromkeys(("deadline_exceeded", "estimator_fault"), "geopose"),
+    **dict.fromkeys(("job_not_ready", "no_pose", "no_geo_anchor"), "export_pose"),
+    **{"photo_gone": "job_photo", "record_not_found": "job_render", "job_not_found": "get_job"},
+    **{"scene_not_found": "get_scene", "bad_input": "unload_scene", "scene_in_use": "delete_scene"},
+    **{"scene_exists": "upload_scene", "no_keys": "make_token", "interrupted": "see test_durable"},
+}
+
 LIKE_ALL = ("unauthorized", "forbidden", "internal_error", "content_too_large", "rate_limited", "queue_full")
 SPECIFIC = [pair for pair in PAIRS if pair[1] not in (*LIKE_ALL, "request_timeout")]
 
@@ -334,6 +354,8 @@ def test_an_operation_gives_the_error_that_it_tells_of(troubled, name, code):
     method, pattern, _ = OPERATIONS[name]
     assert answer.request.method == method
     assert pattern.fullmatch(answer.request.url.path)
+    if name == SHOWN[code]:
+        assert_as_shown(answer.json())
 
 
 def test_nothing_is_provoked_that_is_not_told():
@@ -348,12 +370,14 @@ def telling(code: str) -> list[str]:
 
 
 def test_the_gate_stops_every_operation(stepping, tmp_path):
-    add_key(tmp_path / "keys.json", "reader", "read")
+    key = add_key(tmp_path / "keys.json", "reader", "read")
     app = create_app(settings(keys_file=tmp_path / "keys.json"), {"good": make_scene("good")})
     with serving(app) as client:
         assert set(telling("unauthorized")) == set(OPERATIONS)
         for name in OPERATIONS:
             assert_problem(plainly(client, name, Authorization="Bearer wrong"), 401, "unauthorized")
+        assert_as_shown(plainly(client, "list_jobs").json())
+        assert_as_shown(plainly(client, "localize_photo", Authorization=f"Bearer {key}").json())
     with serving(create_app(settings(), {"good": make_scene("good")})) as client:
         assert set(telling("forbidden")) == set(OPERATIONS)
         for name in OPERATIONS:
@@ -370,6 +394,7 @@ def test_a_bug_in_any_operation_is_told_without_details(stepping):
             # The queue's state is asked for before anything else; that it fails is no less a bug.
             answer = plainly(client, name)
             assert_problem(answer, 500, "internal_error")
+            assert_as_shown(answer.json())
             assert "app_state" not in answer.text
         app.state.app_state = app_state
 
@@ -385,11 +410,13 @@ def test_limits_hold_for_every_operation_that_changes_something(stepping):
         for name in WRITING:
             answer = plainly(client, name)
             assert_problem(answer, 429, "rate_limited")
+            assert_as_shown(answer.json())
             assert int(answer.headers["retry-after"]) > 0
     with serving(create_app(settings(max_uploads=1, rate_limit=""), {"good": make_scene("good")})) as client:
         for name in WRITING:
             status, problem = of_head(client, name, f"Content-Length: {10**13}")
             assert (status, problem["code"]) == (413, "content_too_large")
+            assert_as_shown(problem)
         with upload_under_way(client):
             for name in WRITING:
                 answer = plainly(client, name)
@@ -404,6 +431,7 @@ def test_a_body_that_does_not_come_is_given_up(stepping):
             kind = "multipart/form-data; boundary=x" if name == "localize_photo" else "application/json"
             status, problem = of_head(client, name, f"Content-Type: {kind}\r\nContent-Length: 100", scene="new")
             assert (name, status, problem["code"]) == (name, 408, "request_timeout")
+            assert_as_shown(problem)
 
 
 def of_head(client: httpx.Client, name: str, lines: str, scene: str = "good") -> tuple[int, dict]:
@@ -450,6 +478,21 @@ def test_every_error_has_an_example_and_each_example_its_error():
     assert BadInput.code in EXAMPLES
 
 
+def test_the_names_in_the_examples_are_real():
+    named = EXAMPLES["unknown_name"].detail.rpartition("known: ")[2].rstrip(".").split(", ")
+    assert set(named) == set(ESTIMATORS.names()) - {"absent", "stepping"}
+    named = EXAMPLES["invalid_options"].detail.rpartition("it has: ")[2].rstrip(".").split(", ")
+    assert named == sorted(field.name for field in fields(ESTIMATORS.load("view_index").Options))
+
+
+def test_a_full_queue_is_shown_as_it_is(troubled, monkeypatch):
+    jobs = troubled.app.state.app_state.jobs
+    monkeypatch.setattr(jobs._queue, "full", lambda: True)
+    answer = send_photo(troubled)
+    assert_problem(answer, 503, "queue_full")
+    assert_as_shown(answer.json())
+
+
 def test_the_document_shows_the_examples():
     shown = create_app(settings(estimator="view_index")).openapi()["components"]["examples"]
     assert {code: example["value"] for code, example in shown.items()} == {
@@ -458,8 +501,11 @@ def test_the_document_shows_the_examples():
 
 
 def test_what_belongs_to_no_operation_is_a_problem_document_too(shared):
-    assert_problem(shared.get("/nowhere"), 404, "not_found")
-    assert_problem(shared.put("/localize"), 405, "method_not_allowed")
+    unknown, wrong = shared.get("/nowhere"), shared.put("/localize")
+    assert_problem(unknown, 404, "not_found")
+    assert_problem(wrong, 405, "method_not_allowed")
+    assert_as_shown(unknown.json())
+    assert_as_shown(wrong.json())
     refused = shared.patch("/jobs/x")
     assert_problem(refused, 405, "method_not_allowed")
     assert refused.headers["allow"] == "DELETE, GET"
@@ -475,6 +521,7 @@ def test_a_viewer_that_is_gone_is_told(stepping):
     with serving(app) as client:
         answer = client.get("/viewer/")
         assert_problem(answer, 503, "unavailable")
+        assert_as_shown(answer.json())
         assert answer.headers["retry-after"]
 
 

@@ -31,13 +31,13 @@ def settings_of(given: dict[str, Any]) -> Settings:
     """Return the settings of the environment and the file, overridden by `given`. Raises SplatfixError."""
     from pydantic import ValidationError
 
-    from service.web.problems import described
+    from service.web.problems import field_and_message
     from service.web.settings import Settings
 
     try:
         return Settings(**given)
     except ValidationError as error:
-        where, message = described(error.errors())
+        where, message = field_and_message(error.errors())
         raise InvalidRequest(message, where=where) from error
 
 

@@ -1,8 +1,8 @@
 """Jobs on disk (SQLite, WAL): what is accepted here survives a crash. The only file with sqlite3.
 
 Every change of state is a compare-and-set on (state, attempt), so a job can't end twice, even if several
-threads or processes try to end it. Commits are `synchronous=FULL`: when a method returns, its change is on disk. Specs, photos' data,
-records and results are JSON text of `codec`.
+threads or processes try to end it. Commits are `synchronous=FULL`: when a method returns, its change is on disk.
+Specs, photos' data, records and results are JSON text of `codec`.
 """
 
 from __future__ import annotations

@@ -242,18 +242,16 @@ class Scenes:
 
     def readiness(self) -> SceneReadiness:
         entries = self.entries()
-        required = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.state in _UNDER_WAY]
+        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.state in _UNDER_WAY]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
         loaded = [e.loaded for e in entries if e.loaded]
         return SceneReadiness(
-            ready=usable and not required,
-            pending=tuple(required),
+            ready=usable and not pending,
+            pending=tuple(pending),
             failed=tuple(failed),
             rasterizers=tuple(sorted({scene.rasterizer.name for scene in loaded})),
-            skipped_rasterizers=tuple(
-                sorted({scene.skipped_rasterizer for scene in loaded if scene.skipped_rasterizer})
-            ),
+            skipped_rasterizers=tuple(sorted({scene.skipped_rasterizer for scene in loaded} - {""})),
         )
 
     # ------------------------------------------------------------------ on the loading thread

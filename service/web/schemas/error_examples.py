@@ -1,6 +1,7 @@
 """All errors of the API by code, each with an example, for `openapi.yaml`.
 
-Examples are made from the exceptions that the code raises, so their status and fields are those of real responses.
+Status and fields are those of real responses, since examples are converted as exceptions are. Their texts are copies:
+`test_errors.py` compares each with what a request is answered, but for names and numbers.
 """
 
 from __future__ import annotations
@@ -16,16 +17,22 @@ _JOB, _SCENE = "/jobs/3f9c2a7be1d04c58", "/scenes/studio"
 _AGAIN = "Try again later."
 
 _EXAMPLES: tuple[tuple[Exception, str], ...] = (
-    (e.InvalidRequest("Input should be a valid integer, unable to parse string.", where="seed"), "/localize"),
+    (
+        e.InvalidRequest("Input should be a valid integer, unable to parse string as an integer.", where="seed"),
+        "/localize",
+    ),
     (e.InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo"), "/localize"),
     (e.InvalidIntrinsics("must be a positive focal length in pixels, is 0.0.", where="intrinsics.fx"), "/localize"),
     (e.InvalidPrior("the last row must be 0 0 0 1.", where="prior.world_from_camera"), "/localize"),
     (
-        e.InvalidOptions("'view_index' has no such option; it has: seed_views, top_k.", where="options.topk"),
+        e.InvalidOptions("'view_index' has no such option; it has: candidates, effort.", where="options.topk"),
         "/localize",
     ),
-    (e.UnknownName("there is no 'magic'; known: mc_do, view_index.", where="estimators"), "/localize"),
-    (e.BackendMissing("'gsplat' can't run here: there is no CUDA device.", where="estimators"), "/localize"),
+    (
+        e.UnknownName("there is no 'magic'; known: icomma, inerf, mc_do, pnerf, view_index.", where="estimators"),
+        "/localize",
+    ),
+    (e.BackendMissing("'my_method' can't run here: it needs a CUDA device.", where="estimators"), "/localize"),
     (
         e.IdempotencyConflict(
             "the key was used for job 3f9c2a7be1d04c58, which was another request.",
@@ -59,7 +66,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.SceneInUse("2 jobs use the scene.", where="scene", hint="Unload it, and wait for them."), _SCENE),
     (
         e.CorruptScene(
-            "truncated: the header promises 9 of 'vertex', the file ends after 4.",
+            "truncated: the header has 9 of 'vertex', the file ends after 4.",
             where="scene.ply, byte 1011",
             hint="Copy or export it again.",
         ),
@@ -95,9 +102,9 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         ),
         f"{_JOB}/photo",
     ),
-    (e.DeadlineExceeded("the deadline was over before the job could start.", where="deadline_s"), _JOB),
-    (e.Interrupted("the service ended 3 times while this job ran."), _JOB),
-    (e.EstimatorFault("'view_index' ended without a record."), _JOB),
+    (e.DeadlineExceeded("there was no answer within 60 s."), "/geopose"),
+    (e.Interrupted("the service ended 3 times while this job ran."), "/geopose"),
+    (e.EstimatorFault("'view_index' ended without a record."), "/geopose"),
     (
         e.Unauthorized("an API key is needed here.", hint="Send it: Authorization: Bearer KEY."),
         "/jobs",
