@@ -11,7 +11,19 @@ from types import ModuleType
 
 import httpx
 import pytest
-from api_server import assert_problem, create_app, events, finished, photo, post, serving, settings, until, until_ready
+from api_server import (
+    assert_as_shown,
+    assert_problem,
+    create_app,
+    events,
+    finished,
+    photo,
+    post,
+    serving,
+    settings,
+    until,
+    until_ready,
+)
 from stand_ins import make_scene
 
 import service.jobs.photo_store
@@ -89,6 +101,7 @@ def test_a_job_that_was_there_in_every_crash_is_given_up(crashed):
         job = client.get(f"/jobs/{running}").json()
         assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
         assert job["error"]["instance"] == f"/jobs/{running}"
+        assert_as_shown(job["error"])
         told = events(client.get(f"/jobs/{running}/events").text)
         # The record that was stored before the crash is not lost either.
         assert [(name, number) for name, number, _ in told] == [("record", "1.0"), ("error", "end")]

@@ -49,6 +49,7 @@ PAIRS = [
     for code in sorted(codes)
 ]
 EYE = [[float(i == j) for j in range(4)] for i in range(4)]
+NO_FOCAL = {"width": 96, "height": 64, "fx": 0, "fy": 80, "cx": 48, "cy": 32}
 ANCHOR = {"latitude": 1, "longitude": 2, "height": 3, "enu_from_world": EYE}
 
 
@@ -226,9 +227,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
         "/localize", content=photo(), headers={"Content-Type": "image/jpeg"}
     ),
     ("localize_photo", "invalid_image"): lambda s: send_photo(s, b"x"),
-    ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(
-        s, intrinsics=dict.fromkeys(("width", "height", "cx", "cy", "fx", "fy"), 9) | {"fx": 0}
-    ),
+    ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(s, intrinsics=NO_FOCAL),
     ("localize_photo", "invalid_prior"): lambda s: send_photo(s, prior={"world_from_camera": [*EYE[:3], [1, 0, 0, 1]]}),
     ("localize_photo", "invalid_options"): lambda s: send_photo(s, options={"topk": 1}),
     ("localize_photo", "unknown_name"): lambda s: send_photo(s, estimator="magic"),

@@ -201,7 +201,7 @@ def test_keys_belong_to_their_client(store):
         store.find_by_key("c", "k", "e")
     assert store.find_by_key("c", "k", "d").id == "a"
     assert store.find_by_key("c", None, "d") is None
-    assert (store.has_key("c", "k"), store.knows("third", "k")) == (True, False)
+    assert (store.has_key("c", "k"), store.has_key("third", "k")) == (True, False)
 
 
 def test_a_lost_attempt_is_made_again_and_its_late_result_is_refused(store):

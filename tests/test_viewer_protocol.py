@@ -344,7 +344,7 @@ def _rendered_from(fake: FakeService) -> np.ndarray:
 
 def _nothing_more_comes(browser: FakeBrowser) -> bool:
     count = len(browser.frames)
-    time.sleep(0.3)
+    time.sleep(0.6)  # longer than the view must rest before it is rendered
     return len(browser.frames) == count
 
 
@@ -410,6 +410,8 @@ def test_a_step_comes_as_widgets_first_and_only_what_changed(
         there = [r.pose.position_in_world for r in records(5)]
         browser.wait(lambda: np.allclose(place(), there[4], atol=1e-6) and _background(browser) == "exact", "the end")
         browser.wait(lambda: set(browser.nodes) >= LAST_NODES, "the job's own 3D")
+        (client,) = viewer.server.get_clients().values()
+        browser.wait(lambda: not client.scene._handle_from_node_name["/splats/splats"].visible, "the view at rest")
         until(lambda: _nothing_more_comes(browser), "the end of the start")
         before = len(browser.frames)
         browser.set("step", 2)

@@ -34,7 +34,7 @@ class Limits:
     def __init__(
         self, app: ASGIApp, settings: Settings, check_queue: Callable[[str, str | None], Awaitable[None]]
     ) -> None:
-        self._app, self._settings, self._check_room = app, settings, check_queue
+        self._app, self._settings, self._check_queue = app, settings, check_queue
         self._limit: RateLimitItem | None = parse(settings.rate_limit) if settings.rate_limit else None
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._uploads = 0
@@ -70,7 +70,7 @@ class Limits:
         if policy.body:
             _check_length(scope, policy.body.max_bytes(self._settings))
         if policy.queues_job:
-            await self._check_room(client_of(scope), Headers(scope=scope).get("idempotency-key"))
+            await self._check_queue(client_of(scope), Headers(scope=scope).get("idempotency-key"))
         if policy.body and self._uploads >= self._settings.max_uploads:
             raise QueueFull(f"{self._uploads} uploads are under way.", hint="Try again later.")
 

@@ -29,7 +29,9 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/localize",
     ),
     (
-        e.UnknownName("there is no 'magic'; known: icomma, inerf, mc_do, pnerf, view_index.", where="estimators"),
+        e.UnknownName(
+            "there is no 'magic'; known: icomma, inerf, inerf_dagger, mc_do, pnerf, view_index.", where="estimators"
+        ),
         "/localize",
     ),
     (e.BackendMissing("'my_method' can't run here: it needs a CUDA device.", where="estimators"), "/localize"),
