@@ -73,5 +73,6 @@ def bench_localize(
         )
     write_json(json_file, outcome)
     for name, value in outcome.items():
+        # Hundreds of rows, for the file.
         if name != "per_query":
             say(f"{name:28} {short(value)}")

@@ -41,5 +41,6 @@ def bench_track(
         )
     write_json(json_file, outcome)
     for name, value in outcome.items():
+        # Hundreds of rows, for the file.
         if name != "per_frame":
             say(f"{name:28} {short(value)}")

@@ -44,8 +44,9 @@ def findings() -> Iterator[Finding]:
     """Examine the machine, yielding each finding as it is made: some take seconds."""
     yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
-    chosen, skipped_rasterizers = choose_rasterizer()
-    yield Finding("renders with", True, f"{chosen} ({skipped_rasterizers})" if skipped_rasterizers else chosen)
+    chosen, skipped_rasterizer = choose_rasterizer()
+    yield Finding("renders with", True, f"{chosen} ({skipped_rasterizer})" if skipped_rasterizer else chosen)
+    # A scene that does not fit into the GPU's memory is rendered on the CPU, so that must work in any case.
     for name in dict.fromkeys((chosen, "cpu")):
         yield _tried(f"renderer {name}", partial(_try_renderer, name))
     yield _tried("matcher", _try_matcher)
@@ -70,6 +71,7 @@ def processor() -> str:
     """Return the processor's name, cores, SIMD extensions and load, on which every timing depends."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.exists() else []
+    # One block for each core: of the same keys, the last core's value stays.
     values = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = set(values.get("flags", values.get("Features", "")).split())
     simd = [name for name in ("avx512f", "avx512bw", "avx2", "fma", "asimd", "sve") if name in flags]

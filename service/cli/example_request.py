@@ -21,6 +21,7 @@ def curl_line(
     url: str, folder: Path | None, cameras: Sequence[NamedCamera], *, scene_id: str = "", key: str = ""
 ) -> str:
     """Return a shell command that localizes a photo of the folder, or a placeholder `PHOTO.jpg` if it has none."""
+    # A scene that is a single file lies among files that have nothing to do with it.
     photo = example_photo(folder, cameras) if folder and folder.is_dir() else None
     parts = ["curl", "-H", "Prefer: wait=30", "-F", f"photo=@{photo or 'PHOTO.jpg'}"]
     if key:
@@ -45,10 +46,12 @@ def _needed_intrinsics(photo: Path, cameras: Sequence[NamedCamera]) -> dict[str,
     """Return the intrinsics of a training photo of the same size, if the photo has no focal length in EXIF."""
     try:
         query = read_query(photo.read_bytes())
+    # Any file may have such a suffix; an example that fails is no reason not to start.
     except BadInput:
         return None
     size = (query.photo_intrinsics.width, query.photo_intrinsics.height)
     fitting = [c.camera.intrinsics for c in cameras]
+    # Of another size it is another camera, or a resized photo.
     fitting = [i for i in fitting if (i.width, i.height) == size]
     if query.intrinsics_source != "guessed" or not fitting:
         return None

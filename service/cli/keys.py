@@ -21,6 +21,7 @@ def add_key(
     """Make an API key and print it; only its hash is kept."""
     from service.web import api_keys
 
+    # Without rich: the key alone, for scripts.
     typer.echo(api_keys.add_key(_keys_file(), name, role))
 
 

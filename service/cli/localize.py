@@ -77,6 +77,7 @@ def localize(
     paths = [path for given_path in scene for path in find_scenes(given_path)]
     if track_camera:
         _require_one_scene(paths)
+    # Last: faults of photos and fields are reported without waiting for it.
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
     output = _Output(as_json, csv_file, tum_file)
     if track_camera:
@@ -124,8 +125,10 @@ def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[Load
         result, _ = run_task(photo.task(spec), loaded)
         results.append((body.name, result_out(result)))
         if not output.as_json:
+            # At once, not in the end: a photo may take seconds.
             say(result_tables.photo_line(*results[-1]))
     if output.as_json:
+        # One document, so that it can be parsed as a whole.
         print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
     if output.csv_file:
         result_tables.write_photo_table(output.csv_file, results)

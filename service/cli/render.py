@@ -22,6 +22,7 @@ def render(
     from service.scene_manager.status import PictureSpec
     from service.web.schemas.job_spec import checked_intrinsics, pose_from, read_fields
 
+    # `truth` is the field of the API that is a pose and nothing else.
     fields = read_fields({"truth": parsed_option(pose, "truth")})
     if fields.truth is None:
         raise InvalidRequest("a pose is required.", where="--pose")

@@ -74,6 +74,7 @@ def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
             "views": len(cameras),
             "coverage": coverage(scene, rasterizer, cameras),
         }
+    # Without training cameras the index places its views itself, which depends on the seed.
     found = find_views(scene, rasterizer, rng)
     return {
         "placed_by": "the scene itself",

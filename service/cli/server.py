@@ -31,10 +31,12 @@ def run(settings: Settings, out: Console, err: Console) -> None:
     if settings.data_dir is None and settings.port:  # a random port is never the same again
         settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
     keys = KeyRing(settings.keys_file)
+    # Beyond this machine nobody may come in without a key, so one is made where there is none.
     key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_temporary("start", "admin")
     # The socket first: the port is known, and an error is reported before scenes are loaded.
     with _listener(settings.host, settings.port) as listener:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+        # After the port: the viewer gets the address of the service.
         application = create_app(settings, keys=keys)
         server = uvicorn.Server(
             uvicorn.Config(
@@ -68,13 +70,14 @@ def _announce(
 ) -> None:
     """Wait until the service is ready, then print its addresses and an example request."""
     with err.status("starting") as status:
+        # uvicorn has no event for it; the app makes its state while it starts.
         while not server.started:
             time.sleep(0.05)
-        parts = application.state.parts
-        while pending := parts.engine.readiness().pending:
+        app_state = application.state.app_state
+        while pending := app_state.engine.readiness().pending:
             status.update(", ".join(pending))
             time.sleep(0.1)
-    readiness, url = parts.engine.readiness(), settings.loopback_url
+    readiness, url = app_state.engine.readiness(), settings.loopback_url
     query = f"?key={key}" if key else ""
     for reason in readiness.failed:
         err.print(f"not usable: {reason}", style="red", markup=False, highlight=False, soft_wrap=True)
@@ -84,13 +87,14 @@ def _announce(
         *([f"  viewer      {url}/viewer/{query}"] if settings.viewer else []),
         f"  API         {url}/docs",
     ]
-    scenes = parts.engine.scenes()
+    scenes = app_state.engine.scenes()
     ready = [scene.id for scene in scenes if scene.state == "ready"]
     if key:
         lines += ["The key was made for this run only; `splatfix keys add NAME` makes lasting ones."]
-    contents = parts.engine.contents(ready[0]) if ready else None
+    contents = app_state.engine.contents(ready[0]) if ready else None
     if ready and contents:
-        stored = parts.scene_store.find(ready[0])
+        stored = app_state.scene_store.find(ready[0])
+        # With one scene a request need not name it: a shorter example.
         named = ready[0] if len(scenes) > 1 else ""
         example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=key)
         lines += ["Try it:", f"  {example}"]

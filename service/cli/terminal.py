@@ -29,6 +29,7 @@ JsonFileOption = Annotated[Path | None, typer.Option("--json", help="Write the w
 
 def settings_of(given: dict[str, Any]) -> Settings:
     """Return the settings of the environment and the file, overridden by `given`. Raises SplatfixError."""
+    # Imports in functions: `--help` and shell completion must not wait for numpy and FastAPI.
     from pydantic import ValidationError
 
     from service.web.problems import field_and_message
@@ -57,6 +58,7 @@ def parsed_option(text: str, where: str) -> Any:
 
     if not text:
         return None
+    # No file name begins with a bracket in practice, and all options of this kind are objects or lists.
     return parsed_json(text if text.lstrip()[:1] in ("{", "[") else read_file(Path(text)), where)
 
 

@@ -61,6 +61,7 @@ def _typed(kind: Any, value: Any) -> Any:
     if dataclasses.is_dataclass(kind):
         hints = _hints(kind)  # type: ignore[arg-type]
         return kind(**{name: _typed(hints[name], item) for name, item in value.items()})  # type: ignore[operator]
+    # The annotation has dtype and fixed dimensions, so they need not be stored.
     if isinstance(kind, type) and issubclass(kind, AbstractArray):
         return np.array(value, np.dtype(kind.dtypes[0])).reshape(_shape(kind, value))
     if origin is tuple:
@@ -87,6 +88,7 @@ def _member(members: tuple[Any, ...], value: Any) -> Any:
         is_object = dataclasses.is_dataclass(member)
         if is_object and isinstance(value, dict) and set(value) == set(_field_names(member)):  # type: ignore[arg-type]
             return member
+        # Unions of the stored classes differ in their fields or in the JSON type.
         if not is_object and member is not type(None) and _fits(member, value):
             return member
     raise ValueError(f"no member of {members} fits {type(value).__name__}")

@@ -38,7 +38,7 @@ class JobsConfig:
 
 
 class Observer(Protocol):
-    """Is called with what happens to jobs, on the thread where it happens."""
+    """Receives events of jobs, e.g. for metrics; each method is called on the thread where the event occurs."""
 
     def started(self, waited_s: float) -> None:
         """A job was started, so long after it was accepted."""

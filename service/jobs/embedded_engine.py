@@ -36,7 +36,7 @@ class EngineConfig:
     rasterizer: str | None = None
     """None: the first that can run here."""
     cache_dir: Path | None = None
-    """Where view indexes are kept between runs; None: nowhere."""
+    """Where view indexes and scenes in mappable form are kept between runs; None: nowhere."""
     memory_bytes: int | None = None
     """Of all scenes together; None: any number."""
 
@@ -104,6 +104,7 @@ class EmbeddedEngine:
 
     def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
         ids = self._manager.chosen(asked)
+        # A token instead of the scenes, so that an engine in another process can have the same interface.
         held, token = self._manager.acquire(ids), secrets.token_hex(8)
         self._held[token] = held
         return HeldScenes(token, tuple(ids), held[0].scene.info.background_rgb)
@@ -121,6 +122,7 @@ class EmbeddedEngine:
         try:
             result, loaded = run_task(task, held, on_record, cancel)
         finally:
+            # Also after an error: a later attempt has another id, so the entry would stay for ever.
             del self._cancels[task.id]
         return EngineAnswer(result, self._manager.id_of(loaded))
 
@@ -166,6 +168,7 @@ def _run_sequence(
 ) -> JobResult:
     trajectory = Trajectory()
     photos = read_sequence(source.data, source.options)
+    # Closed also after an error or a cancel: the video decoder is a process that would stay.
     with closing(photos), closing(localize_sequence(photos, loaded, request)) as poses:
         for found in poses:
             record = trajectory.add(found)

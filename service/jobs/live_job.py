@@ -93,6 +93,7 @@ class LiveJob:
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
+            # `asyncio.Event` may be set on its own thread only.
             loop.call_soon_threadsafe(changed.set)
 
         with self._lock:
@@ -100,6 +101,7 @@ class LiveJob:
         try:
             ended = False
             while not ended:
+                # Cleared before `ended` is read: a change after that sets it again, and none is missed.
                 changed.clear()
                 ended = self.ended.is_set()
                 yield ended

@@ -66,6 +66,7 @@ def old_result(text: str) -> JobResult:
     """Read the column `result`."""
     result = json.loads(text)
     pose, intrinsics = _pose(result["pose"]), _intrinsics(result["intrinsics"])
+    # The first timing was always that of decoding.
     decode, *timings = (StageTiming(t["stage"], t["wall_s"], t["cpu_s"]) for t in result["timings"])
     others = result["alternatives"]
     alternatives = Candidates(
@@ -87,6 +88,7 @@ def old_result(text: str) -> JobResult:
         renders=0,
         timings=tuple(timings),
         warnings=tuple(result["warnings"]),
+        # Release 0.1.0 stored the other answers with the result; now they are in the last record.
         records=(IterationRecord(timings[-1].stage, pose, alternatives=alternatives if others else None),),
         scene_ranking=tuple((scene["id"], scene["matches"]) for scene in result["considered"]),
     )
@@ -163,6 +165,7 @@ def _given_pose(given: dict[str, Any]) -> Pose | None:
         matrix[:3, 3] = given["position"]
     else:
         return None
+    # The convention is that of the camera axes, so it is applied on the right.
     return Pose(matrix @ _OPENCV_FROM_OPENGL if given["convention"] == "opengl" else matrix)
 
 
@@ -172,6 +175,7 @@ def _region(given: dict[str, Any], prior: Pose | None) -> PriorRegion | None:
     if prior is not None and given["covariance"]:
         return GaussianPosePrior(prior, np.array(given["covariance"], np.float64))
     if prior is not None and given["sigma_deg"]:
+        # A twist is rotation first, then translation.
         spread = np.repeat([np.radians(given["sigma_deg"]), given["sigma_units"]], 3)
         return GaussianPosePrior(prior, np.diag(spread**2))
     return None

@@ -28,7 +28,7 @@ class PhotoStore(Protocol):
         ...
 
     def discard_original(self, job_id: str, jpeg: bytes | None) -> None:
-        """Replace what was sent by a JPEG for looking at, or by nothing; by nothing, too, if there is no space."""
+        """Delete the photo as it was sent, and keep a JPEG for display if one is given and the disk has space."""
         ...
 
     def kept(self, job_id: str) -> bytes:
@@ -104,6 +104,7 @@ def write_durably(path: Path, data: bytes) -> None:
     """Write a file and wait until it and its name are on disk. Raises OSError."""
     with path.open("wb") as file:
         file.write(data)
+        # The file and then its entry in the folder: either alone may be lost with the power.
         file.flush()
         os.fsync(file.fileno())
     folder = os.open(path.parent, os.O_RDONLY)

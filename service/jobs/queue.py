@@ -53,6 +53,7 @@ class JobQueue:
     def _full(self) -> bool:
         idle = sum(worker.job is None for worker in self._workers)
         taken = len(self._queue) + self._reserved
+        # The number of jobs alone does not limit what their photos take.
         held = sum(job.memory_bytes for job in self._queue)
         return self._closed.is_set() or taken >= self._queue_size + idle or held > self._queue_bytes
 
@@ -131,6 +132,7 @@ class JobQueue:
         worker.abandoned = True
         with self._changed:
             self._workers.discard(worker)
+            # A thread cannot be killed: it is left alone, and another one takes its place.
             self._stuck += 1
             self._add_worker()
         _log.error("job %s had no new record for %.0f s: its worker is abandoned", job.id, self._stuck_s)

@@ -55,6 +55,7 @@ def read_photo(
     if is_sequence(data):
         query, source = _read_sequence(data, spec, background_rgb, max_frames)
     else:
+        # A value that is the default may not have been sent at all.
         defaults = {field.name: field.default for field in fields(JobSpec)}
         for name in _OF_SEQUENCES:
             if getattr(spec, name) != defaults[name]:
@@ -79,6 +80,7 @@ def _read_sequence(
     options = SequenceOptions(
         max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb
     )
+    # Before the job is accepted, so that most faults of a sequence are answered at once.
     check_sequence(data, options)
     return next(read_sequence(data, options)).query, SequenceSource(data, options)
 

@@ -95,8 +95,10 @@ class Jobs:
         for job in self._store.queued():
             if job.id not in self._live:
                 self._enqueue_when_ready(job)
+        # A photo is written before its job: a crash between the two leaves one without a job.
         for orphan in self._photos.ids() - self._store.ids():
             self._photos.delete(orphan)
+        # A crash after a job ended may have left the photo as it was sent, with its EXIF data.
         for job_id in self._photos.with_original() - self._live.keys():
             self._photos.discard_original(job_id, None)
         self._maintenance.start()
@@ -115,6 +117,7 @@ class Jobs:
             photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames)
             new = _new_job(order, held.ids[0], photo)
             job = self._stored(new, order.photo)
+        # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
         except BaseException:
             self._engine.release(held.token)
             raise
@@ -127,9 +130,11 @@ class Jobs:
 
     def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
         """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
+        # Reserved first: once the job is on disk it can no longer be refused.
         self._queue.reserve()
         taken = False
         try:
+            # The photo first: a stored job without its photo could not be run after a crash.
             self._photos.accept(new.id, photo)
             job = self._store.accept(new)
             taken = job.id == new.id
@@ -210,6 +215,7 @@ class Jobs:
         live = self._live.get(job.id)
         if live is None:
             return
+        # On disk before the attempt stops, so that a crash in between does not run it again.
         self._store.request_cancel(job.id)
         self._stop(live)
         if self._store.end_queued(job, Ending("cancelled"), self._worker.photo_until()):
@@ -222,9 +228,11 @@ class Jobs:
         self._queue.close(self._config.shutdown_s)
         for live in tuple(self._live.values()):
             self._stop(live)
+        # Cancelled attempts end at their next record.
         self._queue.close(1.0)
         for live in tuple(self._live.values()):
             live.end()
+        # It writes to the store, which is closed next.
         self._maintenance.join(_MAINTENANCE_S + 1)
         self._store.close()
 
@@ -251,6 +259,7 @@ class Jobs:
                 self._reclaim(time.time())
                 for job_id in [*self._store.expire_photos(), *self._store.prune(kept)]:
                     self._photos.delete(job_id)
+                # No job may come that would show that the disk has space again: the service is not ready meanwhile.
                 if self._worker.storage_error:
                     self._store.probe()
                     self._worker.storage_error = ""
@@ -277,6 +286,7 @@ class Jobs:
 
     def _enqueue_when_ready(self, job: StoredJob) -> None:
         """Queue a stored job as soon as its scene is loaded or has failed to load; keep its listeners."""
+        # Clients may be waiting for the events of an attempt that was lost.
         live = self._live.setdefault(job.id, LiveJob(job.id, job.scene))
         self._engine.when_settled(job.scene, partial(self._queue.submit, live, reserved=False))
 

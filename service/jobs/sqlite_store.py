@@ -102,6 +102,7 @@ class SqliteJobStore:
         try:
             self._writer = self._connection()
             self._migrate()
+            # A second connection: with WAL, readers do not wait for a commit to reach the disk.
             self._reader = self._connection()
         except sqlite3.Error as error:
             raise StorageFailed(f"{path} can't be used: {error}.", where="data_dir") from error
@@ -136,7 +137,7 @@ class SqliteJobStore:
     def accept(self, job: NewJob) -> StoredJob:
         row = f"INSERT INTO jobs ({', '.join(_NEW_COLUMNS)}, state) VALUES ({_marks(len(_NEW_COLUMNS))}, 'queued')"
         with self._transaction() as writer:
-            known = _repeated(writer, job.client, job.idempotency_key, job.digest)
+            known = _find_by_key(writer, job.client, job.idempotency_key, job.digest)
             if known is None:
                 values = [getattr(job, name) for name in _NEW_COLUMNS]
                 coded = zip(_NEW_COLUMNS, values, strict=True)
@@ -146,7 +147,7 @@ class SqliteJobStore:
 
     def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
         with self._reading:
-            return _repeated(self._reader, client, key, digest)
+            return _find_by_key(self._reader, client, key, digest)
 
     def has_key(self, client: str, key: str) -> bool:
         with self._reading:
@@ -163,6 +164,7 @@ class SqliteJobStore:
                 "stage = NULL WHERE id = ? AND state = 'queued' AND attempt = ? AND NOT cancelled",
                 (time.time(), lease_until, job.id, job.attempt),
             ).rowcount
+            # Clients get the records of the latest attempt only.
             writer.execute("DELETE FROM events WHERE job = ? AND attempt <= ?", (job.id, job.attempt))
         return job.attempt + 1 if changed else None
 
@@ -179,6 +181,7 @@ class SqliteJobStore:
             "finished = ?, bytes = photo_bytes, photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END "
             "WHERE state = 'running' AND lease_until < ?"
         )
+        # Asked often: mostly there is nothing, and a read needs no commit.
         over = "SELECT id FROM jobs WHERE state = 'running' AND lease_until < ?"
         with self._reading:
             if not self._reader.execute(over, (before,)).fetchone():
@@ -186,6 +189,7 @@ class SqliteJobStore:
         with self._transaction() as writer:
             ids = [job_id for (job_id,) in writer.execute(over, (before,))]
             writer.execute("UPDATE jobs SET lost = lost + 1 WHERE state = 'running' AND lease_until < ?", (before,))
+            # Each statement takes some of the rows out of `running`, the last one takes the rest.
             writer.execute(f"UPDATE jobs SET state = 'cancelled', {end} AND cancelled", (now, now, before))
             writer.execute(
                 f"UPDATE jobs SET state = 'interrupted', failure = ?, {end} AND lost >= ?",
@@ -203,6 +207,7 @@ class SqliteJobStore:
         result, failure = (value and encode(value) for value in (ending.result, ending.failure))
         size = len(result or "") + len(failure or "")
         with self._transaction() as writer:
+            # In one transaction: a job that has ended has all of its records.
             if not _append(writer, job_id, attempt, batch):
                 return False
             writer.execute(
@@ -300,6 +305,7 @@ class SqliteJobStore:
     def prune(self, kept: Retention) -> list[str]:
         with self._transaction() as writer:
             ended = "SELECT id, finished, row_number() OVER newest AS place, sum(bytes) OVER newest AS total "
+            # By number, not by time: clocks may be set back.
             ended += f"FROM jobs WHERE state IN ({_ENDED_SQL}) WINDOW newest AS (ORDER BY number DESC)"
             chosen = f"SELECT id FROM ({ended}) WHERE place > ? OR total > ? OR finished < ?"
             ids = writer.execute(chosen, (kept.jobs, kept.bytes, time.time() - kept.seconds)).fetchall()
@@ -338,7 +344,7 @@ def _select(connection: sqlite3.Connection, where: str, *values: object) -> list
     return [_job(row) for row in rows]
 
 
-def _repeated(connection: sqlite3.Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
+def _find_by_key(connection: sqlite3.Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
     found = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key is not None else []
     known = found[0] if found else None
     if known and known.digest != digest:
@@ -367,6 +373,7 @@ def _append(writer: sqlite3.Connection, job_id: str, attempt: int, batch: Batch)
         (batch.first + len(batch.records), stage, job_id, attempt),
     ).rowcount
     if changed:
+        # Level 1: the search waits for it.
         rows = enumerate((zlib.compress(encode(record).encode(), 1) for record in batch.records), batch.first)
         writer.executemany(
             "INSERT INTO events VALUES (?, ?, ?, ?)", [(job_id, attempt, seq, record) for seq, record in rows]

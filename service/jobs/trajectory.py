@@ -29,6 +29,7 @@ class Trajectory:
         """Take a photo's answer; return its record, whose pose is the last that was localized."""
         estimate = found.estimate
         last = estimate.records[-1]
+        # A later frame that is not localized does not replace one that is.
         if not _localized(self.shown) or _localized(estimate):
             self.shown = estimate
         assert self.shown
@@ -62,6 +63,7 @@ class Trajectory:
         spent = self._spent.values()
         wall_s = self._clock.wall_s - sum(timing.wall_s for timing in spent)
         cpu_s = self._clock.cpu_s - sum(timing.cpu_s for timing in spent)
+        # Warnings are for people: a single pose does not show how many others are missing.
         missed = sum(frame.status is not Status.LOCALIZED for frame in self._frames)
         warnings = [
             *self._warnings,

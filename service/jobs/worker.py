@@ -60,6 +60,7 @@ class Worker:
     def give_up(self, live: LiveJob) -> None:
         """End a job whose thread is stuck."""
         error = Interrupted(f"the job had no new record for {self._config.stuck_s:g} s and was given up.")
+        # The records in memory are left out: the stuck thread may still add to them.
         nothing = Batch(len(self._store.records(live.id)), ())
         end = Ending("interrupted", failure=Failure.of(error))
         if self._store.finish(live.id, live.attempt, nothing, end, self.photo_until()):
@@ -128,6 +129,7 @@ class Worker:
 
     def _localize(self, live: LiveJob, job: StoredJob, stored: _Stored) -> EngineAnswer:
         spec = job.spec
+        # After a restart nothing is in memory; a job of several scenes looks in all of them again.
         if live.held is None:
             live.held = self._engine.hold(spec.scene if spec.names_several_scenes else job.scene)
         if live.photo is None:
@@ -147,9 +149,11 @@ class Worker:
         return self._engine.localize(task, on_record)
 
     def _add(self, live: LiveJob, stored: _Stored, record: JobRecord) -> None:
+        # The thread of an attempt that was given up may come to life again.
         if live.attempt != stored.attempt:
             raise _AttemptLost
         live.add(record)
+        # Each batch is a commit that waits for the disk: one for each record would slow the search.
         if time.monotonic() - stored.at < _BATCH_S:
             return
         batch = Batch(stored.count, live.records[stored.count :])
@@ -178,6 +182,7 @@ class Worker:
         self._observer.ended(job.estimator, job.state, job.status, took_s)
         wanted = live.shown is not None and (job.keep_photo or self._config.photo_grace_s > 0)
         self._photos.discard_original(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
+        # After the photo is replaced: until then it is returned from memory.
         self.live.pop(live.id, None)
         if live.held is not None:
             self._engine.release(live.held.token)
@@ -200,6 +205,7 @@ class Worker:
                 result = write()
             except StorageFailed as error:
                 self.note_storage(error)
+                # Waiting for the disk is not being stuck.
                 live.mark_alive()
                 if self.closing.wait(_RETRY_S):
                     return None

@@ -95,9 +95,11 @@ class Scenes:
         self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
         self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
         self._entries: dict[str, Entry] = {}
+        # Reentrant: methods that hold it call others that take it.
         self._lock = threading.RLock()
         self._stop = threading.Event()
         self._tasks: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
+        # One thread: scenes that were loaded at once would need their peak memory at once.
         self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
 
     def start(self) -> None:
@@ -163,6 +165,7 @@ class Scenes:
         entry = self.entry(scene_id)
         with self._lock:
             entry.used = time.monotonic()
+            # Not loaded again by each request: a broken file would be read again and again.
             if entry.error:
                 raise entry.error
             if entry.loaded is not None and entry.state != "unloading":
@@ -192,6 +195,7 @@ class Scenes:
     def acquire(self, ids: Sequence[str]) -> tuple[LoadedScene, ...]:
         """Return scenes that stay in memory until they are released as often. Raises SceneError."""
         with self._lock:
+            # All or none: if one is missing, nothing is counted as used.
             loaded = tuple(self.get(scene_id) for scene_id in ids)
             for scene_id in ids:
                 self.entry(scene_id).jobs += 1
@@ -204,6 +208,7 @@ class Scenes:
     def release(self, held: Collection[LoadedScene]) -> None:
         with self._lock:
             for entry in self._entries.values():
+                # By identity: the scene of that name may have been replaced meanwhile.
                 if any(entry.loaded is loaded for loaded in held):
                     entry.jobs -= 1
                     if entry.state == "unloading" and not entry.jobs:
@@ -278,11 +283,13 @@ class Scenes:
         if entry.loaded is None and entry.path is not None:
             tools = {"matcher": self._matcher, "rasterizer": self._rasterizer}
             loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, **tools)
+            # Only now is its size known; for a moment it is in memory beyond the limit.
             self._make_room(entry, loaded.nbytes)
             entry.loaded, entry.state = loaded, "preparing"
             self._settle(entry)
         if entry.loaded is not None and not self._stop.is_set():
             entry.loaded.prepare(self._estimator)
+            # Compiles and loads what the first photo would wait for.
             warm_up(entry.loaded, self._estimator)
         with self._lock:
             entry.state = "ready"
@@ -296,6 +303,7 @@ class Scenes:
         with self._lock:
             there = [e for e in self._entries.values() if e.loaded and e is not entry]
             total = sum(e.loaded.nbytes for e in there if e.loaded)
+            # A scene without a file could not be loaded again.
             idle = [e for e in there if e.state == "ready" and not e.jobs and e.path]
             for other in sorted(idle, key=lambda e: e.used):
                 if total + needed <= self._memory_bytes:
@@ -314,6 +322,7 @@ class Scenes:
     def _settle(self, entry: Entry) -> None:
         with self._lock:
             waiting, entry.waiting = entry.waiting, []
+        # Outside of the lock: they submit jobs, which take locks of their own.
         for do in waiting:
             do()
 

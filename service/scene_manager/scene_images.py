@@ -30,6 +30,7 @@ def picture(loaded: LoadedScene, wanted: PictureSpec) -> bytes:
     frame = loaded.rasterizer.render([Camera(_intrinsics(loaded, wanted.intrinsics), wanted.pose)])[0]
     if wanted.format == "depth":
         file = io.BytesIO()
+        # Little-endian whatever the machine: the file goes to others.
         np.lib.format.write_array(file, frame.median_depth.astype("<f4"), allow_pickle=False)
         return file.getvalue()
     return encode_image(frame.rgb, "png" if wanted.format == "png" else "jpg", quality=wanted.quality)

@@ -168,6 +168,7 @@ class FolderDraft:
             os.fsync(self._file.fileno())
             self._file.close()
             self._check(file_name)
+            # Atomic on one file system: a scene is there as a whole or not at all.
             self._folder.rename(self._target)
         return StoredScene(self._target.name, self._target, uploaded=True)
 
@@ -187,6 +188,7 @@ class FolderDraft:
                 raise InvalidRequest(f"say what kind of file it is: {names}, or send a ZIP.", where="query.file")
             upload.rename(self._folder / f"scene{Path(file_name).suffix.lower()}")
         try:
+            # Read once, so that a broken file is refused at the upload, not at the first job.
             load_scene(self._folder)
         except SceneError as error:
             # Clients must not learn where the service keeps its files.
@@ -274,6 +276,7 @@ def _copied(source: IO[bytes], path: Path, left: int) -> int:
     """Copy at most `left` bytes into a new file; return how many more there may be. Raises CorruptScene, OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
+        # Two members may have one name, and on some file systems names differ in case only.
         target = path.open("xb")
     except FileExistsError as error:
         raise CorruptScene("two files of the archive have the same name.", where="archive") from error
@@ -283,6 +286,7 @@ def _copied(source: IO[bytes], path: Path, left: int) -> int:
                 chunk = source.read(_COPY_BYTES)
             if not chunk:
                 return left
+            # The size in the archive is not trusted: small files can unpack to any size.
             left -= len(chunk)
             if left < 0:
                 raise CorruptScene("the archive holds more than the service takes.", where="archive")

@@ -31,6 +31,7 @@ def packed_splats(scene: GaussianScene, limit: int) -> bytes:
     chosen = np.argsort(-importance(scene), kind="stable")[:limit]
     info = scene.info
     header = json.dumps({"scene": info.id, "sha256": info.sha256, "count": len(chosen), "total": scene.count}).encode()
+    # Aligned, so that a client can view the arrays without copying them.
     header += b" " * (-len(header) % 4)
     rotation = rotation_from_quat(scene.quats[chosen])
     axes = rotation * scene.scales[chosen][:, None, :]

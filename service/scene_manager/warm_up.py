@@ -25,6 +25,7 @@ def warm_up(loaded: LoadedScene, estimator: str) -> None:
     query = Query(rgb, camera.intrinsics, "given", camera.intrinsics)
     try:
         estimate = localize(query, loaded, Request(estimator))
+    # Methods that only refine need a pose to start from.
     except InvalidPrior:
         begun = replace(query, prior=camera.pose)
         estimate = localize(begun, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
@@ -42,6 +43,7 @@ def _outside(loaded: LoadedScene) -> Camera:
     """A camera that looks at the middle of the Gaussians from outside."""
     means = loaded.scene.means
     centre = np.median(means, 0)
+    # Medians: floaters far outside would put the camera far away.
     radius = float(np.median(np.linalg.norm(means - centre, axis=1))) or 1.0
     pose = look_at(centre + radius * np.array([0.0, 0.0, 3.0]), centre, np.array([0.0, 1.0, 0.0]))
     return Camera(Intrinsics(512, 384, 450.0, 450.0, 256.0, 192.0), pose)

@@ -85,10 +85,13 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     app.include_router(router)
     add_pages(app)
     if relay:
+        # After the API's routes, which no path of the viewer can hide then.
         app.include_router(relay.router)
     _add_middleware(app, settings, keys, metrics)
+    # In place of FastAPI's: with problem documents, examples and links.
     app.openapi = lambda: description(app)
     _declare_documentation(app)
+    # Last, when all routes are there: one without a policy stops the start.
     require_policies(app.routes)
     return app
 

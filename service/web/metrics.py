@@ -19,7 +19,7 @@ METRICS_TYPE = CONTENT_TYPE_LATEST
 # From a rendered thumbnail to the longest searches.
 _SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60, 120)
 
-Reading = Mapping[tuple[str, ...], float]
+GaugeValues = Mapping[tuple[str, ...], float]
 """Values of a gauge by the values of its labels."""
 
 
@@ -94,7 +94,7 @@ class Metrics:
         """Count an image that was rendered for a client."""
         self._render_s.labels(scene).observe(seconds)
 
-    def gauge(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], Reading]) -> None:
+    def gauge(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], GaugeValues]) -> None:
         """Add a gauge whose values are read at each scrape."""
         self._registry.register(_Gauge(f"splatfix_{name}", text, labels, read))
 
@@ -109,7 +109,7 @@ _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 class _Gauge:
     """A collector: prometheus_client calls `collect` at each scrape."""
 
-    def __init__(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], Reading]) -> None:
+    def __init__(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], GaugeValues]) -> None:
         self._name, self._text, self._labels, self._read = name, text, labels, read
 
     def describe(self) -> list[GaugeMetricFamily]:

@@ -19,6 +19,7 @@ _REVALIDATE = {"Cache-Control": "no-cache"}
 def add_pages(app: FastAPI) -> None:
     """Add the routes of the pages."""
     app.add_api_route("/", _start_page, include_in_schema=False)
+    # Public: without a key, too, the start page must be able to ask for one.
     app.mount("/ui", declare(_Files(directory=PAGES), RoutePolicy(role=None)), "ui")
 
 

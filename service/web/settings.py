@@ -111,7 +111,7 @@ class Settings(BaseSettings):
     max_wait_s: float = Field(default=60.0, gt=0, le=3600)
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
-    """Cache folder of the view indexes; None: no cache."""
+    """Cache folder of view indexes and of scenes in mappable form; None: no cache."""
     keys_file: Path | None = CONFIG_HOME / "keys.json"
     """File of API keys, as `splatfix keys add` writes it. If it has keys, every client needs one."""
     open: bool = False

@@ -55,6 +55,7 @@ class Relay:
     @route_policy(role="read", key_in_address=True)
     async def _page(self, request: Request, path: str = "") -> Response:
         answer = await self._ask(path)
+        # A page of a job: the viewer has one page for all paths.
         if answer.status_code == 404:
             answer = await self._ask("")
         content, kind = answer.content, answer.headers.get("content-type", "")

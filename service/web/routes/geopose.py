@@ -75,6 +75,7 @@ async def geopose(
         # The protocol has no second request to fetch the result with.
         await to_thread.run_sync(app_state.jobs.cancel, job)
         raise DeadlineExceeded(f"there was no answer within {wait_s:g} s.")
+    # A job's error is a field elsewhere; here it must be the answer.
     if job.failure:
         return problem_answer(problem_of_failure(job.failure, request.url.path), request.url.path)
     resources.require_pose(job)

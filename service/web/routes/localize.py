@@ -117,6 +117,7 @@ async def create_job(
     request: Request, app_state: AppState, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
 ) -> StoredJob:
     """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
+    # The same as for the limits: idempotency keys of different clients are independent.
     client = client_of(request.scope)
 
     def accept() -> StoredJob:
@@ -126,6 +127,7 @@ async def create_job(
         spec = job_spec(fields, app_state.settings.estimator)
         return app_state.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))
 
+    # Decoding takes up to seconds: not on the event loop.
     return await to_thread.run_sync(accept, limiter=app_state.decoding)
 
 

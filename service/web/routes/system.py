@@ -52,6 +52,7 @@ def ready(app_state: AppStateOf, response: Response) -> Readiness:
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
+    # Load balancers look at the status only.
     response.status_code = 200 if readiness.ready else 503
     return readiness
 

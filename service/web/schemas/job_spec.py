@@ -106,6 +106,7 @@ def checked_intrinsics(values: Mapping[str, Any]) -> Intrinsics:
 def prior_from(prior: PriorIn) -> tuple[Pose | None, PriorRegion | None]:
     """Return a prior's approximate pose and its region, each None if not given. Raises InvalidPrior, at `prior`."""
     has_pose = any(getattr(prior, name) is not None for name in (*_POSE_FIELDS, "quaternion_wxyz"))
+    # Without pose and box `pose_from` raises the error that says what is missing.
     pose = pose_from(prior, "prior") if has_pose or prior.box is None else None
     spreads = [name for name in ("sigma_deg", "sigma_units", "covariance") if getattr(prior, name) is not None]
     try:
@@ -118,6 +119,7 @@ def prior_from(prior: PriorIn) -> tuple[Pose | None, PriorRegion | None]:
             raise InvalidPrior("the pose lies outside the box.", where="box", hint="Leave one of them out.")
         return pose, box
     except InvalidPrior as error:
+        # Raised where the name of the request's field is unknown.
         error.where = f"prior.{error.where}"
         raise
 
