@@ -156,7 +156,7 @@ def test_serve_beyond_this_machine_makes_a_key_and_prints_it_in_the_url(stepping
     thread = threading.Thread(target=run, args=(chosen, *consoles))
     thread.start()
     try:
-        until(lambda: "start page" in out.getvalue())
+        until(lambda: "start page" in out.getvalue(), 120)
         found = re.search(r"(http://127\.0\.0\.1:\d+)/\?key=(sfx_\S+)", out.getvalue())
         assert found
         url, key = found.groups()

@@ -44,8 +44,8 @@ def findings() -> Iterator[Finding]:
     """Examine the machine, yielding each finding as it is made: some take seconds."""
     yield Finding("splatfix", True, f"{__version__}, Python {platform.python_version()}, {platform.platform()}")
     yield Finding("processor", True, processor())
-    chosen, skipped_rasterizer = choose_rasterizer()
-    yield Finding("renders with", True, f"{chosen} ({skipped_rasterizer})" if skipped_rasterizer else chosen)
+    chosen, skipped_rasterizers = choose_rasterizer()
+    yield Finding("renders with", True, f"{chosen} ({skipped_rasterizers})" if skipped_rasterizers else chosen)
     # A scene that does not fit into the GPU's memory is rendered on the CPU, so that must work in any case.
     for name in dict.fromkeys((chosen, "cpu")):
         yield _tried(f"renderer {name}", partial(_try_renderer, name))

@@ -256,7 +256,7 @@ class Scenes:
             pending=tuple(pending),
             failed=tuple(failed),
             rasterizers=tuple(sorted({scene.rasterizer.name for scene in loaded})),
-            skipped_rasterizers=tuple(sorted({scene.skipped_rasterizer for scene in loaded} - {""})),
+            skipped_rasterizers=tuple(sorted({scene.skipped_rasterizers for scene in loaded} - {""})),
         )
 
     # ------------------------------------------------------------------ on the loading thread
