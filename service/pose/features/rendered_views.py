@@ -25,6 +25,8 @@ class ViewConfig:
     """Opacity from which on a pixel counts as surface."""
     grid_px: int = 16
     """Spacing of the pixels at which two cameras' images are compared."""
+    max_motion_px: float = 1.0
+    """Motion of the image within which a render is used again."""
     min_unmoved_share: float = 0.9
     """Share of those pixels that move by less than the tolerance if the images are the same."""
 
@@ -89,13 +91,13 @@ class ViewRenderer:
         self.latest = RenderedView(self.rasterizer.render([camera])[0], camera)
         return self.latest
 
-    def at(self, query: Query, pose: Pose, tolerance_px: float = 1.0) -> RenderedView:
-        """Return a render with the query's intrinsics, at most `tolerance_px` from what the pose shows."""
-        return self.near(camera_of(query, pose), tolerance_px)
+    def at(self, query: Query, pose: Pose) -> RenderedView:
+        """Return a render with the query's intrinsics, within a pixel of what the pose shows (`near`)."""
+        return self.near(camera_of(query, pose))
 
-    def near(self, camera: Camera, tolerance_px: float = 1.0) -> RenderedView:
-        """Return the latest render if it shows the same within the tolerance, else a new one."""
-        if self.latest is not None and self.latest.shows_the_same_as(camera, tolerance_px):
+    def near(self, camera: Camera) -> RenderedView:
+        """Return the latest render if it shows the same within `max_motion_px`, else a new one."""
+        if self.latest is not None and self.latest.shows_the_same_as(camera, VIEWS.max_motion_px):
             return self.latest
         return self.render(camera)
 

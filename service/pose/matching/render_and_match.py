@@ -72,6 +72,7 @@ def epipolar_inliers(matches: Correspondences, intrinsics: Intrinsics) -> Bool[n
     none = np.zeros(len(matches.photo_px), bool)
     if len(none) < 8:
         return none
+    # OpenCV's threshold: a pixel of an image whose long side is 256, whatever the photo's size.
     photo, view = (np.asarray(px, np.float64) for px in (matches.photo_px, matches.view_px))
     try:
         _, mask = cv2.findFundamentalMat(photo, view, cv2.USAC_MAGSAC, intrinsics.long_side / 256, 0.999, 2000)

@@ -13,7 +13,7 @@ import numpy as np
 from service.geometry import pose_distance
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.query_images import QueryImages
-from service.pose.features.rendered_views import RenderedView, ViewRenderer, camera_of
+from service.pose.features.rendered_views import VIEWS, RenderedView, ViewRenderer, camera_of
 from service.pose.matching.match_stages import MATCHING, MatchingConfig, render_and_rematch
 from service.pose.refinement.photometric import RefinementResult, refine_photometric
 from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
@@ -68,7 +68,7 @@ class RefinedPose:
         """Return a render within a pixel of the pose, and the refinement on it: both at hand, or a new render."""
         camera = camera_of(images.query, self.pose)
         # The gate measures at this size, and a smaller render of the first round is none.
-        if self.rendered is not None and self.rendered.shows_the_same_as(camera, 1.0):
+        if self.rendered is not None and self.rendered.shows_the_same_as(camera, VIEWS.max_motion_px):
             return self.rendered, self.photometric
         return renderer.render(camera), None
 
