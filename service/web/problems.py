@@ -182,7 +182,7 @@ def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | Non
     """Return the response for a problem of the request to `path`."""
     retry = {"Retry-After": str(RETRY_AFTER_S)} if problem.status in (429, 503) else {}
     problem = problem.model_copy(update={"instance": path})
-    # The header of the error itself, which knows better, replaces the default.
+    # An error may have a Retry-After of its own, which replaces the default.
     return Response(problem.model_dump_json(), problem.status, {**retry, **(headers or {})}, MEDIA_TYPE)
 
 

@@ -12,6 +12,7 @@ GET    /jobs/{id}/iterations/{k}/render.jpg   record k's pose (or `last`), photo
 GET    /jobs/{id}/export/{format}             the pose for COLMAP, nerfstudio, TUM tools or GeoPose
 GET    /scenes                                GET /scenes/{id}
 PUT    /scenes/{id}                           upload; POST .../load, .../unload; DELETE
+GET    /scenes/{id}/thumbnail.jpg             small JPEG
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
 POST   /scenes/{id}/render                    colour or depth from any pose
 POST   /tokens                                short-lived, for pages

@@ -1,4 +1,7 @@
-"""OpenAPI links: from an operation that returns an id to the operations that take it."""
+"""OpenAPI links: from an operation that returns an id to the operations that take it.
+
+An operation that takes the id of a job or a scene must be added to `_JOB` or `_SCENE` by hand.
+"""
 
 from __future__ import annotations
 
