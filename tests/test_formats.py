@@ -1,6 +1,7 @@
 """Scene files and folders: read against other programs' files, moved, and every kind of damage."""
 
 import json
+import re
 import struct
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from service.errors import CorruptScene, SceneError, SceneNotFound, UnsupportedF
 from service.geometry import look_at, quat_from_rotation, se3_exp, so3_exp
 from service.scene_formats import SCENE_FORMATS, load_scene
 from service.scene_formats.folder import same_photo
+from service.scene_formats.formats import _UNREAD_SUFFIXES
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 DATA = Path(__file__).parent / "data"
 GSPLY = np.load(DATA / "gsply_values.npz")
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+ALL_FORMATS = re.escape(f"known: {', '.join(SCENE_FORMATS.names())}.")
 
 
 def columns(count=20, degree=1, seed=0) -> dict[str, np.ndarray]:
@@ -282,7 +285,7 @@ class TestDamage:
             (ply_bytes({k: v for k, v in columns().items() if k != "f_rest_8"}), CorruptScene, "8 f_rest"),
             (b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n"
              + b"".join(b"property float p%d\n" % i for i in range(600)) + b"end_header\n", CorruptScene, "512"),
-            (b"solid something", UnsupportedFormat, "known: compressed_ply, ply, splat"),
+            (b"solid something", UnsupportedFormat, ALL_FORMATS),
         ],
     )  # fmt: skip
     def test_hostile_headers(self, tmp_path, data, error, says):
@@ -332,9 +335,13 @@ class TestFolder:
         (folder / "scene.json").write_text('{"file": "b.ply"}')
         assert load_scene(folder).count == 20
 
-    def test_unreadable_formats_are_named(self, tmp_path):
-        with pytest.raises(UnsupportedFormat, match="known: compressed_ply, ply, splat"):
-            load_scene(written(tmp_path, b"\x1f\x8b", "scene.spz"))
+    @pytest.mark.parametrize("suffix", _UNREAD_SUFFIXES)
+    def test_unreadable_formats_are_named(self, tmp_path, suffix):
+        with pytest.raises(UnsupportedFormat, match=ALL_FORMATS):
+            load_scene(written(tmp_path, b"\x1f\x8b", f"scene{suffix}"))
+
+    def test_built_in_formats_are_known(self):
+        assert {"compressed_ply", "ply", "splat"} <= set(SCENE_FORMATS.names())
 
     def test_every_reader_has_the_contract(self):
         for name in SCENE_FORMATS.names():

@@ -490,8 +490,7 @@ def test_local_colours_distinguish_like_things_whatever_the_light_and_with_a_par
 
 
 def test_pixels_are_enough_only_where_local_colours_agree_too() -> None:
-    signals = {"gradients": 0.98, "gradients_half": 0.99, "colours": 0.99, "colours_half": 0.99, "drift_px": 0.1}
-    signals["local_colour_correlation"] = 0.99
+    signals = {name: SHIPPED_MODEL.scales[name].at_one for name in SHIPPED_MODEL.photometric.weights}
     assert photometric_suffices(signals)
     assert not photometric_suffices(signals | {"local_colour_correlation": 0.85})  # one sphere of a row too far
     assert not photometric_suffices(signals | {"gradients": 0.5, "gradients_half": 0.7})
