@@ -20,6 +20,7 @@ from api_server import (
     create_app,
     events,
     finished,
+    operations,
     photo,
     post,
     serving,
@@ -659,3 +660,15 @@ def test_openapi_yaml_is_fresh():
     """Write it anew with `splatfix openapi > openapi.yaml`."""
     app = create_app(Settings(scenes=[], viewer=False))
     assert yaml.safe_load((ROOT / "openapi.yaml").read_text("utf-8")) == app.openapi()
+
+
+@pytest.mark.parametrize(("lister", "parameter"), [("list_jobs", "job_id"), ("list_scenes", "scene_id")])
+def test_every_operation_on_a_listed_thing_is_linked_from_the_list(lister, parameter):
+    described = {operation["operationId"]: operation for _, _, operation in operations()}
+    takes = {
+        name
+        for name, operation in described.items()
+        if any((one["in"], one["name"]) == ("path", parameter) for one in operation.get("parameters", []))
+    }
+    # An upload makes a scene that isn't in the list.
+    assert set(described[lister]["responses"]["200"]["links"]) == takes - {"upload_scene"}

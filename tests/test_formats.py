@@ -295,7 +295,7 @@ class TestDamage:
     @settings(max_examples=200)
     @given(st.data())
     def test_no_damage_raises_anything_else(self, tmp_path_factory, data):
-        kind = data.draw(st.sampled_from(["scene.ply", "scene.compressed.ply", "scene.splat"]))
+        kind = data.draw(st.sampled_from(list(_WHOLE)))
         whole = bytearray(_WHOLE[kind])
         for _ in range(data.draw(st.integers(0, 4))):
             whole[data.draw(st.integers(0, min(len(whole), 2000) - 1))] = data.draw(st.integers(0, 255))
