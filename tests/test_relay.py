@@ -98,7 +98,7 @@ def relaying(port: int) -> Iterator[str]:
     """host:port of a service that has nothing but the relay."""
     relay = Relay(Upstream(port))
     app = FastAPI()
-    problems.install(app)
+    problems.add_error_handlers(app)
     app.include_router(relay.router)
     app.router.add_event_handler("shutdown", relay.close)
     config = uvicorn.Config(app, port=0, log_level="critical", ws="websockets-sansio", ws_max_size=2**26)
