@@ -16,6 +16,7 @@ import typing
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from beartype.door import is_bearable
 from jaxtyping import AbstractArray, jaxtyped
 
@@ -92,20 +93,18 @@ def _decorator(name: str, node: ast.AST) -> ast.expr:
 def checked_calls(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return the function with its arguments and its result checked."""
     names = list(inspect.signature(function).parameters)
-    hints: dict[str, Any] | None = None
+    check = _Check(function)
 
     @functools.wraps(function)
     def checked(*args: Any, **kwargs: Any) -> Any:
-        nonlocal hints
-        if hints is None:  # not before: an annotation may name a class from further down
-            hints = _array_hints(function)
-        with jaxtyped("context"):
-            for name, value in (*zip(names, args, strict=False), *kwargs.items()):
-                if name in hints:
-                    _check(function, name, value, hints[name])
-            result = function(*args, **kwargs)
-            if "return" in hints:
-                _check(function, "return", result, hints["return"])
+        hints = check.hints
+        given = [(name, value) for name, value in zip(names, args, strict=False) if name in hints]
+        if kwargs:
+            given += [(name, value) for name, value in kwargs.items() if name in hints]
+        check(given)
+        result = function(*args, **kwargs)
+        if "return" in hints:
+            check([*given, ("return", result)])
         return result
 
     return checked
@@ -114,34 +113,49 @@ def checked_calls(function: Callable[..., Any]) -> Callable[..., Any]:
 def checked_fields(cls: type) -> type:
     """Return the dataclass with its fields checked once they are set."""
     set_fields = cls.__init__
-    hints: dict[str, Any] | None = None
+    check = _Check(cls)
 
     @functools.wraps(set_fields)
     def checked(self: Any, *args: Any, **kwargs: Any) -> None:
-        nonlocal hints
         set_fields(self, *args, **kwargs)
-        if hints is None:
-            hints = _array_hints(cls)
-        with jaxtyped("context"):
-            for name, hint in hints.items():
-                _check(cls, name, getattr(self, name), hint)
+        check([(name, getattr(self, name)) for name in check.hints])
 
     cls.__init__ = checked  # type: ignore[method-assign]
     return cls
 
 
-def _array_hints(annotated: Any) -> dict[str, Any]:
-    return {name: hint for name, hint in typing.get_type_hints(annotated).items() if _has_array(hint)}
+class _Check:
+    """Compares values with the annotations of a function or a class."""
+
+    def __init__(self, owner: Any) -> None:
+        self._owner = owner
+        self._passed: set[tuple[Any, ...]] = set()
+
+    @functools.cached_property
+    def hints(self) -> dict[str, Any]:
+        """Not before the first call: an annotation may name a class from further down."""
+        return {n: hint for n, hint in typing.get_type_hints(self._owner).items() if _has_array(hint)}
+
+    def __call__(self, values: Sequence[tuple[str, Any]]) -> None:
+        """Raise ShapeError unless all fit; what has the types and shapes of earlier ones fits, too."""
+        outline = tuple([(n, v.dtype, v.shape) if type(v) is np.ndarray else (n, type(v)) for n, v in values])
+        if outline in self._passed:
+            return
+        with jaxtyped("context"):
+            for name, value in values:
+                if not _fits(value, self.hints[name]):
+                    where = f"{self._owner.__module__}.{self._owner.__qualname__}"
+                    raise ShapeError(f"{where}: {name} is {_told(value)}, and not {self.hints[name]}")
+        if all(isinstance(value, np.ndarray | float | int | None) for _, value in values):
+            self._passed.add(outline)
+
+
+def _told(value: Any) -> str:
+    return f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
 
 
 def _has_array(hint: Any) -> bool:
     return (isinstance(hint, type) and issubclass(hint, AbstractArray)) or any(map(_has_array, typing.get_args(hint)))
-
-
-def _check(owner: Any, name: str, value: Any, hint: Any) -> None:
-    if not _fits(value, hint):
-        shape = f"{getattr(value, 'dtype', type(value))} {getattr(value, 'shape', '')}"
-        raise ShapeError(f"{owner.__module__}.{owner.__qualname__}: {name} is {shape}, and not {hint}")
 
 
 def _fits(value: Any, hint: Any) -> bool:
