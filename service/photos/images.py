@@ -25,6 +25,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from service.errors import InvalidImage
+from service.photos.camera_identity import CameraIdentity, identity_from_exif
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import require_size, undistorted
 from service.photos.jpeg_scans import count_scans
@@ -100,7 +101,7 @@ def read_query(
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
-    focal_mm = _focal_35mm(photo) if intrinsics is None else None
+    focal_mm = _identity(photo).focal_35mm if intrinsics is None else None
     return _query(decoded, focal_mm, intrinsics, prior)
 
 
@@ -186,6 +187,11 @@ def photo_size(data: bytes) -> tuple[int, int]:
     _, photo = _open(data, header_only=True)
     transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
+
+
+def camera_identity(data: bytes) -> CameraIdentity:
+    """Return what the photo's header tells of its camera; no pixels are decoded. Raises InvalidImage."""
+    return _identity(_open(data, header_only=True)[1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,14 +368,9 @@ def _orientation(photo: Image.Image) -> int:
     return value if value in _ORIENTATIONS else 1
 
 
-def _focal_35mm(photo: Image.Image) -> float | None:
-    """Return EXIF's 35 mm equivalent focal length in mm; None if it is missing or impossible."""
-    value = _exif(photo).get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
-    try:
-        focal = float(value) if value is not None else 0.0
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return focal if 4.0 <= focal <= 2000.0 else None
+def _identity(photo: Image.Image) -> CameraIdentity:
+    tags = _exif(photo)
+    return identity_from_exif(tags, tags.get_ifd(ExifTags.IFD.Exif), photo.size, _orientation(photo))
 
 
 def _exif(photo: Image.Image) -> Image.Exif:
