@@ -27,7 +27,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from service.errors import InvalidImage
 from service.photos.camera_identity import CameraIdentity, identity_from_exif
 from service.photos.heic import decode_heic
-from service.photos.intrinsics import require_size, undistorted
+from service.photos.intrinsics import UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
 from service.types import Intrinsics, Pose, Query
 
@@ -127,7 +127,7 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
     """Choose the intrinsics (given, EXIF, default), scale them to the decoded image, and undistort it."""
     warnings = list(decoded.warnings)
     if intrinsics is not None:
-        require_size(intrinsics, decoded.width, decoded.height)
+        require_size(intrinsics, decoded.width, decoded.height, decoded.upright_from_stored)
         source = "given"
     else:
         source = "exif" if focal_mm else "guessed"
@@ -208,6 +208,7 @@ class _Decoded:
     offset: tuple[float, float]
     """Pixels of `rgb` at which the photo's corner lies: not exactly 0 after JPEG's reduction and a mirroring."""
     warnings: tuple[str, ...]
+    upright_from_stored: tuple[bool, bool, bool] = UPRIGHT
 
     def camera(self, photo: Intrinsics) -> Intrinsics:
         """Return the camera of `rgb` for that of the photo."""
@@ -324,6 +325,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
         scale=(scale[0], scale[1]),
         offset=(beyond[0] * mirror_x, beyond[1] * mirror_y),
         warnings=tuple(warnings),
+        upright_from_stored=(transpose, mirror_x, mirror_y),
     )
 
 

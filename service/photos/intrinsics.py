@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -64,23 +65,109 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
     )
 
 
-def require_size(given: Intrinsics, width: int, height: int) -> None:
-    """Raise InvalidIntrinsics unless they are for an upright photo of this size."""
+UPRIGHT, CLOCKWISE = (False, False, False), (True, True, False)
+"""How a stored image becomes an upright one: transpose, then mirror left-right, then mirror top-bottom."""
+
+
+def oriented(intrinsics: Intrinsics, transpose: bool, mirror_x: bool, mirror_y: bool) -> Intrinsics:
+    """Return the camera of an image that is transposed and then mirrored, left-right and top-bottom.
+
+    Radial distortion stays as it is; the tangential coefficients p1 and p2, which COLMAP's models have after k1 and k2,
+    change places and signs.
+    """
+    camera, changed = intrinsics, list(intrinsics.distortion)
+    tangential = "FISHEYE" not in camera.model and len(changed) >= 4
+    if transpose:
+        camera = replace(
+            camera,
+            width=camera.height,
+            height=camera.width,
+            fx=camera.fy,
+            fy=camera.fx,
+            cx=camera.cy,
+            cy=camera.cx,
+        )
+        if tangential:
+            changed[2:4] = changed[3], changed[2]
+    if mirror_x:
+        camera = replace(camera, cx=camera.width - camera.cx)
+        if tangential:
+            changed[3] = -changed[3]
+    if mirror_y:
+        camera = replace(camera, cy=camera.height - camera.cy)
+        if tangential:
+            changed[2] = -changed[2]
+    return replace(camera, distortion=tuple(changed))
+
+
+def require_size(
+    given: Intrinsics, width: int, height: int, upright_from_stored: tuple[bool, bool, bool] = UPRIGHT
+) -> None:
+    """Raise InvalidIntrinsics unless they are for an upright photo of this size.
+
+    The error names what probably happened: turned (intrinsics of the camera's landscape buffer, or a photo that lost
+    its EXIF orientation), resized, or cropped, as for a display; and has the intrinsics that fit then.
+    `upright_from_stored` is how the photo was turned, as `oriented` takes it.
+    """
     if (given.width, given.height) == (width, height):
         return
     expected = f"they are for {given.width} x {given.height}, the upright photo has {width} x {height}"
-    if (given.width, given.height) == (height, width):
-        raise InvalidIntrinsics(
-            f"width and height are swapped: {expected}.",
-            where="intrinsics",
-            hint="They refer to the photo after its EXIF orientation was applied: swap fx, fy, cx, cy too.",
+    is_turned = (given.width - given.height) * (width - height) < 0
+    turn = upright_from_stored if upright_from_stored[0] else CLOCKWISE
+    camera = oriented(given, *turn) if is_turned else given
+    fitting = _cropped(camera, width, height)
+    is_resized = abs(camera.width * height - camera.height * width) <= 0.01 * camera.width * height
+    hints = []
+    if is_turned:
+        hints.append(_turned_hint(camera, upright_from_stored))
+    if not is_resized:
+        hints.append(
+            f"The photo was cropped to another shape. If that was done about its centre, as for a display, send "
+            f"{_as_json(fitting)}; of another part, not resized, keep fx and fy, and subtract its left and upper edge "
+            "from cx and cy."
         )
-    same_shape = abs(given.width * height - given.height * width) <= 0.01 * given.width * height
-    raise InvalidIntrinsics(
-        f"{expected}.",
-        where="intrinsics",
-        hint="Scale all of them by the ratio of the widths." if same_shape else "The photo may have been cropped.",
+    elif is_turned:
+        hints.append(f"Send {_as_json(fitting)}.")
+    else:
+        hints.append(f"Scale all of them by the ratio of the widths: {_as_json(fitting)}.")
+    what = "width and height are swapped: " if is_turned else ""
+    raise InvalidIntrinsics(f"{what}{expected}.", where="intrinsics", hint=" ".join(hints))
+
+
+def _turned_hint(camera: Intrinsics, upright_from_stored: tuple[bool, bool, bool]) -> str:
+    if upright_from_stored[0]:
+        return "They are of the camera's buffer, before the photo was turned by its EXIF orientation."
+    other_way = oriented(camera, False, True, True)
+    return (
+        "Either they are of the camera's buffer, before it was turned upright, or the photo isn't upright, for it lost "
+        "its EXIF orientation: turn it. The values below are for a buffer turned clockwise; for the other way mirror "
+        f"the principal point ({other_way.cx:g}, {other_way.cy:g} at {camera.width} x {camera.height})."
     )
+
+
+def _cropped(camera: Intrinsics, width: int, height: int) -> Intrinsics:
+    """Return the camera of the image after it was scaled to cover this size, and cut to it about its centre."""
+    factor = max(width / camera.width, height / camera.height)
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * factor,
+        fy=camera.fy * factor,
+        cx=width / 2 + (camera.cx - camera.width / 2) * factor,
+        cy=height / 2 + (camera.cy - camera.height / 2) * factor,
+    )
+
+
+def _as_json(intrinsics: Intrinsics) -> str:
+    """Return the JSON that `intrinsics_from` reads, rounded to hundredths of a pixel."""
+    values: dict[str, Any] = {"width": intrinsics.width, "height": intrinsics.height}
+    values |= {name: round(getattr(intrinsics, name), 2) for name in ("fx", "fy", "cx", "cy")}
+    if intrinsics.model != "PINHOLE":
+        values |= {"model": intrinsics.model, "distortion": list(intrinsics.distortion)}
+    if intrinsics.trust != "exact":
+        values["trust"] = intrinsics.trust
+    return json.dumps(values)
 
 
 def undistorted(
