@@ -65,6 +65,7 @@ WRAPPED = {
         "service/photos/video_decoder_process.py",
         "service/matchers",
         "service/pose",
+        "service/bench/modified_photo.py",
         "viewer/comparison_images.py",
     },
     "numba": {"service/jit.py", "service/render/simd.py"},

@@ -15,7 +15,8 @@ from service.bench import localize as bench
 from service.bench import render as render_bench
 from service.bench.bench_photos import find_photos, prepare_photo
 from service.bench.miss_images import save_miss_images
-from service.bench.modifications import MODIFICATIONS, Photo, modify
+from service.bench.modifications import MODIFICATIONS, modify
+from service.bench.modified_photo import Photo
 from service.bench.pose_metrics import Units, nees, units_of
 from service.bench.start_poses import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName

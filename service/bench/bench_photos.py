@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from service.bench.modifications import Photo, modify
+from service.bench.modifications import modify
+from service.bench.modified_photo import Photo
 from service.errors import CorruptScene, SceneNotFound, SplatfixError
 from service.photos.images import encode_image, read_query
 from service.photos.intrinsics import intrinsics_from

@@ -212,7 +212,7 @@ def make_trials(
 
     A trial depends only on the seed, the photo and its number, not on `count`.
     """
-    others = _read_occluders(occluders) if occluders else ()
+    others = read_occluders(occluders) if occluders else ()
     for index, photo in enumerate(bench_scene.photos):
         numbers = range(len(range(index, count, len(bench_scene.photos))))
         # With fewer trials than photos the last photos have none.
@@ -226,7 +226,7 @@ def make_trials(
             yield Trial(photo.name, number, sent.data, sent.intrinsics, sent.truth, begin)
 
 
-def _read_occluders(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
+def read_occluders(folder: Path) -> list[Float32[np.ndarray, "_ _ 3"]]:
     """Return at most MAX_OCCLUDERS photos of a folder; 0..1. Raises SceneNotFound."""
     files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES) if folder.is_dir() else []
     if not files:

@@ -5,42 +5,28 @@ white_balance   red times, blue divided by it    scale      resampled by this fa
 blur            sigma in px at 800 px           roll       about the optical axis, degrees; padding transparent
 noise           sigma, in 0..1                  crop       the middle: this share of width and height
 jpeg            quality                         focal      the focal length sent is the true one times this
+
+Those of other lenses (`lens_modifications`), at most one of the first column in a list:
+
+k1              of a radial distortion          off_centre    a corner: this share of width and height
+fisheye         1: equidistant                  zoom          digital: by this factor, to the same size
+shutter_yaw     degrees a second while a rolling shutter reads the photo in 20 ms; shutter_pitch likewise
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
+from service.bench.lens_modifications import LENS_MODIFICATIONS, require_pinhole
+from service.bench.modified_photo import Change, Photo
 from service.errors import InvalidOptions, UnknownName
 from service.geometry import so3_exp
-from service.photos.images import encode_image, read_query, resized
+from service.photos.images import encode_image, read_query
 from service.types import Intrinsics, Pose
-
-
-@dataclass(frozen=True, slots=True)
-class Photo:
-    """A photo with its pinhole camera and its true pose."""
-
-    rgb: Float32[np.ndarray, "h w 3"]
-    """sRGB, 0..1."""
-    intrinsics: Intrinsics
-    pose: Pose
-    mask: Bool[np.ndarray, "h w"] | None = None
-    """Pixels that belong to the photo; the others are transparent in the file. None: all belong to it."""
-    sent_focal_factor: float = 1.0
-    """The focal length sent with the photo, divided by the true one."""
-    occluders: tuple[Float32[np.ndarray, "_ _ 3"], ...] = ()
-    """Photos of another scene, from which `occlusion` cuts rectangles."""
-
-    def pixels(self) -> Float32[np.ndarray, "h w c"]:
-        """Return the pixels of a file: RGB, or RGBA with the mask as alpha; 0..1."""
-        if self.mask is None:
-            return self.rgb
-        return np.concatenate([self.rgb, self.mask[..., None].astype(np.float32)], 2)
 
 
 def modify(photo: Photo, specs: Sequence[str], rng: np.random.Generator) -> Photo:
@@ -57,7 +43,7 @@ def require_modifications(specs: Sequence[str]) -> None:
         _parse(spec)
 
 
-def _parse(spec: str) -> tuple[_Change, float]:
+def _parse(spec: str) -> tuple[Change, float]:
     name, _, text = spec.partition("=")
     if name not in MODIFICATIONS:
         raise UnknownName(
@@ -162,12 +148,7 @@ def _saturation(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
 def _scale(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
     """Resample: by the mean over each new pixel's area, or by interpolation where the photo is enlarged."""
     old = photo.intrinsics
-    camera = old.resized(max(2, round(old.width * factor)), max(2, round(old.height * factor)))
-    rgb, mask = resized(photo.rgb, camera.width, camera.height), photo.mask
-    if mask is not None:
-        grown = np.repeat(mask[..., None], 3, 2).astype(np.float32)
-        mask = resized(grown, camera.width, camera.height)[..., 0] > 0.999
-    return replace(photo, rgb=rgb, mask=mask, intrinsics=camera)
+    return photo.resized(max(2, round(old.width * factor)), max(2, round(old.height * factor)))
 
 
 def _focal(photo: Photo, factor: float, rng: np.random.Generator) -> Photo:
@@ -178,16 +159,12 @@ def _crop(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
     """Keep the middle: `share` of width and height."""
     old = photo.intrinsics
     width, height = max(1, round(old.width * share)), max(1, round(old.height * share))
-    left, top = (old.width - width) // 2, (old.height - height) // 2
-    camera = replace(old, width=width, height=height, cx=old.cx - left, cy=old.cy - top)
-    area = np.s_[top : top + height, left : left + width]
-    mask = None if photo.mask is None else photo.mask[area].copy()
-    return replace(photo, rgb=photo.rgb[area].copy(), mask=mask, intrinsics=camera)
+    return photo.cut((old.width - width) // 2, (old.height - height) // 2, width, height)
 
 
 def _roll(photo: Photo, degrees: float, rng: np.random.Generator) -> Photo:
     """Roll the camera; the image is enlarged so that nothing is cut off, and the padding is masked."""
-    old = photo.intrinsics
+    old = require_pinhole(photo)
     camera_from_rolled = so3_exp(np.array([0.0, 0.0, np.radians(degrees)]))
     focal = float(np.sqrt(old.fx * old.fy))
     corners = np.array([[0, 0], [old.width, 0], [0, old.height], [old.width, old.height]], float)
@@ -206,7 +183,8 @@ def _roll(photo: Photo, degrees: float, rng: np.random.Generator) -> Photo:
     mask = _sample(np.repeat(before[..., None], 3, 2).astype(np.float32), *at)[..., 0] > 0.999
     matrix = photo.pose.world_from_camera.copy()
     matrix[:3, :3] = matrix[:3, :3] @ camera_from_rolled
-    rolled = replace(photo, rgb=_sample(photo.rgb, *at), intrinsics=camera, pose=Pose(matrix))
+    focal = photo.focal_of_whole
+    rolled = replace(photo, rgb=_sample(photo.rgb, *at), intrinsics=camera, pose=Pose(matrix), focal_as_taken=focal)
     return replace(rolled, mask=None if mask.all() else mask)
 
 
@@ -224,8 +202,7 @@ def _sample(
     return ((upper * (1 - v) + lower * v) * inside[..., None]).astype(np.float32)
 
 
-_Change = Callable[[Photo, float, np.random.Generator], Photo]
-MODIFICATIONS: dict[str, tuple[float, float, _Change]] = {
+MODIFICATIONS: dict[str, tuple[float, float, Change]] = {
     "gain": (0.05, 20.0, _gain),
     "gamma": (0.1, 10.0, _gamma),
     "white_balance": (0.2, 5.0, _white_balance),
@@ -238,5 +215,5 @@ MODIFICATIONS: dict[str, tuple[float, float, _Change]] = {
     "focal": (0.5, 2.0, _focal),
     "crop": (0.1, 1.0, _crop),
     "roll": (-180.0, 180.0, _roll),
-}
+} | LENS_MODIFICATIONS
 """Name -> smallest value, largest value, function."""

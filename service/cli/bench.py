@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from service.cli.bench_ablation import bench_ablation
+from service.cli.bench_field import bench_field
 from service.cli.bench_gate import bench_gate
 from service.cli.bench_localize import bench_localize
 from service.cli.bench_paper import bench_paper
@@ -20,3 +21,4 @@ bench_app.command("gate")(bench_gate)
 bench_app.command("render")(bench_render)
 bench_app.command("scale")(bench_scale)
 bench_app.command("ablation")(bench_ablation)
+bench_app.command("field")(bench_field)

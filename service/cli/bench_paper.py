@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from service.cli.terminal import MatcherOption, err, out, print_machine, settings_of
-from service.errors import InvalidRequest
+from service.cli.terminal import MatcherOption, err, out, print_machine, scene_arguments, settings_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -40,7 +39,7 @@ def bench_paper(
     from service.localize import DEFAULT_MATCHER
 
     spec = runs.RunSpec(
-        scenes=_scene_arguments(scenes),
+        scenes=scene_arguments(scenes),
         cells=chosen(study or (), method or (), protocol or ()),
         out=folder,
         trials=trials,
@@ -61,18 +60,6 @@ def bench_paper(
         with err.status("drawing"):
             write(spec, report)
         out.print(str(report / "index.html"), highlight=False, soft_wrap=True)
-
-
-def _scene_arguments(given: list[str]) -> dict[str, tuple[Path, Path | None]]:
-    """Parse SCENE or SCENE=DATA arguments to (scene, data) by the scene's name, its stem. Raises InvalidRequest."""
-    found: dict[str, tuple[Path, Path | None]] = {}
-    for text in given:
-        scene, _, data = text.partition("=")
-        name = Path(scene).resolve().stem
-        if name in found:
-            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
-        found[name] = Path(scene), Path(data) if data else None
-    return found
 
 
 @contextmanager

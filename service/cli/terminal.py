@@ -83,6 +83,23 @@ def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -
     return loaded
 
 
+def scene_arguments(given: list[str], named_by_photos: bool = False) -> dict[str, tuple[Path, Path | None]]:
+    """Parse SCENE or SCENE=DATA arguments to (scene, data) by the scene's name, its stem. Raises InvalidRequest.
+
+    With `named_by_photos` the name of SCENE=DATA is that of both, so that a scene may come with several sets of photos.
+    """
+    found: dict[str, tuple[Path, Path | None]] = {}
+    for text in given:
+        scene, _, data = text.partition("=")
+        name = Path(scene).resolve().stem
+        if data and named_by_photos:
+            name += f"-{Path(data).resolve().stem}"
+        if name in found:
+            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
+        found[name] = Path(scene), Path(data) if data else None
+    return found
+
+
 def print_machine() -> None:
     """Print the processor and its load, without which a benchmark's times mean nothing."""
     from service.cli.diagnostics import processor

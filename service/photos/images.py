@@ -168,6 +168,15 @@ def encode_image(
     return data.tobytes()
 
 
+def with_focal_35mm(jpeg: bytes, focal_mm: int) -> bytes:
+    """Return a JPEG without EXIF with this 35 mm equivalent focal length in one."""
+    exif = Image.Exif()
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal_mm
+    segment = exif.tobytes()
+    # Right after the start of the image; a segment's length counts its own two bytes.
+    return jpeg[:2] + b"\xff\xe1" + (len(segment) + 2).to_bytes(2, "big") + segment + jpeg[2:]
+
+
 def with_palette(png: bytes) -> bytes:
     """Return a PNG with 256 colours of its own, opaque: about a third of the bytes."""
     shown = BytesIO()

@@ -1,0 +1,54 @@
+"""`splatfix bench field`: lenses, photos and scenes as people have them, one factor at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.terminal import counter, print_machine, progress_bar, say, scene_arguments, settings_of
+
+
+def bench_field(
+    scenes: Annotated[
+        list[str] | None, typer.Argument(help="Scene folders; SCENE=PHOTOS where photos and truth are elsewhere.")
+    ] = None,
+    folder: Annotated[Path, typer.Option("--out", help="Where results are kept; a run there is gone on with.")] = Path(
+        "field"
+    ),
+    rows: Annotated[list[str] | None, typer.Option("--row", help="Only rows like this, e.g. 'lens/k1=*'.")] = None,
+    photos: Annotated[int | None, typer.Option(min=1, help="Test photos a scene, at most.")] = None,
+    seed: int = 0,
+    occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, to hide parts with.")] = None,
+    by_scene: Annotated[bool, typer.Option("--by-scene", help="A line of the table for each scene and row.")] = False,
+    table_only: Annotated[bool, typer.Option("--table-only", help="Run nothing; print what there is.")] = False,
+    show_rows: Annotated[bool, typer.Option("--list", help="Print the rows, and end.")] = False,
+) -> None:
+    """Localize photos with the lenses, defects and scenes that people have; print a Markdown table."""
+    from service.bench import field
+    from service.bench.field_rows import chosen_rows
+    from service.bench.field_table import table
+
+    chosen = chosen_rows(rows or ())
+    if show_rows:
+        for row in chosen:
+            say(row.name)
+        return
+    spec = field.FieldSpec(
+        scenes=scene_arguments(scenes or [], named_by_photos=True),
+        rows=chosen,
+        out=folder,
+        photos=photos,
+        seed=seed,
+        occluders=occluders,
+        cache_dir=settings_of({}).cache_dir,
+    )
+    if not table_only:
+        print_machine()
+        with progress_bar() as progress:
+            bars = {name: counter(progress, name) for name in spec.scenes}
+            field.run(spec, lambda name, done, total: bars[name](done, total))
+    names = {row.name for row in chosen}
+    lines = [line for line in field.read_results(spec) if line["row"] in names]
+    say(table(lines, by_scene))

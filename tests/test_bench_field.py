@@ -1,0 +1,356 @@
+"""The field bench: lenses that bend as OpenCV's do, what is told of them, what counts as what, and resuming."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from PIL import ExifTags, Image
+from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, folder_of, poses
+
+from service.bench import field, field_queries
+from service.bench import localize as bench
+from service.bench.bench_photos import BenchPhoto
+from service.bench.field_queries import FieldQuery, Sent, decoded, send
+from service.bench.field_rows import TOLD, Row, all_rows, chosen_rows
+from service.bench.field_table import chi_square_6, outcome_of, summary, table
+from service.bench.modifications import modify
+from service.bench.modified_photo import Photo
+from service.errors import InvalidOptions, InvalidRequest, UnknownName
+from service.geometry import moved
+from service.pose.refinement.refine_stage import RefinedPose, RefineOutcome
+from service.results import PoseEstimate, Reason, Status, Verdict
+from service.types import Camera, Intrinsics, Pose
+
+LENS = Intrinsics(240, 180, 200.0, 204.0, 124.0, 86.0)
+RNG = np.random.default_rng(0)
+TOLERANCE_PX = 0.04
+"""OpenCV's Lanczos kernel shifts a ramp by up to 0.03 px."""
+EDGE_TOLERANCE_PX = 0.15
+"""Within the kernel's reach of the edge; seen: 0.09."""
+
+
+def map_photo(lens: Intrinsics = LENS) -> Photo:
+    """A photo whose red and green say where each pixel is: after resampling, where it came from."""
+    rows, columns = np.mgrid[: lens.height, : lens.width]
+    rgb = np.stack([(columns + 0.5) / 256, (rows + 0.5) / 256, np.zeros(rows.shape)], 2)
+    return Photo(rgb.astype(np.float32), lens, poses()[1])
+
+
+def source_of(photo: Photo) -> np.ndarray:
+    return photo.rgb[..., :2].reshape(-1, 2) * 256
+
+
+def check_places(found: np.ndarray, expected: np.ndarray) -> None:
+    error = np.abs(found - expected).max(1)
+    assert error.max() < EDGE_TOLERANCE_PX
+    inner = ((expected > 5) & (expected < expected.max(0) - 5)).all(1)
+    assert error[inner].max() < TOLERANCE_PX
+
+
+def pixels_of(lens: Intrinsics) -> np.ndarray:
+    rows, columns = np.mgrid[: lens.height, : lens.width]
+    return np.stack([columns + 0.5, rows + 0.5], 2).reshape(-1, 2)
+
+
+def matrix(lens: Intrinsics) -> np.ndarray:
+    return np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+
+
+class TestLenses:
+    @pytest.mark.parametrize("spec", ["k1=-0.1", "k1=0.1", "k1=-0.02", "fisheye=1"])
+    def test_each_pixel_comes_from_where_opencv_says(self, spec):
+        """OpenCV projects the rays of the old places through the lens that the photo now claims to have."""
+        photo = modify(map_photo(), [spec], RNG)
+        lens, (x, y) = photo.intrinsics, source_of(photo).T
+        rays = np.stack([(x - LENS.cx) / LENS.fx, (y - LENS.cy) / LENS.fy, np.ones_like(x)], 1)[:, None]
+        place = np.zeros(3), np.zeros(3), matrix(lens)
+        if spec.startswith("fisheye"):
+            assert lens.model == "OPENCV_FISHEYE"
+            projected, _ = cv2.fisheye.projectPoints(rays, *place, np.zeros(4))
+        else:
+            assert (lens.model, lens.distortion) == ("SIMPLE_RADIAL", (float(spec[3:]),))
+            projected, _ = cv2.projectPoints(rays, *place, np.array([*lens.distortion, 0, 0, 0]))
+        check_places(projected[:, 0], pixels_of(lens))
+        assert lens.fx == lens.fy
+
+    @pytest.mark.parametrize("spec", ["k1=-0.1", "fisheye=1", "shutter_yaw=300", "shutter_pitch=-300"])
+    def test_every_pixel_is_of_the_photo_and_none_is_wasted(self, spec):
+        photo = modify(map_photo(), [spec], RNG)
+        found, size = source_of(photo), np.array([LENS.width, LENS.height])
+        assert found.min() > 0.5 - EDGE_TOLERANCE_PX
+        assert (found < size - 0.5 + EDGE_TOLERANCE_PX).all()
+        # At some side the source's edge is reached to a pixel or two.
+        assert min(*(found.min(0) - 0.5), *(size - 0.5 - found.max(0))) < 2.0
+        assert photo.intrinsics.width < LENS.width
+        aspect = photo.intrinsics.width / photo.intrinsics.height
+        assert aspect == pytest.approx(LENS.width / LENS.height, rel=0.02)
+
+    def test_a_pincushion_needs_no_cut(self):
+        camera = modify(map_photo(), ["k1=0.1"], RNG).intrinsics
+        assert (camera.width, camera.height, camera.cx, camera.cy) == (240, 180, LENS.cx, LENS.cy)
+
+    @pytest.mark.parametrize(("axis", "name"), [([0, 1.0, 0], "shutter_yaw"), ([1.0, 0, 0], "shutter_pitch")])
+    def test_a_rolling_shutter_is_a_homography_a_row(self, axis, name):
+        photo = modify(map_photo(), [f"{name}=100"], RNG)
+        lens = photo.intrinsics
+        found, expected = source_of(photo).reshape(lens.height, lens.width, 2), []
+        for row in range(lens.height):
+            # 100 degrees a second, 20 ms over the whole height, 0 in its middle
+            of_whole = (row + 0.5 + (LENS.height - lens.height) / 2) / LENS.height - 0.5
+            rotation, _ = cv2.Rodrigues(np.radians(100 * 0.02 * of_whole) * np.array(axis))
+            homography = matrix(LENS) @ rotation @ np.linalg.inv(matrix(lens))
+            pixels = np.stack([np.arange(lens.width) + 0.5, np.full(lens.width, row + 0.5)], 1)[:, None]
+            expected.append(cv2.perspectiveTransform(pixels, homography)[:, 0])
+        check_places(found.reshape(-1, 2), np.concatenate(expected))
+
+    def test_zoom_and_corners_know_where_they_were_cut(self):
+        zoomed = modify(map_photo(), ["zoom=2"], RNG)
+        assert (zoomed.intrinsics.width, zoomed.intrinsics.fx) == (240, 400.0)
+        inner = np.s_[20:160, 20:220]
+        expected = (pixels_of(LENS).reshape(180, 240, 2)) / 2 + [60, 45]
+        assert np.abs(zoomed.rgb[inner][..., :2] * 256 - expected[inner]).max() < 0.02
+        assert zoomed.focal_of_whole == pytest.approx(200 / 240)
+        corner = modify(map_photo(), ["off_centre=0.5"], np.random.default_rng(3))
+        left, top = corner.rgb[0, 0, :2] * 256 - 0.5
+        assert (left in (0, 120), top in (0, 90)) == (True, True)
+        assert (corner.intrinsics.cx, corner.intrinsics.cy) == (124 - left, 86 - top)
+        assert corner.focal_of_whole == pytest.approx(200 / 240)
+
+    def test_what_cannot_be(self):
+        with pytest.raises(InvalidOptions, match="already"):
+            modify(map_photo(), ["k1=0.1", "fisheye=1"], RNG)
+        with pytest.raises(InvalidOptions, match="fold"):
+            modify(map_photo(replace(LENS, fx=80.0, fy=80.0)), ["k1=-0.1"], RNG)
+
+
+def photo_file(path) -> BenchPhoto:
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 255, (180, 240, 3), np.uint8))
+    image.save(path)
+    return BenchPhoto(path.name, path, Camera(LENS, poses()[1]))
+
+
+def exif_focal(sent: Sent) -> int | None:
+    """Read the tag as another program would."""
+    image = Image.open(io.BytesIO(sent.data))
+    return image.getexif().get_ifd(ExifTags.IFD.Exif).get(ExifTags.Base.FocalLengthIn35mmFilm)
+
+
+class TestWhatIsSent:
+    @pytest.mark.parametrize(
+        ("specs", "millimetres"),
+        [((), 30), (("focal=0.67",), 20), (("crop=0.5",), 30), (("zoom=2",), 30), (("off_centre=0.6",), 30)],
+    )
+    def test_exif_is_that_of_the_whole_photo(self, tmp_path, specs, millimetres):
+        one = photo_file(tmp_path / "a.png")
+        sent = send(decoded(one, (0, 0, 0)), FieldQuery(Row("r", "exif", specs), one), 0)
+        # 36 mm x 200 / 240
+        assert (exif_focal(sent), sent.intrinsics) == (millimetres, None)
+        image = Image.open(io.BytesIO(sent.data))
+        assert image.size == (sent.truth.intrinsics.width, sent.truth.intrinsics.height)
+
+    def test_no_more_is_told_than_the_row_says(self, tmp_path):
+        one = photo_file(tmp_path / "a.png")
+        photo = decoded(one, (0, 0, 0))
+        sent = {told: send(photo, FieldQuery(Row("r", told, ("k1=-0.05", "focal=1.1")), one), 0) for told in TOLD}
+        assert {told: exif_focal(each) for told, each in sent.items() if told != "exif"} == dict.fromkeys(
+            set(TOLD) - {"exif"}
+        )
+        assert sent["exif"].intrinsics is sent["withheld"].intrinsics is None
+        pinhole = sent["pinhole"].intrinsics
+        assert pinhole is not None
+        assert (pinhole.model, pinhole.distortion, pinhole.trust) == ("PINHOLE", (), "exact")
+        truth = sent["told"].truth.intrinsics
+        assert sent["told"].intrinsics == replace(truth, fx=truth.fx * 1.1, fy=truth.fy * 1.1)
+        assert sent["approximate"].intrinsics == replace(
+            truth, fx=truth.fx * 1.1, fy=truth.fy * 1.1, trust="approximate"
+        )
+        centred = sent["centred"].intrinsics
+        assert centred is not None
+        assert (centred.cx, centred.cy) == (truth.width / 2, truth.height / 2)
+
+    def test_a_distorted_photo_stays_as_it_is(self, tmp_path):
+        plain = photo_file(tmp_path / "a.png")
+        lens = Intrinsics(240, 180, 200.0, 200.0, 120.0, 90.0, "SIMPLE_RADIAL", (-0.08,))
+        one = replace(plain, camera=Camera(lens, poses()[1]))
+        photo = decoded(one, (0, 0, 0))
+        assert np.array_equal(photo.rgb, decoded(plain, (0, 0, 0)).rgb)
+        assert photo.intrinsics == lens
+        fits = {row.name for row in all_rows() if row.fits(lens)}
+        assert {"lens/told", "lens/pinhole"} <= fits
+        assert not fits & {"lens/k1=0.1/exif", "lens/shutter_yaw=30/told", "photo/roll=45"}
+        assert "lens/pinhole" not in {row.name for row in all_rows() if row.fits(LENS)}
+
+
+class TestRows:
+    def test_names_are_unique_and_choosable(self):
+        rows = all_rows()
+        assert len({row.name for row in rows}) == len(rows)
+        some = chosen_rows(["lens/k1=-0.1/*", "photo/jpeg=20"])
+        assert [row.name.rpartition("/")[2] for row in some] == ["told", "exif", "withheld", "pinhole", "jpeg=20"]
+        assert {row.pool for row in chosen_rows(["lens/k1=*/exif"])} == {"lens/k1/exif"}
+        with pytest.raises(UnknownName, match="jpg"):
+            chosen_rows(["photo/jpg*"])
+
+    def test_each_can_be_made(self):
+        photo = replace(map_photo(), occluders=(map_photo().rgb,))
+        for row in all_rows():
+            if row.fits(LENS):
+                assert modify(photo, row.modify, RNG).rgb.shape[2] == 3
+
+
+def line(localized: bool, right: bool, stays: bool = True, **more) -> dict:
+    found = {
+        "scene": "s", "row": "lens/k1=0.1/exif", "pool": "lens/k1/exif", "group": "lens", "localized": localized,
+        "right": right, "reason": "focal_uncertain", "below_floor": [], "cpu_ms": 100.0, "rotation_deg": 0.1,
+        "translation_units": 0.01, "nees": 5.0, "focal_error": -0.01, "k1_error": 0.02, "home": {"stays": stays},
+    }  # fmt: skip
+    return found | more
+
+
+class TestTable:
+    def test_every_query_is_counted_once(self):
+        lines = [line(True, True)] * 5 + [line(False, True)] * 4 + [line(True, False)] * 3 + [line(False, False)] * 2
+        lines += [line(False, False, stays=False)]
+        found = summary(lines)
+        assert [found[key] for key in ("localized", "refused", "wrong", "lost", "unanswerable")] == [5, 4, 3, 2, 1]
+        assert (found["queries"], found["answerable"]) == (15, 14)
+        assert found["refused_by"] == {"focal_uncertain": 4}
+        assert (found["focal_error"], found["k1_error"]) == (0.01, 0.02)
+        assert outcome_of(line(True, False, stays=False)) == "wrong"
+
+    def test_ellipsoids(self):
+        """Quantiles of a chi-square with six degrees of freedom, from a table."""
+        assert [chi_square_6(x) for x in (5.348, 12.592, 16.812)] == pytest.approx([0.5, 0.95, 0.99], abs=1e-4)
+        drawn = np.sum(np.random.default_rng(0).normal(size=(4000, 6)) ** 2, 1)
+        found = summary([line(True, True, nees=float(value)) for value in drawn])
+        assert (found["in_68"], found["in_95"]) == pytest.approx((0.68, 0.95), abs=0.02)
+
+    def test_shares_of_many_counts_of_few(self):
+        few = table([line(True, True)] * 3 + [line(False, True, row="lens/k1=0.2/exif", below_floor=["tints"])])
+        rows = [cells.split(" | ") for cells in few.splitlines()[2:]]
+        assert [cells[0].strip("| *") for cells in rows] == [
+            "lens/k1=0.1/exif", "lens/k1=0.2/exif", "lens/k1/exif", "all of lens",
+        ]  # fmt: skip
+        assert [cells[1] for cells in rows] == ["3", "1", "4", "4"]
+        assert rows[2][7] == "3 of 4"
+        assert "focal_uncertain (tints) 1" in rows[2][-1]
+        many = table([line(True, True)] * 39 + [line(False, True)]).splitlines()
+        assert many[2].split(" | ")[7] == "97.5 %"
+        assert table([line(True, True), line(True, True, scene="t")], by_scene=True).count("\n") == 3
+
+
+@pytest.fixture
+def fake_scene(monkeypatch):
+    monkeypatch.setattr(bench.LoadedScene, "of", lambda scene, **_: FakeLoaded(scene, FakeRasterizer(), FakeMatcher()))
+
+
+@pytest.fixture
+def answers(monkeypatch, fake_scene):
+    """`field.run` with a fake answer to each query."""
+    seen = {"asked": []}
+
+    def fake_answer(one, photo, query, seed, request):
+        seen["asked"].append(query.key)
+        return {"row": query.row.name, "photo": query.photo.name, "number": query.number}
+
+    monkeypatch.setattr(bench.LoadedScene, "of", lambda scene, **_: FakeLoaded(scene, FakeRasterizer(), FakeMatcher()))
+    monkeypatch.setattr(field, "answer", fake_answer)
+    return seen
+
+
+class TestRun:
+    def spec(self, tmp_path, *patterns, **more) -> field.FieldSpec:
+        folder = tmp_path / "s"
+        if not folder.exists():
+            folder_of(folder, "nerfstudio")
+        return field.FieldSpec({"s": (folder, None)}, chosen_rows(patterns), tmp_path / "out", **more)
+
+    def test_what_has_a_line_is_not_run_again(self, tmp_path, answers):
+        steps = []
+        field.run(self.spec(tmp_path, "lens/told"), lambda *step: steps.append(step))
+        assert steps == [("s", 1, 2), ("s", 2, 2)]
+        # the first is answered twice, for compilation
+        assert len(answers["asked"]) == 3
+        file = tmp_path / "out" / "s.jsonl"
+        lines = file.read_text().splitlines(keepends=True)
+        file.write_text(lines[0] + lines[1][:20])  # killed while it wrote
+        answers["asked"].clear()
+        whole = field.run(self.spec(tmp_path, "lens/told", "lens/exif"))
+        assert sorted(set(answers["asked"])) == [
+            ("lens/exif", "images/0.png", 0), ("lens/exif", "images/5.png", 0), ("lens/told", "images/5.png", 0),
+        ]  # fmt: skip
+        assert len(whole) == 4
+        assert [json.loads(text) for text in file.read_text().splitlines()] == whole
+        assert field.read_results(self.spec(tmp_path)) == whole
+
+    def test_results_of_another_seed_are_not_mixed(self, tmp_path, answers):
+        field.run(self.spec(tmp_path, "lens/told"))
+        with pytest.raises(InvalidRequest, match="seed 0, not 1"):
+            field.run(self.spec(tmp_path, "lens/told", seed=1))
+
+    def test_rows_that_need_occluders_need_a_folder(self, tmp_path, answers):
+        assert field.run(self.spec(tmp_path, "photo/occlusion=*")) == []
+        occluders = tmp_path / "s" / "images"
+        found = field.run(self.spec(tmp_path, "photo/occlusion=*", occluders=occluders, photos=1))
+        assert [one["photo"] for one in found] == ["images/0.png"] * 2
+
+
+@pytest.mark.usefixtures("fake_scene")
+class TestAnswerable:
+    """An estimator that says what it is told to, and a refinement that leads where it is told to."""
+
+    OFF = np.array([0, 0, 0, 0, 0, 1.0])
+
+    def answered(self, monkeypatch, tmp_path, status: Status, off: float, leads: float | None, told="withheld"):
+        verdict = Verdict(status, Reason.FEW_INLIERS, 0.3, 10, 0.5, 1.0, np.eye(6) * 1e-4)
+        one = bench.load_bench_scene(folder_of(tmp_path / "s", "nerfstudio"))
+        photo = one.photos[0]
+        truth = photo.camera.pose
+        starts = []
+
+        def localized(read, loaded, request):
+            pose = moved(truth, off * self.OFF)
+            return PoseEstimate(
+                pose, verdict, read.photo_intrinsics, read.intrinsics_source, "s", "0", "f", "f", "f", 0, False, 0, (),
+                (), (),
+            )  # fmt: skip
+
+        def refined(start, images, renderer):
+            starts.append((start.pose, images.query.photo_intrinsics))
+            yield from ()
+            if leads is None:
+                return RefineOutcome(None)
+            pose: Pose = moved(start.pose, leads * self.OFF)
+            return RefineOutcome(RefinedPose(pose, start.correction, 0.01, None, None, None))
+
+        monkeypatch.setattr(field_queries, "localize", localized)
+        monkeypatch.setattr(field_queries, "refine_stage", refined)
+        query = FieldQuery(Row("lens/x", told), photo)
+        found = field_queries.answer(one, decoded(photo, (0, 0, 0)), query, 0, bench.Request())
+        return json.loads(json.dumps(found)), starts, photo.camera
+
+    @pytest.mark.parametrize(("leads", "outcome"), [(0.0, "lost"), (1.0, "unanswerable"), (None, "unanswerable")])
+    def test_a_lost_photo_is_refined_from_the_truth(self, monkeypatch, tmp_path, leads, outcome):
+        found, starts, camera = self.answered(monkeypatch, tmp_path, Status.UNCERTAIN, 1.0, leads)
+        assert outcome_of(found) == outcome
+        ((pose, lens),) = starts
+        assert np.allclose(pose.world_from_camera, camera.pose.world_from_camera)
+        assert lens == replace(camera.intrinsics, trust="approximate")
+
+    def test_a_told_lens_is_exact_there_too(self, monkeypatch, tmp_path):
+        _, ((_, lens),), camera = self.answered(monkeypatch, tmp_path, Status.UNCERTAIN, 1.0, 0.0, "told")
+        assert lens == camera.intrinsics
+
+    def test_only_where_it_was_not_right(self, monkeypatch, tmp_path):
+        found, starts, _ = self.answered(monkeypatch, tmp_path, Status.LOCALIZED, 0.0, 0.0)
+        assert (starts, "home" in found, outcome_of(found)) == ([], False, "localized")
+        assert found["nees"] == pytest.approx(0.0, abs=1e-9)
+
+    def test_a_wrong_answer_is_wrong_though_nobody_could_answer(self, monkeypatch, tmp_path):
+        found, starts, _ = self.answered(monkeypatch, tmp_path, Status.LOCALIZED, 1.0, None)
+        assert (len(starts), outcome_of(found)) == (1, "wrong")
