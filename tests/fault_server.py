@@ -32,13 +32,13 @@ def main() -> None:
 
         def fill(*_: object) -> None:
             service.jobs.photo_store.write_durably = full
-            writer = app.state.app_state.jobs._store._writer
+            writer = app.state.app_state.jobs._store._database._writer
             (pages,) = writer.execute("PRAGMA page_count").fetchone()
             writer.execute(f"PRAGMA max_page_count = {pages}")
 
         def free(*_: object) -> None:
             service.jobs.photo_store.write_durably = _write
-            app.state.app_state.jobs._store._writer.execute("PRAGMA max_page_count = 1000000")
+            app.state.app_state.jobs._store._database._writer.execute("PRAGMA max_page_count = 1000000")
 
         signal.signal(signal.SIGUSR1, fill)
         signal.signal(signal.SIGUSR2, free)

@@ -201,7 +201,7 @@ def test_a_result_waits_until_the_disk_has_room(stepping, tmp_path):
         ready(client)
         path = post(client, prefer="", options={"hold": True, "steps": 60}).headers["location"]
         until(lambda: client.get(path).json()["records"] == 1)
-        writer = service_app.state.app_state.jobs._store._writer
+        writer = service_app.state.app_state.jobs._store._database._writer
         (pages,) = writer.execute("PRAGMA page_count").fetchone()
         writer.execute(f"PRAGMA max_page_count = {pages}")
         stepping.GO_ON.set()

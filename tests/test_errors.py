@@ -112,7 +112,7 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
 
 def on_scene(s: SimpleNamespace, scene: str) -> str:
     """Return the ended job, as if it had been on another scene."""
-    writer = s.app.state.app_state.jobs._store._writer
+    writer = s.app.state.app_state.jobs._store._database._writer
     writer.execute("UPDATE jobs SET scene = ? WHERE id = ?", (scene, s.done))
     return s.done
 
@@ -159,7 +159,7 @@ def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> ht
         patch.setattr(service.jobs.photo_store, "write_durably", full)
         patch.setattr(service.scene_manager.scene_store.os, "fsync", full)
         patch.setattr(service.scene_manager.scene_store.shutil, "rmtree", undeletable)
-        writer = s.app.state.app_state.jobs._store._writer
+        writer = s.app.state.app_state.jobs._store._database._writer
         (pages,) = writer.execute("PRAGMA page_count").fetchone()
         writer.execute(f"PRAGMA max_page_count = {pages}")
         writer.execute("PRAGMA query_only = 1")
@@ -313,7 +313,7 @@ def recovered(s: SimpleNamespace) -> str:
 
 def localized(s: SimpleNamespace) -> str:
     store = s.app.state.app_state.jobs._store
-    writer, result = store._writer, store.result(s.done)
+    writer, result = store._database._writer, store.result(s.done)
     writer.execute("UPDATE jobs SET status = 'localized' WHERE id = ?", (s.done,))
     writer.execute("UPDATE jobs SET result = ? WHERE id = ?", (encode(replace(result, geo_anchor=None)), s.done))
     s.client.event_hooks["response"].append(

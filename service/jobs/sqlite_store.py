@@ -1,24 +1,22 @@
-"""Jobs on disk (SQLite, WAL): what is accepted here survives a crash. The only file with sqlite3.
+"""Jobs on disk (SQLite): what is accepted here survives a crash.
 
 Every change of state is a compare-and-set on (state, attempt), so a job can't end twice, even if several
-threads or processes try to end it. Commits are `synchronous=FULL`: when a method returns, its change is on disk.
+threads or processes try to end it. When a method returns, its change is on disk.
 Specs, photos' data, records and results are JSON text of `codec`.
 """
 
 from __future__ import annotations
 
-import sqlite3
-import threading
 import time
 import zlib
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from service.errors import Failure, IdempotencyConflict, JobNotFound, StorageFailed
+from service.errors import Failure, IdempotencyConflict, JobNotFound
 from service.jobs.codec import decode, encode
+from service.jobs.database import Connection, Database
 from service.jobs.migrate_0_1 import old_failure, old_photo, old_result, old_spec
 from service.jobs.model import (
     ENDED,
@@ -62,12 +60,12 @@ _JOB_COLUMNS = tuple(field.name for field in fields(StoredJob))
 _NEW_COLUMNS = tuple(field.name for field in fields(NewJob))
 
 
-def _make_version_1(writer: sqlite3.Connection) -> None:
+def _make_version_1(writer: Connection) -> None:
     for statement in _VERSION_1.split(";"):
         writer.execute(statement)
 
 
-def _make_version_2(writer: sqlite3.Connection) -> None:
+def _make_version_2(writer: Connection) -> None:
     """From release 0.1.0: values instead of the API's JSON, and leases. Its records go."""
     writer.execute("ALTER TABLE jobs RENAME COLUMN fields TO spec")
     writer.execute("ALTER TABLE jobs RENAME COLUMN error TO failure")
@@ -88,55 +86,24 @@ def _make_version_2(writer: sqlite3.Connection) -> None:
     writer.execute(f"UPDATE jobs SET bytes = {sizes} WHERE state IN ({_ENDED_SQL})")
 
 
-# One entry takes the file one version up; an entry that was released is never changed.
 _MIGRATIONS = (_make_version_1, _make_version_2)
 
 
 class SqliteJobStore:
-    """One file, one process (a lock file sees to that elsewhere), any number of threads."""
+    """Implements `JobStore`."""
 
     def __init__(self, path: Path) -> None:
         """Open the file or make it, and bring it to the present version. Raises StorageFailed."""
-        self._path = path
-        self._writing, self._reading = threading.Lock(), threading.Lock()
-        try:
-            self._writer = self._connection()
-            self._migrate()
-            # A second connection: with WAL, readers do not wait for a commit to reach the disk.
-            self._reader = self._connection()
-        except sqlite3.Error as error:
-            raise StorageFailed(f"{path} can't be used: {error}.", where="data_dir") from error
+        self._database = Database(path, _MIGRATIONS, "its jobs")
 
     def close(self) -> None:
-        with self._writing, self._reading:
-            self._writer.close()
-            self._reader.close()
-
-    def _connection(self) -> sqlite3.Connection:
-        connection = sqlite3.connect(self._path, timeout=10, isolation_level=None, check_same_thread=False)
-        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")  # only in a new file, before its first table
-        connection.execute("PRAGMA journal_mode = WAL")
-        connection.execute("PRAGMA synchronous = FULL")
-        return connection
-
-    def _migrate(self) -> None:
-        (version,) = self._writer.execute("PRAGMA user_version").fetchone()
-        if version > len(_MIGRATIONS):
-            raise StorageFailed(
-                f"{self._path} has version {version}, this program knows up to {len(_MIGRATIONS)}.",
-                where="data_dir",
-                hint="Run the newer program, or name another data_dir.",
-            )
-        for number, migrate in enumerate(_MIGRATIONS[version:], version + 1):
-            with self._transaction() as writer:
-                migrate(writer)
-                writer.execute(f"PRAGMA user_version = {number}")
+        self._database.close()
 
     # ------------------------------------------------------------------ the life of a job
 
     def accept(self, job: NewJob) -> StoredJob:
         row = f"INSERT INTO jobs ({', '.join(_NEW_COLUMNS)}, state) VALUES ({_marks(len(_NEW_COLUMNS))}, 'queued')"
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             known = _find_by_key(writer, job.client, job.idempotency_key, job.digest)
             if known is None:
                 values = [getattr(job, name) for name in _NEW_COLUMNS]
@@ -146,19 +113,19 @@ class SqliteJobStore:
         return known
 
     def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
-        with self._reading:
-            return _find_by_key(self._reader, client, key, digest)
+        with self._database.reading() as reader:
+            return _find_by_key(reader, client, key, digest)
 
     def has_key(self, client: str, key: str) -> bool:
-        with self._reading:
-            return bool(_select(self._reader, "WHERE client = ? AND idempotency_key = ?", client, key))
+        with self._database.reading() as reader:
+            return bool(_select(reader, "WHERE client = ? AND idempotency_key = ?", client, key))
 
     def probe(self) -> None:
-        with self._transaction() as writer:
-            writer.execute(f"PRAGMA user_version = {len(_MIGRATIONS)}")
+        with self._database.transaction() as writer:
+            writer.execute(f"PRAGMA user_version = {self._database.version}")
 
     def claim(self, job: StoredJob, lease_until: float) -> int | None:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             changed = writer.execute(
                 "UPDATE jobs SET state = 'running', attempt = attempt + 1, started = ?, lease_until = ?, records = 0, "
                 "stage = NULL WHERE id = ? AND state = 'queued' AND attempt = ? AND NOT cancelled",
@@ -169,7 +136,7 @@ class SqliteJobStore:
         return job.attempt + 1 if changed else None
 
     def renew(self, attempts: Sequence[tuple[str, int]], lease_until: float) -> None:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             writer.executemany(
                 "UPDATE jobs SET lease_until = ? WHERE id = ? AND state = 'running' AND attempt = ?",
                 [(lease_until, job_id, attempt) for job_id, attempt in attempts],
@@ -183,10 +150,10 @@ class SqliteJobStore:
         )
         # Asked often: mostly there is nothing, and a read needs no commit.
         over = "SELECT id FROM jobs WHERE state = 'running' AND lease_until < ?"
-        with self._reading:
-            if not self._reader.execute(over, (before,)).fetchone():
+        with self._database.reading() as reader:
+            if not reader.execute(over, (before,)).fetchone():
                 return []
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             ids = [job_id for (job_id,) in writer.execute(over, (before,))]
             writer.execute("UPDATE jobs SET lost = lost + 1 WHERE state = 'running' AND lease_until < ?", (before,))
             # Each statement takes some of the rows out of `running`, the last one takes the rest.
@@ -199,14 +166,14 @@ class SqliteJobStore:
             return _select(writer, f"WHERE id IN ({_marks(len(ids))}) ORDER BY number", *ids)
 
     def append(self, job_id: str, attempt: int, batch: Batch) -> bool:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             return _append(writer, job_id, attempt, batch)
 
     def finish(self, job_id: str, attempt: int, batch: Batch, ending: Ending, photo_until: float | None) -> bool:
         verdict = ending.result.estimate.verdict if ending.result else None
         result, failure = (value and encode(value) for value in (ending.result, ending.failure))
         size = len(result or "") + len(failure or "")
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             # In one transaction: a job that has ended has all of its records.
             if not _append(writer, job_id, attempt, batch):
                 return False
@@ -223,7 +190,7 @@ class SqliteJobStore:
         return True
 
     def end_queued(self, job: StoredJob, ending: Ending, photo_until: float | None) -> bool:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             changed = writer.execute(
                 "UPDATE jobs SET state = ?, failure = ?, finished = ?, bytes = photo_bytes, "
                 "photo_until = CASE WHEN keep_photo THEN NULL ELSE ? END "
@@ -236,11 +203,11 @@ class SqliteJobStore:
         return bool(changed)
 
     def request_cancel(self, job_id: str) -> None:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             writer.execute(f"UPDATE jobs SET cancelled = 1 WHERE id = ? AND state NOT IN ({_ENDED_SQL})", (job_id,))
 
     def requeue(self, job_id: str, attempt: int) -> bool:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             changed = writer.execute(
                 "UPDATE jobs SET state = 'queued' WHERE id = ? AND state = 'running' AND attempt = ?", (job_id, attempt)
             ).rowcount
@@ -249,15 +216,15 @@ class SqliteJobStore:
     # ------------------------------------------------------------------ reading
 
     def get(self, job_id: str) -> StoredJob:
-        with self._reading:
-            found = _select(self._reader, "WHERE id = ?", job_id)
+        with self._database.reading() as reader:
+            found = _select(reader, "WHERE id = ?", job_id)
         if not found:
             raise JobNotFound(f"there is no job '{job_id}', or it was forgotten.", where="job")
         return found[0]
 
     def queued(self) -> list[StoredJob]:
-        with self._reading:
-            return _select(self._reader, "WHERE state = 'queued' ORDER BY number")
+        with self._database.reading() as reader:
+            return _select(reader, "WHERE state = 'queued' ORDER BY number")
 
     def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:
         tests = {
@@ -270,16 +237,16 @@ class SqliteJobStore:
         }
         given = {test: value for test, value in tests.items() if value is not None}
         where = f"WHERE {' AND '.join(given)} " if given else ""
-        with self._reading:
-            return _select(self._reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
+        with self._database.reading() as reader:
+            return _select(reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
 
     def count(self, state: JobState) -> int:
-        with self._reading:
-            return self._reader.execute("SELECT count(*) FROM jobs WHERE state = ?", (state,)).fetchone()[0]
+        with self._database.reading() as reader:
+            return reader.execute("SELECT count(*) FROM jobs WHERE state = ?", (state,)).fetchone()[0]
 
     def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
-        with self._reading:
-            rows = self._reader.execute(
+        with self._database.reading() as reader:
+            rows = reader.execute(
                 "SELECT record FROM events WHERE job = ? AND seq >= ? "
                 "AND attempt = (SELECT attempt FROM jobs WHERE id = ?) ORDER BY seq",
                 (job_id, first, job_id),
@@ -287,14 +254,14 @@ class SqliteJobStore:
         return [decode(JobRecord, zlib.decompress(data).decode()) for (data,) in rows]
 
     def result(self, job_id: str) -> JobResult | None:
-        with self._reading:
-            row = self._reader.execute("SELECT result FROM jobs WHERE id = ?", (job_id,)).fetchone()
+        with self._database.reading() as reader:
+            row = reader.execute("SELECT result FROM jobs WHERE id = ?", (job_id,)).fetchone()
         return decode(JobResult, row[0]) if row and row[0] else None
 
     # ------------------------------------------------------------------ retention
 
     def expire_photos(self) -> list[str]:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             rows = writer.execute(
                 "UPDATE jobs SET photo_until = NULL, keep_photo = 0, bytes = bytes - photo_bytes, photo_bytes = 0 "
                 f"WHERE photo_until < ? AND state IN ({_ENDED_SQL}) RETURNING id",
@@ -303,7 +270,7 @@ class SqliteJobStore:
         return [job_id for (job_id,) in rows]
 
     def prune(self, kept: Retention) -> list[str]:
-        with self._transaction() as writer:
+        with self._database.transaction() as writer:
             ended = "SELECT id, finished, row_number() OVER newest AS place, sum(bytes) OVER newest AS total "
             # By number, not by time: clocks may be set back.
             ended += f"FROM jobs WHERE state IN ({_ENDED_SQL}) WINDOW newest AS (ORDER BY number DESC)"
@@ -312,39 +279,24 @@ class SqliteJobStore:
             writer.executemany("DELETE FROM jobs WHERE id = ?", ids)
             writer.executemany("DELETE FROM events WHERE job = ?", ids)
         if ids:
-            with self._writing:
-                self._writer.execute("PRAGMA incremental_vacuum").fetchall()
+            self._database.give_space_back()
         return [job_id for (job_id,) in ids]
 
     def ids(self) -> set[str]:
-        with self._reading:
-            return {job_id for (job_id,) in self._reader.execute("SELECT id FROM jobs")}
-
-    @contextmanager
-    def _transaction(self) -> Iterator[sqlite3.Connection]:
-        with self._writing:
-            try:
-                self._writer.execute("BEGIN IMMEDIATE")
-                yield self._writer
-                self._writer.execute("COMMIT")
-            except BaseException as error:
-                if self._writer.in_transaction:
-                    self._writer.execute("ROLLBACK")
-                if isinstance(error, sqlite3.Error):
-                    raise StorageFailed(f"the service can't write its jobs to disk: {error}.") from error
-                raise
+        with self._database.reading() as reader:
+            return {job_id for (job_id,) in reader.execute("SELECT id FROM jobs")}
 
 
 def _marks(count: int) -> str:
     return ", ".join("?" * count)
 
 
-def _select(connection: sqlite3.Connection, where: str, *values: object) -> list[StoredJob]:
+def _select(connection: Connection, where: str, *values: object) -> list[StoredJob]:
     rows = connection.execute(f"SELECT {', '.join(_JOB_COLUMNS)} FROM jobs {where}", values).fetchall()
     return [_job(row) for row in rows]
 
 
-def _find_by_key(connection: sqlite3.Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
+def _find_by_key(connection: Connection, client: str, key: str | None, digest: str) -> StoredJob | None:
     found = _select(connection, "WHERE client = ? AND idempotency_key = ?", client, key) if key is not None else []
     known = found[0] if found else None
     if known and known.digest != digest:
@@ -366,7 +318,7 @@ def _job(row: tuple) -> StoredJob:
     return StoredJob(**values)
 
 
-def _append(writer: sqlite3.Connection, job_id: str, attempt: int, batch: Batch) -> bool:
+def _append(writer: Connection, job_id: str, attempt: int, batch: Batch) -> bool:
     stage = batch.records[-1].step.stage if batch.records else None
     changed = writer.execute(
         "UPDATE jobs SET records = ?, stage = coalesce(?, stage) WHERE id = ? AND state = 'running' AND attempt = ?",

@@ -27,7 +27,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from service.errors import InvalidImage
 from service.photos.camera_identity import CameraIdentity, identity_from_exif
 from service.photos.heic import decode_heic
-from service.photos.intrinsics import UPRIGHT, require_size, undistorted
+from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
 from service.types import Intrinsics, Pose, Query
 
@@ -70,17 +70,6 @@ _DECODERS = (
     ("HEIC", None, DEFAULTS.max_pixels, lambda d: d[4:8] == b"ftyp"),
 )
 """Name, Pillow's decoder (none: a process of its own), the most pixels, and whether a file begins like one."""
-_ORIENTATIONS = {
-    1: (False, False, False),
-    2: (False, True, False),
-    3: (False, True, True),
-    4: (False, False, True),
-    5: (True, False, False),
-    6: (True, True, False),
-    7: (True, True, True),
-    8: (True, False, True),
-}
-"""EXIF orientation -> what makes the image upright: transpose, mirror left-right, mirror top-bottom."""
 log = logging.getLogger(__name__)
 
 
@@ -194,7 +183,7 @@ def resized(rgb: Float32[np.ndarray, "h w 3"], width: int, height: int) -> Float
 def photo_size(data: bytes) -> tuple[int, int]:
     """Return width and height of the upright photo, from its header. Raises InvalidImage."""
     _, photo = _open(data, header_only=True)
-    transpose, _, _ = _ORIENTATIONS[_orientation(photo)]
+    transpose, _, _ = ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
 
 
@@ -323,7 +312,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     scale = [target[axis] / covered[axis] for axis in (0, 1)]
     # What is covered beyond the photo lies right and below; a mirroring brings it to the left and above.
     beyond = [target[axis] - raw_size[axis] * scale[axis] for axis in (0, 1)]
-    transpose, mirror_x, mirror_y = _ORIENTATIONS[_orientation(photo)]
+    transpose, mirror_x, mirror_y = ORIENTATIONS[_orientation(photo)]
     if transpose:
         scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
     upright = [_oriented(layer, transpose, mirror_x, mirror_y) for layer in layers]
@@ -376,7 +365,7 @@ def _band_rgb(
 def _orientation(photo: Image.Image) -> int:
     """Return EXIF's orientation, 1..8; 1 (upright) where it is missing or broken, and of HEIC, decoded upright."""
     value = _exif(photo).get(ExifTags.Base.Orientation, 1)
-    return value if value in _ORIENTATIONS else 1
+    return value if value in ORIENTATIONS else 1
 
 
 def _identity(photo: Image.Image) -> CameraIdentity:

@@ -65,8 +65,18 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
     )
 
 
-UPRIGHT, CLOCKWISE = (False, False, False), (True, True, False)
-"""How a stored image becomes an upright one: transpose, then mirror left-right, then mirror top-bottom."""
+ORIENTATIONS = {
+    1: (False, False, False),
+    2: (False, True, False),
+    3: (False, True, True),
+    4: (False, False, True),
+    5: (True, False, False),
+    6: (True, True, False),
+    7: (True, True, True),
+    8: (True, False, True),
+}
+"""EXIF orientation -> what makes a stored image upright: transpose, then mirror left-right, then mirror top-bottom."""
+UPRIGHT, CLOCKWISE = ORIENTATIONS[1], ORIENTATIONS[6]
 
 
 def oriented(intrinsics: Intrinsics, transpose: bool, mirror_x: bool, mirror_y: bool) -> Intrinsics:
