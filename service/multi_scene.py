@@ -119,7 +119,7 @@ def _inliers(images: QueryImages, loaded: LoadedScene, roll_steps_45deg: int, co
     """Return how many matches with the most similar views agree with one camera, at most."""
     index: ViewIndex = loaded.prepare(DEFAULT_ESTIMATOR)
     features, query = images.features(roll_steps_45deg=roll_steps_45deg), images.query
-    max_error_px = config.approximate_max_error_px if query.focal_sigma else config.max_error_px
+    max_error_px = config.approximate_max_error_px if query.lens_prior else config.max_error_px
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     scores = retrieval_scores(features.descriptors, [view.features.descriptors for view in index.views])
     most = 0

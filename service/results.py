@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, frozen
+from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, IntrinsicsSource, Pose, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +190,7 @@ class PoseEstimate:
     verdict: Verdict
     intrinsics: Intrinsics
     """Used for the whole upright photo."""
-    intrinsics_source: Literal["given", "exif", "guessed"]
+    intrinsics_source: IntrinsicsSource
     scene_id: str
     scene_sha256: str
     estimator: str

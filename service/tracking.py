@@ -32,6 +32,7 @@ from service.localize import (
     rasterizer_for,
     render_and_verify,
 )
+from service.photos.intrinsics import undistorted_query
 from service.photos.sequence import SequencePhoto
 from service.pose.features.image_sizes import sized
 from service.pose.features.query_images import QueryImages
@@ -43,7 +44,7 @@ from service.pose.verification.gate import VERIFICATION, VerificationConfig, pho
 from service.pose.verification.signals import geometry_signals
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
-from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose, Query
+from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,8 +200,9 @@ class Tracker:
         self._rendered, self._unverified = None, 0
         shared = self._intrinsics.correction
         records = tuple(replace(record, correction=shared.then(record.correction)) for record in found.records)
-        if query.focal_sigma and _is_placed(found.verdict):
-            self._intrinsics.set(found.pose, records[-1].correction, found.verdict.focal_sigma)
+        if query.lens_prior and _is_placed(found.verdict):
+            prior = replace(query.lens_prior, log_focal_scale=found.verdict.focal_sigma)
+            self._intrinsics.set(found.pose, records[-1].correction, prior)
         return replace(found, records=records)
 
 
@@ -245,7 +247,7 @@ def refine_from(
     for _ in range(config.max_renders):
         rendered = renderer.render(Camera(size, pose))
         camera = rendered.camera
-        uncertainty = pose_uncertainty(photo, rendered.frame, camera, camera, query.focal_sigma, valid)
+        uncertainty = pose_uncertainty(photo, rendered.frame, camera, camera, query.lens_prior, valid)
         if uncertainty is None:
             return None
         # Estimating the uncertainty includes a step, which is taken.
@@ -274,11 +276,11 @@ def verify_tracked(
     signals |= geometry_signals(frame, size, found.uncertainty)
     if not photometric_suffices(signals, config):
         return None
-    focal_sigma = images.query.focal_sigma
+    lens_prior = images.query.lens_prior
     # A shared focal length is not for one photo to doubt.
-    focal_step = 0.0 if focal_sigma else found.uncertainty.focal_step
+    focal_step = 0.0 if lens_prior else found.uncertainty.focal_step
     uncertainty = replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step)
-    return verdict_of(signals, uncertainty, focal_sigma, config=config)
+    return verdict_of(signals, uncertainty, lens_prior, config=config)
 
 
 @dataclass(slots=True)
@@ -288,23 +290,23 @@ class _SharedIntrinsics:
     config: TrackingConfig
     correction: IntrinsicsCorrection = NO_CORRECTION
     """Of the intrinsics that the photos came with."""
-    sigma: float | None = None
-    """Standard deviation of the focal length's logarithm; None: no photo has added anything."""
+    prior: LensPrior | None = None
+    """How certain they are; None: no photo has added anything."""
     photos: int = 0
     seen_from: Pose | None = None
 
     def applied_to(self, query: Query) -> Query:
         """Return the photo with the intrinsics so far."""
-        return replace(query.corrected(self.correction), shared_focal_sigma=self.sigma)
+        return replace(undistorted_query(query, self.correction), lens_prior=self.prior or query.lens_prior)
 
-    def set(self, pose: Pose, correction: IntrinsicsCorrection, sigma: float) -> None:
+    def set(self, pose: Pose, correction: IntrinsicsCorrection, prior: LensPrior) -> None:
         """Take over an estimate that a photo led to, beginning with the one so far."""
-        self.correction, self.sigma, self.photos, self.seen_from = correction, sigma, self.photos + 1, pose
+        self.correction, self.prior, self.photos, self.seen_from = correction, prior, self.photos + 1, pose
 
     def update(self, images: QueryImages, found: TrackedPose) -> None:
         """Estimate the intrinsics with the pose, if they are uncertain and the photo isn't much like the last one."""
-        config, focal_sigma = self.config, images.query.focal_sigma
-        if focal_sigma <= config.settled_focal_sigma or self.seen_from is None:
+        config, prior = self.config, images.query.lens_prior
+        if prior is None or prior.log_focal_scale <= config.settled_focal_sigma or self.seen_from is None:
             return
         turn_deg, way = pose_distance(self.seen_from, found.pose)
         frame, camera = found.rendered.frame, found.rendered.camera
@@ -312,11 +314,12 @@ class _SharedIntrinsics:
             return
         photo, valid = images.resized(camera.intrinsics), images.valid_mask(camera.intrinsics)
         start = Camera(camera.intrinsics, found.pose)
-        result = refine_photometric(photo, frame, camera, start, 1, NO_CORRECTION, focal_sigma, valid)
+        result = refine_photometric(photo, frame, camera, start, 1, NO_CORRECTION, prior, valid)
         if not np.isfinite(result.loss):
             return
-        share = 1 / (self.photos + 1)  # of the principal point, whose mean is taken
+        share = 1 / (self.photos + 1)  # of principal point and distortion, whose means are taken
         new = result.correction
-        step = IntrinsicsCorrection(new.focal_factor, share * new.shift_x, share * new.shift_y)
-        sigma = float(np.sqrt(found.uncertainty.covariance[6, 6]))
-        self.set(result.pose, self.correction.then(step), sigma)
+        step = IntrinsicsCorrection(new.focal_factor, share * new.shift_x, share * new.shift_y, share * new.k1)
+        focal_sigma, k1_sigma = np.sqrt(found.uncertainty.covariance.diagonal()[6:8])
+        known = replace(prior, log_focal_scale=float(focal_sigma), k1_sigma=float(k1_sigma))
+        self.set(result.pose, self.correction.then(step), known)

@@ -32,17 +32,26 @@ SH_C0 = 0.28209479177387814
 
 @dataclass(frozen=True, slots=True)
 class IntrinsicsCorrection:
-    """What turns assumed intrinsics into the camera's own."""
+    """What turns assumed intrinsics into the camera's own.
+
+    A point at (x, y, 1) in the camera frame is seen at c + f (1 + k1 (x^2 + y^2)) (x, y), where c and f are the
+    corrected principal point and focal length: COLMAP's SIMPLE_RADIAL.
+    """
 
     focal_factor: float = 1.0
     shift_x: float = 0.0
     """Of the principal point, as a share of the image's long side: the same at every size."""
     shift_y: float = 0.0
+    k1: float = 0.0
+    """Radial distortion beside that of the assumed intrinsics."""
 
     def then(self, other: IntrinsicsCorrection) -> IntrinsicsCorrection:
-        """Return this correction followed by another one."""
+        """Return this correction followed by another one; the distortion to first order."""
         return IntrinsicsCorrection(
-            self.focal_factor * other.focal_factor, self.shift_x + other.shift_x, self.shift_y + other.shift_y
+            self.focal_factor * other.focal_factor,
+            self.shift_x + other.shift_x,
+            self.shift_y + other.shift_y,
+            self.k1 * other.focal_factor**2 + other.k1,
         )
 
 
@@ -100,7 +109,10 @@ class Intrinsics:
         )
 
     def corrected(self, correction: IntrinsicsCorrection) -> Intrinsics:
-        """Return the same camera with corrected focal length and principal point."""
+        """Return the same camera with corrected focal length and principal point; its distortion is kept as it is.
+
+        Of a pinhole it is the camera of the image from which the correction's distortion was removed.
+        """
         if correction == NO_CORRECTION:
             return self
         return replace(
@@ -110,6 +122,22 @@ class Intrinsics:
             cx=self.cx + correction.shift_x * self.long_side,
             cy=self.cy + correction.shift_y * self.long_side,
         )
+
+    def distorted(self, correction: IntrinsicsCorrection) -> Intrinsics:
+        """Return the camera of the photo as it was taken: corrected, and with the distortion added to this camera's.
+
+        Added to the coefficient of the radius' third power, which is the sum of both to first order.
+        """
+        camera = self.corrected(correction)
+        if not correction.k1:
+            return camera
+        # A given distortion is a function of the radius over the given focal length.
+        k1 = correction.k1 + (self.distortion[0] * correction.focal_factor**2 if self.distortion else 0.0)
+        if self.distortion:
+            return replace(camera, distortion=(k1, *self.distortion[1:]))
+        if self.fx == self.fy:
+            return replace(camera, model="SIMPLE_RADIAL", distortion=(k1,))
+        return replace(camera, model="OPENCV", distortion=(k1, 0.0, 0.0, 0.0))
 
     def with_long_side(self, pixels: int) -> Intrinsics:
         """Return the camera for the image resampled so that its long side has `pixels`, never enlarged."""
@@ -292,7 +320,28 @@ PriorRegion = BoxPrior | GaussianPosePrior
 """Where the photo was taken for certain; poses outside are refused."""
 
 
-FOCAL_SIGMA = {"given": 0.15, "exif": 0.06, "guessed": 0.5}
+@dataclass(frozen=True, slots=True)
+class LensPrior:
+    """What is known of approximate intrinsics before the photo is localized: independent priors, centred on them.
+
+    Focal length and principal point have heavy tails (Cauchy's distribution): most photos are as their source says,
+    and some were cropped, or have an EXIF tag that was edited. The distortion's prior is normal.
+    """
+
+    log_focal_scale: float
+    """Of the logarithm of the focal length."""
+    k1_sigma: float = 0.05
+    principal_point_scale: float = 0.007
+    """In long sides of the image: phones and calibrated test cameras have 0.001 to 0.03."""
+
+
+IntrinsicsSource = Literal["given", "exif", "guessed", "memory"]
+"""Where a photo's assumed intrinsics are from: the request, its EXIF, a default, or earlier photos of the camera."""
+LENS_PRIORS: dict[IntrinsicsSource, LensPrior] = {
+    "given": LensPrior(0.15),
+    "exif": LensPrior(0.06),
+    "guessed": LensPrior(0.5, k1_sigma=0.1),
+}
 """By the source of approximate intrinsics. EXIF is rounded to a millimetre, and its definition is ambiguous by 4 %."""
 
 
@@ -304,7 +353,7 @@ class Query:
     """sRGB; decoded no larger than estimators use."""
     intrinsics: Intrinsics
     """Of `rgb`."""
-    intrinsics_source: Literal["given", "exif", "guessed"]
+    intrinsics_source: IntrinsicsSource
     photo_intrinsics: Intrinsics
     """Of the whole upright photo in its own resolution, with its distortion: what results report."""
     prior: Pose | None = None
@@ -312,8 +361,8 @@ class Query:
     warnings: tuple[str, ...] = ()
     valid_mask: Bool[np.ndarray, "h w"] | None = None
     """False where a pixel shows nothing: transparent, or outside a distorted photo's edge. None: valid everywhere."""
-    shared_focal_sigma: float | None = None
-    """`focal_sigma` after other photos of the same camera were localized; None: there are none."""
+    lens_prior: LensPrior | None = None
+    """None: the intrinsics are exact, and nothing of them is estimated."""
     region: PriorRegion | None = None
     """Poses outside are refused."""
 
@@ -322,21 +371,15 @@ class Query:
         if self.valid_mask is not None:
             object.__setattr__(self, "valid_mask", frozen(self.valid_mask, np.bool_))
 
-    @property
-    def focal_sigma(self) -> float:
-        """Standard deviation of the logarithm of the focal length before localization; 0: it is exact."""
-        if self.intrinsics.trust == "exact":
-            return 0.0
-        if self.shared_focal_sigma is not None:
-            return self.shared_focal_sigma
-        return FOCAL_SIGMA[self.intrinsics_source]
-
     def corrected(self, correction: IntrinsicsCorrection) -> Query:
-        """Return the query with corrected focal length and principal point."""
+        """Return the query with corrected focal length and principal point.
+
+        The distortion is that of `photo_intrinsics` only: `rgb` is left as it is, `QueryImages` undistorts it.
+        """
         if correction == NO_CORRECTION:
             return self
         return replace(
             self,
             intrinsics=self.intrinsics.corrected(correction),
-            photo_intrinsics=self.photo_intrinsics.corrected(correction),
+            photo_intrinsics=self.photo_intrinsics.distorted(correction),
         )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from service.geometry import look_at, moved, pose_distance, project, se3_log, so3_log, transformed
+from service.pose.absolute_pose import unknown_lens
 from service.pose.absolute_pose.decoupled import (
     BEHIND_PX,
     DecoupledConfig,
@@ -17,15 +20,23 @@ from service.pose.absolute_pose.decoupled import (
     linearize_matches,
     solution_at,
 )
-from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior, correction_vector
-from service.pose.absolute_pose.pnp import AbsolutePoseConfig, estimate_absolute_pose
+from service.pose.absolute_pose.lens_prior import BOUNDS, correction_vector, prior_cost, prior_precision, stepped
+from service.pose.absolute_pose.pnp import AbsolutePose, AbsolutePoseConfig, estimate_absolute_pose
 from service.pose.absolute_pose.prior_region import PriorRegionConfig, distance_outside, inside_prior, widened_prior
-from service.pose.absolute_pose.unknown_focal import (
-    FocalSearchConfig,
-    absolute_pose_unknown_focal,
+from service.pose.absolute_pose.unknown_lens import (
+    LensSearchConfig,
+    absolute_pose_unknown_lens,
     linearize_reprojection,
 )
-from service.types import BoxPrior, GaussianPosePrior, Intrinsics, IntrinsicsCorrection, Pose
+from service.types import (
+    NO_CORRECTION,
+    BoxPrior,
+    GaussianPosePrior,
+    Intrinsics,
+    IntrinsicsCorrection,
+    LensPrior,
+    Pose,
+)
 
 CAMERA = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)
 CENTRE = np.array([0.2, -0.1, 0.3])
@@ -65,41 +76,68 @@ def test_a_pose_needs_the_least_number_of_inliers() -> None:
     assert estimate_absolute_pose(px, points, CAMERA, 2.0, 500, AbsolutePoseConfig(min_points=41)) is None
 
 
-# --- unknown focal length
+# --- unknown lens
 
 
 def test_too_few_inliers_are_not_refined() -> None:
-    """The answer is then a sample of the grid; refined, it is the focal length that was planted."""
-    factor = 1.07  # between two samples, 1 and 1.22
+    """The answer then has one of the assumed focal lengths; refined, it is the one that was planted."""
+    factor = 1.07  # between two steps, 1 and 1.49
     points, px = points_and_pixels(camera=CAMERA.corrected(IntrinsicsCorrection(factor)))
-    refined = absolute_pose_unknown_focal(px, points, CAMERA, 0.5, 8.0, FocalSearchConfig(min_inliers=50))
-    sample = absolute_pose_unknown_focal(px, points, CAMERA, 0.5, 8.0, FocalSearchConfig(min_inliers=51))
+    prior = LensPrior(0.5)
+    refined = absolute_pose_unknown_lens(px, points, CAMERA, prior, 8.0, LensSearchConfig(min_inliers=50))
+    sample = absolute_pose_unknown_lens(px, points, CAMERA, prior, 8.0, LensSearchConfig(min_inliers=51))
     assert refined is not None
     assert sample is not None
     assert sample.num_inliers == refined.num_inliers == 50
     assert refined.correction.focal_factor == pytest.approx(factor, rel=1e-3)
-    steps = np.log(sample.correction.focal_factor) / 0.2
+    steps = np.log(sample.correction.focal_factor) / 0.4
     assert steps == pytest.approx(round(steps), abs=1e-9)
 
 
-def test_the_grid_ends_two_and_a_half_standard_deviations_away() -> None:
-    """Unrefined answers on both sides; without a reach the given focal length is the only sample."""
-    for factor in (0.3, 3.0):
+def test_assumed_focal_lengths_end_two_and_a_half_scales_away() -> None:
+    """Unrefined answers on both sides; one step is tried in any case."""
+    for factor in (0.2, 5.0):
         points, px = points_and_pixels(camera=CAMERA.corrected(IntrinsicsCorrection(factor)))
-        for config, last in (
-            (FocalSearchConfig(min_inliers=1000, error_factor=100), 4),  # ceil(2.5 * 0.25 / 0.2)
-            (FocalSearchConfig(min_inliers=1000, error_factor=100, reach_sigmas=0.0), 0),
-        ):
-            found = absolute_pose_unknown_focal(px, points, CAMERA, 0.25, 8.0, config)
+        config = LensSearchConfig(min_inliers=1000, error_factor=100)
+        for scale, last in ((0.35, 2), (0.06, 1)):  # 2.5 * 0.35 / 0.4 = 2.2
+            found = absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(scale), 8.0, config)
             assert found is not None
-            assert abs(np.log(found.correction.focal_factor)) <= 0.2 * last + 1e-9
+            assert abs(np.log(found.correction.focal_factor)) <= 0.4 * last + 1e-9
+
+
+def test_no_other_focal_length_is_tried_once_enough_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, px = points_and_pixels()
+    tried = []
+
+    def counted(*args: Any, **kwargs: Any) -> AbsolutePose | None:
+        tried.append(args[2].fx)
+        return estimate_absolute_pose(*args, **kwargs)
+
+    monkeypatch.setattr(unknown_lens, "estimate_absolute_pose", counted)
+    for sufficient, steps in ((50, 1), (51, 7)):
+        tried.clear()
+        config = LensSearchConfig(sufficient_inliers=sufficient)
+        absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(0.5), 8.0, config)
+        assert len(tried) == steps
+        assert tried[0] == CAMERA.fx
+
+
+def test_a_crop_off_centre_is_told_by_its_matches() -> None:
+    """The principal point is a fifth of the long side away: thirty times the prior's scale."""
+    crop = IntrinsicsCorrection(1.0, 0.2, -0.12)
+    points = CENTRE + np.random.default_rng(0).uniform(-2.0, 2.0, (100, 3))
+    px = project(transformed(TRUTH.camera_from_world, points), CAMERA.corrected(crop))
+    found = absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(0.06), 4.0)
+    assert found is not None
+    assert np.allclose([found.correction.shift_x, found.correction.shift_y], [0.2, -0.12], atol=0.01)
+    assert pose_distance(found.pose, TRUTH)[0] < 1.0
 
 
 def test_refined_inliers_are_those_within_the_bound() -> None:
     points, px = points_and_pixels()
     px[0, 0] += 4.0
     for bound, count in ((3.5, 49), (5.0, 50)):
-        found = absolute_pose_unknown_focal(px, points, CAMERA, 0.05, bound)
+        found = absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(0.05), bound)
         assert found is not None
         assert found.num_inliers == count
 
@@ -107,19 +145,30 @@ def test_refined_inliers_are_those_within_the_bound() -> None:
 def test_points_behind_the_camera_have_no_part_in_a_refinement() -> None:
     points, px = points_and_pixels(3)
     points[1] = TRUTH.position_in_world - TRUTH.axis_in_world
-    jacobian, residual = linearize_reprojection(px + 1.0, points, CAMERA, TRUTH)
+    jacobian, residual, ahead = linearize_reprojection(px + 1.0, points, CAMERA, TRUTH, NO_CORRECTION)
+    assert ahead.tolist() == [True, False, True]
     assert np.all(jacobian[1] == 0)
     assert np.all(residual[1] == 0)
     assert np.allclose(residual[[0, 2]], 1.0)
 
 
-def test_the_prior_of_the_intrinsics_is_as_precise_as_said_and_ends_at_four_sigmas() -> None:
-    prior = IntrinsicsPrior(0.1, principal_point_sigma=0.02)
-    assert np.allclose(prior.precision, [100, 2500, 2500])
-    inside = prior.stepped(IntrinsicsCorrection(1.0, 0.01, -0.01), np.array([0.2, 0.03, -0.03]))
-    assert np.allclose(correction_vector(inside), [0.2, 0.04, -0.04])
-    outside = prior.stepped(inside, np.array([0.3, 0.1, -0.1]))
-    assert np.allclose(correction_vector(outside), [0.4, 0.08, -0.08])
+def test_the_priors_weights_are_the_slopes_of_its_cost() -> None:
+    """Of a component d: half the cost's derivative is its weight times d; heavy tails but for the distortion."""
+    prior = LensPrior(0.1, k1_sigma=0.05, principal_point_scale=0.02)
+    assert np.allclose(prior_precision(prior, NO_CORRECTION), [100, 400, 2500, 2500])
+    at_correction = stepped(NO_CORRECTION, np.array([0.2, 0.1, 0.01, -0.1]))
+    weights, vector = prior_precision(prior, at_correction), correction_vector(at_correction)
+    assert weights[0] < 100
+    assert weights[1] == pytest.approx(400)
+    for i in range(4):
+        step = np.eye(4)[i] * 1e-6
+        rise = prior_cost(prior, stepped(at_correction, step)) - prior_cost(prior, stepped(at_correction, -step))
+        assert rise / 4e-6 == pytest.approx(weights[i] * vector[i], rel=1e-4)
+
+
+def test_a_correction_ends_at_its_bounds() -> None:
+    far = stepped(NO_CORRECTION, np.array([9.0, -9.0, 9.0, -9.0]))
+    assert np.allclose(correction_vector(far), BOUNDS.vector * [1, -1, 1, -1])
 
 
 # --- prior regions

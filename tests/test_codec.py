@@ -24,7 +24,7 @@ STORED_RECORD = {
         "step": {
             "stage": "match",
             "pose": {"world_from_camera": IDENTITY},
-            "correction": {"focal_factor": 1.5, "shift_x": 0.25, "shift_y": -0.25},
+            "correction": {"focal_factor": 1.5, "shift_x": 0.25, "shift_y": -0.25, "k1": 0.125},
             "loss": 0.1,
             "num_matches": 7,
             "num_inliers": None,

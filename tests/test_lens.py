@@ -10,15 +10,26 @@ import pytest
 
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
+from service.photos.images import query_of
 from service.photos.intrinsics import intrinsics_from
-from service.pose.absolute_pose.unknown_focal import absolute_pose_unknown_focal, linearize_reprojection
+from service.pose.absolute_pose.unknown_lens import absolute_pose_unknown_lens, linearize_reprojection
 from service.pose.features.rendered_views import to_uint8
 from service.pose.refinement import covariance
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.refinement_config import REFINEMENT, UncertaintyConfig
 from service.pose.refinement.uncertainty import pose_uncertainty
-from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
+from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, LensPrior, Pose
 from tests.test_pose import LENS, PaintedWalls, photo_from, true_pose
+
+
+def seen_through(lens: IntrinsicsCorrection, points_in_camera: np.ndarray) -> np.ndarray:
+    """The points' pixels in LENS with this correction, by OpenCV's projection."""
+    camera = LENS.corrected(lens)
+    # OpenCV has the centre of the first pixel at (0, 0), but a pinhole's centre is where its intrinsics say.
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    distortion = np.array([lens.k1, 0.0, 0.0, 0.0])
+    px, _ = cv2.projectPoints(points_in_camera, np.zeros(3), np.zeros(3), matrix, distortion)
+    return px[:, 0]
 
 
 def planted(
@@ -28,18 +39,19 @@ def planted(
     rng = np.random.default_rng(seed)
     pose = true_pose(seed)
     points = np.concatenate([rng.uniform(-1.3, 1.3, (150, 2)), rng.uniform(0.0, 0.0 if flat else 1.2, (150, 1))], 1)
-    px = project(transformed(pose.camera_from_world, points), LENS.corrected(lens)) + rng.normal(0, 0.3, (150, 2))
+    px = seen_through(lens, transformed(pose.camera_from_world, points)) + rng.normal(0, 0.3, (150, 2))
     wrong = rng.random(150) < wrong_share
     px[wrong] = rng.uniform([0, 0], [LENS.width, LENS.height], (wrong.sum(), 2))
     return px, points, pose
 
 
-@pytest.mark.parametrize("factor", [0.45, 0.8, 1.15, 2.2])
-def test_the_focal_length_is_found_among_wrong_matches(factor: float) -> None:
-    px, points, pose = planted(3, IntrinsicsCorrection(factor), flat=False, wrong_share=0.4)
-    found = absolute_pose_unknown_focal(px, points, LENS, 0.5, 2.0)
+@pytest.mark.parametrize(("factor", "k1"), [(0.45, -0.02), (0.8, 0.1), (1.0, -0.1), (1.15, 0.0), (2.2, 0.0)])
+def test_focal_length_and_distortion_are_found_among_wrong_matches(factor: float, k1: float) -> None:
+    px, points, pose = planted(3, IntrinsicsCorrection(factor, k1=k1), flat=False, wrong_share=0.4)
+    found = absolute_pose_unknown_lens(px, points, LENS, LensPrior(0.5, k1_sigma=0.1), 2.0)
     assert found is not None
     assert found.correction.focal_factor == pytest.approx(factor, rel=0.02)
+    assert found.correction.k1 == pytest.approx(k1, abs=0.03)
     angle, distance = pose_distance(found.pose, pose)
     assert angle < 1.5
     assert distance < 0.03 * 3.2
@@ -52,23 +64,27 @@ def test_the_prior_decides_where_a_wall_seen_straight_on_leaves_the_focal_length
     pose = Pose(np.diag([1.0, -1.0, -1.0, 1.0]) + np.array([[0] * 4, [0] * 4, [0, 0, 0, 3.0], [0] * 4]))
     points = np.concatenate([rng.uniform(-1.2, 1.2, (100, 2)), np.zeros((100, 1))], 1)
     px = project(transformed(pose.camera_from_world, points), LENS.corrected(IntrinsicsCorrection(1.3)))
-    found = absolute_pose_unknown_focal(px, points, LENS, 0.1, 2.0)
+    found = absolute_pose_unknown_lens(px, points, LENS, LensPrior(0.1), 2.0)
     assert found is not None
     assert found.num_inliers == 100
     assert found.correction.focal_factor == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("column", range(9))
+@pytest.mark.parametrize("column", range(10))
 def test_linearized_is_the_derivative_by_differences(column: int) -> None:
     px, points, pose = planted(1, NO_CORRECTION, flat=False, wrong_share=0.0)
-    jacobian, _ = linearize_reprojection(px, points, LENS, pose)
-    step = np.zeros(9)
+    at = IntrinsicsCorrection(1.1, 0.02, -0.01, k1=-0.08)
+    jacobian, _, _ = linearize_reprojection(px, points, LENS, pose, at)
+    step = np.zeros(10)
     step[column] = 1e-6
 
     def seen(step: np.ndarray) -> np.ndarray:
-        lens = IntrinsicsCorrection(float(np.exp(step[6])), float(step[7]), float(step[8]))
+        focal, k1, shift_x, shift_y = step[6:]
+        lens = IntrinsicsCorrection(
+            at.focal_factor * float(np.exp(focal)), at.shift_x + shift_x, at.shift_y + shift_y, at.k1 + k1
+        )
         camera = pose.world_from_camera @ se3_exp(step[:6])
-        return project(transformed(np.linalg.inv(camera), points), LENS.corrected(lens))
+        return seen_through(lens, transformed(np.linalg.inv(camera), points))
 
     difference = (seen(step) - seen(-step)) / 2e-6
     assert np.allclose(jacobian[..., column], difference, rtol=1e-4, atol=1e-4)
@@ -80,7 +96,8 @@ def test_refinement_estimates_the_intrinsics_with_the_pose() -> None:
     pose, found = moved(truth, np.array([0.01, -0.01, 0.005, 0.02, 0.03, 0.1])), NO_CORRECTION
     for _ in range(4):
         camera = Camera(LENS.corrected(found), pose)
-        result = refine_photometric(rgb, PaintedWalls().render([camera])[0], camera, Camera(LENS, pose), 3, found, 0.5)
+        frame = PaintedWalls().render([camera])[0]
+        result = refine_photometric(rgb, frame, camera, Camera(LENS, pose), 3, found, LensPrior(0.5))
         pose, found = result.pose, result.correction
     assert found.focal_factor == pytest.approx(1.06, rel=0.004)
     assert found.shift_x == pytest.approx(0.008, abs=0.003)
@@ -121,7 +138,7 @@ def test_the_covariance_predicts_how_refinements_scatter(
         image = bent(frame.rgb, soft_px, rng) if soft_px else frame.rgb
         photo = to_uint8((image + rng.normal(0, noise, image.shape)).astype(np.float32))
         pose = refine_photometric(photo, frame, camera, camera, 1).pose
-        found = pose_uncertainty(photo, frame, camera, Camera(LENS, pose), 0.0, config=config)
+        found = pose_uncertainty(photo, frame, camera, Camera(LENS, pose), None, config=config)
         assert found is not None
         assert np.abs(found.last_step).max() < 2e-4  # a hundredth of a pixel; seen: 1.2e-4
         assert np.linalg.eigvalsh(found.covariance).min() > 0
@@ -165,7 +182,7 @@ def test_the_last_step_measures_how_far_a_pose_is_off() -> None:
     truth = true_pose()
     off = np.array([0.004, -0.003, 0.002, 0.01, 0.005, -0.01])
     camera = Camera(LENS, moved(truth, off))
-    found = pose_uncertainty(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, 0.0)
+    found = pose_uncertainty(photo_from(truth).rgb, PaintedWalls().render([camera])[0], camera, camera, None)
     assert found is not None
     assert np.allclose(found.last_step, -off, atol=2e-3)
 
@@ -180,7 +197,7 @@ def test_another_focal_length_than_given_shows(factor: float) -> None:
         camera = Camera(LENS, pose)
         frame = PaintedWalls().render([camera])[0]
         pose = refine_photometric(rgb, frame, camera, camera, 3).pose
-    found = pose_uncertainty(rgb, frame, camera, Camera(LENS, pose), 0.0)
+    found = pose_uncertainty(rgb, frame, camera, Camera(LENS, pose), None)
     assert found is not None
     if factor == 1.0:
         assert abs(found.focal_step) < 0.002
@@ -210,6 +227,8 @@ def test_trust_is_read_and_checked() -> None:
 def test_only_approximate_intrinsics_leave_the_focal_length_open() -> None:
     rgb = np.zeros((LENS.height, LENS.width, 3), np.uint8)
     loose: Intrinsics = replace(LENS, trust="approximate")
-    sigmas = [Query(rgb, lens, source, lens).focal_sigma for lens, source in ((LENS, "given"), (loose, "given"))]
-    assert sigmas[0] == 0.0
-    assert 0 < sigmas[1] < Query(rgb, loose, "guessed", loose).focal_sigma
+    exact, given, guessed = (query_of(rgb, intrinsics=lens).lens_prior for lens in (LENS, loose, None))
+    assert exact is None
+    assert given is not None
+    assert guessed is not None
+    assert 0 < given.log_focal_scale < guessed.log_focal_scale

@@ -170,7 +170,7 @@ def test_tukeys_weight_ends_at_nine_medians() -> None:
 
 def test_normal_equations_and_cells_are_the_sums_that_they_stand_for() -> None:
     rng = np.random.default_rng(0)
-    jacobian, factors = rng.normal(size=(13, 300)).astype(np.float32), rng.uniform(0.5, 2, 13)
+    jacobian, factors = rng.normal(size=(14, 300)).astype(np.float32), rng.uniform(0.5, 2, 14)
     weights, residuals = rng.uniform(0, 1, 300).astype(np.float32), rng.normal(0, 0.03, 300).astype(np.float32)
     scaled = jacobian * factors[:, None]
     hessian, rhs = normal_equations(jacobian, weights, residuals, factors)
@@ -258,7 +258,7 @@ def test_the_scale_of_the_covariance_has_a_lower_bound_and_a_share() -> None:
 
     def of(**changed: float):
         config = replace(REFINEMENT, uncertainty=UncertaintyConfig(**changed))
-        found = pose_uncertainty(photo, frame, camera, camera, 0.0, config=config)
+        found = pose_uncertainty(photo, frame, camera, camera, None, config=config)
         assert found is not None
         return found
 
@@ -276,11 +276,11 @@ def test_the_result_of_a_refinement_saves_linearizing_anew() -> None:
     photo, frame = photo_from(truth).rgb, PaintedWalls().render([camera])[0]
     result = refine_photometric(photo, frame, camera, camera, 2)
     answer = Camera(LENS, result.pose)
-    reused = pose_uncertainty(np.zeros_like(photo), frame, camera, answer, 0.0, result=result)
-    fresh = pose_uncertainty(photo, frame, camera, answer, 0.0)
+    reused = pose_uncertainty(np.zeros_like(photo), frame, camera, answer, None, result=result)
+    fresh = pose_uncertainty(photo, frame, camera, answer, None)
     assert reused is not None
     assert fresh is not None
     assert np.allclose(reused.covariance, fresh.covariance, rtol=0.05)
     assert np.abs(reused.last_step - fresh.last_step).max() < 1e-5
-    black = pose_uncertainty(np.zeros_like(photo), frame, camera, answer, 0.0)
+    black = pose_uncertainty(np.zeros_like(photo), frame, camera, answer, None)
     assert black is None or np.trace(black.covariance) > 1e3 * np.trace(reused.covariance)

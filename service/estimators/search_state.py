@@ -199,7 +199,7 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     if found is None:
         return
     many = (found.num_inliers or 0) >= state.config.photometric_min_inliers
-    pixels_may_decide = stage.expected or (many and not state.images.query.focal_sigma)
+    pixels_may_decide = stage.expected or (many and not state.images.query.lens_prior)
     verdict = state.verify(found, pixels_may_decide)
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:

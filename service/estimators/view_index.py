@@ -103,7 +103,7 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
     variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
     first = True
-    if not state.images.query.focal_sigma:  # estimating the focal length needs many matches
+    if not state.images.query.lens_prior:  # estimating the focal length needs many matches
         small = variant.scaled(config.small_photo_factor)
         views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
         yield Stage(_search_views("retrieve", small, deque(views), state, try_prior_view=True), small, tentative=True)

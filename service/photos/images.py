@@ -29,7 +29,7 @@ from service.photos.camera_identity import CameraIdentity, identity_from_exif
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
-from service.types import Intrinsics, Pose, Query
+from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,10 +80,12 @@ def read_query(
     prior: Pose | None = None,
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0),
     long_side: int = DEFAULTS.long_side_px,
+    lens_prior: LensPrior | None = None,
 ) -> Query:
     """Decode a photo. Raises InvalidImage, InvalidIntrinsics.
 
     `intrinsics` refer to the upright photo in its full size; without them the focal length is EXIF's or a default.
+    `lens_prior` says how certain they are where earlier photos of the camera are their source.
     Transparent parts are invalid in the query's mask and filled with `background_rgb` (0..1): with the scene's, a
     cut-out object has the same edges as in a render. `long_side` is the target in pixels, exceeded by
     `DecodeConfig.oversize` at most.
@@ -91,7 +93,8 @@ def read_query(
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
     focal_mm = _identity(photo).focal_35mm if intrinsics is None else None
-    return _query(decoded, focal_mm, intrinsics, prior)
+    query = _query(decoded, focal_mm, intrinsics, prior)
+    return query if lens_prior is None else replace(query, intrinsics_source="memory", lens_prior=lens_prior)
 
 
 def query_of(
@@ -117,7 +120,7 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
     warnings = list(decoded.warnings)
     if intrinsics is not None:
         require_size(intrinsics, decoded.width, decoded.height, decoded.upright_from_stored)
-        source = "given"
+        source: IntrinsicsSource = "given"
     else:
         source = "exif" if focal_mm else "guessed"
         if not focal_mm:
@@ -137,7 +140,8 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
         if valid_mask is not None:
             inside = inside & (undistorted(valid_mask.astype(np.uint8), camera)[0] > 0)
         valid_mask = inside
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask)
+    lens_prior = None if intrinsics.trust == "exact" else LENS_PRIORS[source]
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask, lens_prior)
 
 
 def encode_image(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.errors import InvalidIntrinsics
-from service.types import Intrinsics
+from service.types import Intrinsics, IntrinsicsCorrection, Query
 
 DISTORTION_COUNTS = {
     "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8,
@@ -195,6 +195,37 @@ def undistorted(
     straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
     straight[~inside] = 0  # bicubic interpolation bleeds across the border
     return straight, pinhole, inside
+
+
+def undistorted_points(photo_px: Float32[np.ndarray, "n 2"], intrinsics: Intrinsics) -> Float32[np.ndarray, "n 2"]:
+    """Return where pixels of a photo are in the image that `undistorted` makes of it.
+
+    For radial distortion with one coefficient, the first of `distortion`: by Newton's method on the radius.
+    """
+    k1 = intrinsics.distortion[0]
+    centre, focal = np.array([intrinsics.cx, intrinsics.cy]), np.array([intrinsics.fx, intrinsics.fy])
+    distorted = (photo_px - centre) / focal
+    radius = np.linalg.norm(distorted, axis=1)
+    undistorted_radius = radius.copy()
+    # Beyond the radius at which the distortion stops growing there is no solution: the slope is kept positive.
+    for _ in range(8):
+        square = undistorted_radius**2
+        slope = np.maximum(1.0 + 3.0 * k1 * square, 0.1)
+        undistorted_radius -= (undistorted_radius * (1.0 + k1 * square) - radius) / slope
+    factor = np.where(radius > 1e-9, undistorted_radius / np.maximum(radius, 1e-9), 1.0)
+    return (centre + focal * distorted * factor[:, None]).astype(np.float32)
+
+
+def undistorted_query(query: Query, correction: IntrinsicsCorrection) -> Query:
+    """Return the query with corrected intrinsics, its pixels without the correction's distortion."""
+    corrected = query.corrected(correction)
+    if not correction.k1:
+        return corrected
+    camera = replace(corrected.intrinsics, model="OPENCV", distortion=(correction.k1, 0.0, 0.0, 0.0))
+    rgb, _, inside = undistorted(query.rgb, camera)
+    if inside is not None and query.valid_mask is not None:
+        inside = inside & (undistorted(query.valid_mask.astype(np.uint8), camera)[0] > 0)
+    return replace(corrected, rgb=rgb, valid_mask=inside)
 
 
 @lru_cache(maxsize=4)

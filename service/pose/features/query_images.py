@@ -1,8 +1,9 @@
 """Everything that is computed from the photo alone: resized copies, valid masks, local features, corners.
 
 Each is computed once for a size and an in-plane rotation. A job makes one `QueryImages` and passes it to the steps of
-its method and to verification. A mirrored photo needs another one; a photo with corrected intrinsics shares the
-pictures of the original (`corrected`), because none of them depends on the focal length.
+its method and to verification. A mirrored photo needs another one. A photo with corrected intrinsics uses the pictures
+of the original (`corrected`): none of them depends on focal length or principal point, and where the correction has a
+distortion, pictures are resampled and features moved, not extracted again.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from service.interfaces import Features, Matcher
+from service.photos.intrinsics import undistorted, undistorted_points
 from service.pose.features.image_sizes import PHOTO_PX, SIZE_MULTIPLE_PX, sized
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.types import Intrinsics, IntrinsicsCorrection, Query
@@ -43,14 +45,29 @@ class QueryImages:
     _masks: dict[tuple[int, int], Bool[np.ndarray, "_ _"]] = field(default_factory=dict, repr=False)
     _features: dict[tuple[int, int], Features] = field(default_factory=dict, repr=False)
 
+    _distorted: QueryImages | None = field(default=None, repr=False)
+    """The same photo with the distortion that these pictures are without; None: it has none."""
+    _k1: float = 0.0
+    """That distortion."""
+
     def corrected(self, correction: IntrinsicsCorrection) -> QueryImages:
-        """Return the same pictures with corrected intrinsics of the query."""
-        return replace(self, query=self.query.corrected(correction))
+        """Return the same pictures with corrected intrinsics of the query, and without the correction's distortion."""
+        query = self.query.corrected(correction)
+        if not correction.k1:
+            return replace(self, query=query)
+        return QueryImages(query, self.matcher, _distorted=self, _k1=correction.k1)
+
+    def _camera(self, width: int, height: int) -> Intrinsics:
+        """Return the camera of the distorted picture of this size."""
+        pinhole = self.query.intrinsics.resized(width, height)
+        return replace(pinhole, model="OPENCV", distortion=(self._k1, 0.0, 0.0, 0.0))
 
     def resized(self, size: Intrinsics) -> UInt8[np.ndarray, "h w 3"]:
         """Return the photo resampled to `size.width` x `size.height`: area averages when it shrinks, else bilinear."""
         key = size.width, size.height
-        if key not in self._photos:
+        if key not in self._photos and self._distorted:
+            self._photos[key] = undistorted(self._distorted.resized(size), self._camera(*key))[0]
+        elif key not in self._photos:
             rgb = self.query.rgb
             # Area averages don't alias when the image shrinks.
             mode = cv2.INTER_AREA if size.width * size.height < rgb.shape[0] * rgb.shape[1] else cv2.INTER_LINEAR
@@ -59,14 +76,26 @@ class QueryImages:
 
     def valid_mask(self, size: Intrinsics) -> Bool[np.ndarray, "h w"] | None:
         """Return which pixels of `resized(size)` are of valid photo pixels alone; None: all."""
+        key = size.width, size.height
+        if self._distorted:
+            return self._undistorted_mask(size)
         if self.query.valid_mask is None:
             return None
-        key = size.width, size.height
         if key not in self._masks:
             # Pixels that mix with invalid ones are invalid, too.
             share = cv2.resize(self.query.valid_mask.astype(np.float32), key, interpolation=cv2.INTER_AREA)
             self._masks[key] = np.asarray(share) > PHOTOS.min_valid_share
         return self._masks[key]
+
+    def _undistorted_mask(self, size: Intrinsics) -> Bool[np.ndarray, "h w"] | None:
+        assert self._distorted is not None
+        key = size.width, size.height
+        if key not in self._masks:
+            before = self._distorted.valid_mask(size)
+            valid = np.ones((size.height, size.width), np.uint8) if before is None else before.astype(np.uint8)
+            # Resampling leaves what the photo doesn't show at 0.
+            self._masks[key] = undistorted(valid, self._camera(*key))[0] > 0
+        return None if self._masks[key].all() else self._masks[key]
 
     def features(self, long_side: int = PHOTO_PX, roll_steps_45deg: int = 0) -> Features:
         """Return the photo's features, extracted at this size, in pixels of `Query.rgb`.
@@ -75,7 +104,11 @@ class QueryImages:
         some 30 degrees of in-plane rotation); the features' places refer to the photo as it is.
         """
         key = long_side, roll_steps_45deg
-        if key not in self._features:
+        if key not in self._features and self._distorted:
+            found = self._distorted.features(long_side, roll_steps_45deg)
+            camera = self._camera(self.query.intrinsics.width, self.query.intrinsics.height)
+            self._features[key] = replace(found, points_px=undistorted_points(found.points_px, camera))
+        elif key not in self._features:
             size = sized(self.query.intrinsics, long_side)
             rotated, rotated_from_photo = _rotated(self.resized(size), roll_steps_45deg)
             found = self.matcher.extract(rotated, PHOTOS.max_features)

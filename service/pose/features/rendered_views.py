@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from service.geometry import reprojection_error_px, transformed, unproject
 from service.interfaces import Features, Frame, Matcher, Rasterizer
-from service.pose.features.image_sizes import FREE_FOCAL_RENDER_PX, RENDER_PX, sized
+from service.pose.features.image_sizes import FREE_LENS_RENDER_PX, RENDER_PX, sized
 from service.types import Camera, Intrinsics, Pose, Query, frozen
 
 
@@ -104,7 +104,7 @@ class ViewRenderer:
 
 def camera_of(query: Query, pose: Pose, long_side: int | None = None) -> Camera:
     """Return the query's camera at the pose, at the size for renders unless a long side (px) is given."""
-    long_side = long_side or (FREE_FOCAL_RENDER_PX if query.focal_sigma else RENDER_PX)
+    long_side = long_side or (FREE_LENS_RENDER_PX if query.lens_prior else RENDER_PX)
     return Camera(sized(query.intrinsics, long_side), pose)
 
 

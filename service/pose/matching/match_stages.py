@@ -17,10 +17,11 @@ from service.interfaces import Features
 from service.pose.absolute_pose.decoupled import DecoupledConfig, MatchedPoints, least_squares_solve
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.absolute_pose.prior_region import inside_prior, widened_prior
-from service.pose.absolute_pose.unknown_focal import (
-    FOCAL_SEARCH,
-    absolute_pose_unknown_focal,
-    refine_with_intrinsics,
+from service.pose.absolute_pose.unknown_lens import (
+    LENS_SEARCH,
+    absolute_pose_unknown_lens,
+    refine_with_lens,
+    without_distortion,
 )
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages
@@ -28,7 +29,7 @@ from service.pose.features.rendered_views import View, ViewRenderer
 from service.pose.matching.correspondences import Correspondences, correspondences
 from service.pose.matching.render_and_match import match_record
 from service.results import IterationRecord
-from service.types import NO_CORRECTION, Camera, Pose, Query
+from service.types import NO_CORRECTION, Camera, LensPrior, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,14 +135,14 @@ def render_and_rematch(
 
 
 def solve_matches(matches: Correspondences, query: Query, max_error_px: float, max_trials: int) -> AbsolutePose | None:
-    """Return the pose that most matches agree with, by PnP-RANSAC; with an approximate focal length also that.
+    """Return the pose that most matches agree with, by PnP-RANSAC; with approximate intrinsics also their correction.
 
     `max_error_px` is at PHOTO_PX. None if there is no such pose, or the query's prior region excludes it.
     """
     pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
     given = (matches.photo_px, matches.points_in_world)
-    if query.focal_sigma:
-        found = absolute_pose_unknown_focal(*given, query.intrinsics, query.focal_sigma, pixels)
+    if query.lens_prior:
+        found = absolute_pose_unknown_lens(*given, query.intrinsics, query.lens_prior, pixels)
     else:
         found = estimate_absolute_pose(*given, query.intrinsics, pixels, max_trials)
     return found if found and _allowed_by_prior(found.pose, matches, query) else None
@@ -152,10 +153,10 @@ def solve_matches_near(
 ) -> AbsolutePose | None:
     """Return the pose of the matches with a render at `near`: decoupled steps from there, or PnP.
 
-    With an approximate focal length PnP with that of `near`, refined together with the intrinsics.
+    With approximate intrinsics PnP with those of `near`, refined together with the intrinsics.
     """
-    if query.focal_sigma:
-        found = _solve_with_intrinsics(near, matches, query, config)
+    if query.lens_prior:
+        found = _solve_with_lens(near, matches, query, query.lens_prior, config)
     elif config.solver == "pnp":
         return solve_matches(matches, query, config.rematch_error_px, config.view_trials)
     elif len(matches.photo_px) < config.decoupled.min_points:
@@ -170,17 +171,19 @@ def solve_matches_near(
     return found if found and _allowed_by_prior(found.pose, matches, query) else None
 
 
-def _solve_with_intrinsics(
-    near: AbsolutePose, matches: Correspondences, query: Query, config: MatchingConfig
+def _solve_with_lens(
+    near: AbsolutePose, matches: Correspondences, query: Query, prior: LensPrior, config: MatchingConfig
 ) -> AbsolutePose | None:
     pixels = config.rematch_error_px * query.intrinsics.long_side / PHOTO_PX
-    intrinsics = query.intrinsics.corrected(near.correction)
-    given = (matches.photo_px, matches.points_in_world)
-    found = estimate_absolute_pose(*given, intrinsics, FOCAL_SEARCH.error_factor * pixels, config.view_trials)
+    camera = query.intrinsics.corrected(near.correction)
+    straight = without_distortion(matches.photo_px, query.intrinsics, near.correction)
+    found = estimate_absolute_pose(
+        straight, matches.points_in_world, camera, LENS_SEARCH.error_factor * pixels, config.view_trials
+    )
     if found is None:
         return None
     found = replace(found, correction=near.correction)
-    return refine_with_intrinsics(*given, query.intrinsics, found, query.focal_sigma, pixels)
+    return refine_with_lens(matches.photo_px, matches.points_in_world, query.intrinsics, found, prior, pixels)
 
 
 def _allowed_by_prior(pose: Pose, matches: Correspondences, query: Query) -> bool:

@@ -6,10 +6,11 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from service.geometry import se3_exp
-from service.pose.absolute_pose.intrinsics_prior import correction_vector
+from service.pose.absolute_pose.lens_prior import FOCAL, K1, SHIFT, correction_vector, prior_precision, stepped
 from service.pose.refinement.kernels import normal_equations
 from service.pose.refinement.pyramid_level import CORRECTION, PHOTOMETRIC, TWIST, PyramidLevel, RefinementState
 from service.pose.refinement.refinement_config import RefinementConfig
+from service.types import Intrinsics
 
 
 def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, config: RefinementConfig) -> float:
@@ -33,23 +34,31 @@ def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, con
         state.photo_from_render = state.photo_from_render @ se3_exp(-step[TWIST])
         state.photometric += step[PHOTOMETRIC]
         if state.prior:
-            state.correction = state.prior.stepped(state.correction, step[CORRECTION])
-        intrinsics = level.photo_intrinsics
-        # An upper bound of the image motion at the level's typical depth.
-        moved_px = intrinsics.fx * (np.linalg.norm(step[:3]) + np.linalg.norm(step[3:6]) / typical_depth)
-        if moved_px + intrinsics.long_side * np.abs(step[CORRECTION]).max() < settled_px:
+            state.correction = stepped(state.correction, step[CORRECTION])
+        if _motion_px(step, level.photo_intrinsics, typical_depth) < settled_px:
             break
     return loss
 
 
+def _motion_px(step: Float64[np.ndarray, "14"], intrinsics: Intrinsics, depth: float) -> float:
+    """Return an upper bound of the image motion by a step, in pixels, at this depth."""
+    twist, correction = step[TWIST], step[CORRECTION]
+    # Of focal length and distortion at the end of the longer side.
+    radius = 0.5 * intrinsics.long_side / intrinsics.fx
+    magnified = radius * abs(correction[FOCAL]) + radius**3 * abs(correction[K1])
+    shifted = intrinsics.long_side * np.abs(correction[SHIFT]).max()
+    moved = np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]) / depth + magnified
+    return float(intrinsics.fx * moved + shifted)
+
+
 def _step(
-    jacobian: Float32[np.ndarray, "13 n"],
+    jacobian: Float32[np.ndarray, "14 n"],
     residuals: Float32[np.ndarray, "n"],
     weights: Float32[np.ndarray, "n"],
     state: RefinementState,
     loss: float,
     config: RefinementConfig,
-) -> Float64[np.ndarray, "13"]:
+) -> Float64[np.ndarray, "14"]:
     """Solve the weighted normal equations; zeros for unknowns that are not estimated.
 
     Each unknown is scaled by its hessian's diagonal first, for they differ by orders of magnitude.
@@ -63,13 +72,13 @@ def _step(
     hessian, rhs = normal_equations(jacobian, weights, residuals, state.factors)
     if state.prior:
         # With L1 weights the hessian is about `loss` times the information, so the prior is scaled likewise.
-        precision = config.correlated_pixels * loss * state.prior.precision
-        hessian[range(10, 13), range(10, 13)] += precision
+        precision = config.correlated_pixels * loss * prior_precision(state.prior, state.correction)
+        hessian[range(10, 14), range(10, 14)] += precision
         rhs[CORRECTION] -= precision * correction_vector(state.correction)
     scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
     # Damping keeps unknowns without any gradient in place, such as the blur of a flat render.
     damped = hessian * scale * scale[:, None]
     damped[range(size), range(size)] += 1e-6
-    step = np.zeros(13)
+    step = np.zeros(14)
     step[:size] = scale * np.linalg.solve(damped, scale * rhs)
     return step

@@ -12,15 +12,15 @@ def linearize(render, depth, pixels, k):
     """Return the pixels' points in the render's camera frame, and the jacobian d intensity / d unknowns, transposed.
 
     `render` and `depth` are (h, w); `pixels` index the render without its border, row by row; `k` is fx, fy, cx, cy of
-    the render. The 13 unknowns: twist of the render's camera (6), gain, bias, gamma, blur, and the photo's
-    `correction_vector` (3). The jacobian is at the identity and a gain of 1.
+    the render. The 14 unknowns: twist of the render's camera (6), gain, bias, gamma, blur, and the photo's
+    `correction_vector` (4). The jacobian is at the identity and a gain of 1.
     """
     fx, fy, cx, cy = k[0], k[1], k[2], k[3]
     # The border is left out: central differences need both neighbours.
     inner = render.shape[1] - 2
     n = len(pixels)
     points = np.empty((3, n), np.float32)
-    jacobian = np.empty((13, n), np.float32)
+    jacobian = np.empty((14, n), np.float32)
     side = max(render.shape)
     for i in range(n):
         row, column = pixels[i] // inner + 1, pixels[i] % inner + 1
@@ -44,10 +44,12 @@ def linearize(render, depth, pixels, k):
         jacobian[8, i] = render[row, column] * (np.float32(1) - render[row, column])
         around = render[row, column + 1] + render[row, column - 1] + render[row + 1, column] + render[row - 1, column]
         jacobian[9, i] = around - np.float32(4) * render[row, column]
-        # A longer focal length magnifies the photo; a shift of the principal point carries it along.
+        # A longer focal length magnifies the photo, distortion does so with the squared radius; a shift of the
+        # principal point carries it along.
         jacobian[10, i] = -along
-        jacobian[11, i] = -du / fx * side
-        jacobian[12, i] = -dv / fy * side
+        jacobian[11, i] = -along * (x * x + y * y)
+        jacobian[12, i] = -du / fx * side
+        jacobian[13, i] = -dv / fy * side
     return points, jacobian
 
 
@@ -55,7 +57,7 @@ def linearize(render, depth, pixels, k):
 def fill_residuals(photo, points, basis, transform, k, photometric, l1_floor, residuals, weights):
     """Fill residuals and L1 weights, both 0 where the photo is unknown; return the sum of |r| and the pixels counted.
 
-    `transform` is photo_from_render (4, 4), `k` the photo's fx, fy, cx, cy, `basis` the photometric rows of the
+    `transform` is photo_from_render (4, 4), `k` the photo's fx, fy, cx, cy, k1, `basis` the photometric rows of the
     jacobian. Three passes, so that the first and the last vectorize: points -> places in the photo -> values there ->
     residuals.
     """
@@ -92,7 +94,7 @@ def fill_residuals(photo, points, basis, transform, k, photometric, l1_floor, re
 @inline
 def _project_points(points, t, k, shape, columns, rows):
     """Fill where the points project to, in pixels from the centre of the photo's first pixel; column -1 if outside."""
-    fx, fy, cx, cy = k[0], k[1], k[2] - np.float32(0.5), k[3] - np.float32(0.5)
+    fx, fy, cx, cy, k1 = k[0], k[1], k[2] - np.float32(0.5), k[3] - np.float32(0.5), k[4]
     last_column, last_row = np.float32(shape[1] - 1), np.float32(shape[0] - 1)
     # Scalars instead of array reads let the loop vectorize.
     t00, t01, t02, t03 = t[0, 0], t[0, 1], t[0, 2], t[0, 3]
@@ -102,8 +104,11 @@ def _project_points(points, t, k, shape, columns, rows):
         x, y, z = points[0, i], points[1, i], points[2, i]
         depth = t20 * x + t21 * y + t22 * z + t23
         inverse_depth = np.float32(1) / depth
-        u = fx * ((t00 * x + t01 * y + t02 * z + t03) * inverse_depth) + cx
-        v = fy * ((t10 * x + t11 * y + t12 * z + t13) * inverse_depth) + cy
+        across = (t00 * x + t01 * y + t02 * z + t03) * inverse_depth
+        down = (t10 * x + t11 * y + t12 * z + t13) * inverse_depth
+        radial = np.float32(1) + k1 * (across * across + down * down)
+        u = fx * (across * radial) + cx
+        v = fy * (down * radial) + cy
         # A depth of 0 gives inf or NaN, which pass none of these comparisons.
         inside = (depth > 0) & (u >= 0) & (v >= 0) & (u < last_column) & (v < last_row)
         columns[i] = u if inside else np.float32(-1)

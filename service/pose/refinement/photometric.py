@@ -7,7 +7,7 @@ For the pixels x of a render I (intensity, depth: the point X in the render's ca
 
 where a covers exposure, haze, nearly any gamma curve, and a little defocus. Inverse compositional steps (Baker and
 Matthews, IJCV 2004): the render is moved by a small twist, so that its gradients and jacobian are computed once. Each
-step solves 10 normal equations (twist and photometric parameters; 13 with an approximate camera's intrinsics), with L1
+step solves 10 normal equations (twist and photometric parameters; 14 with an approximate camera's intrinsics), with L1
 weights that Tukey's cut off: what hides the scene has no influence. A saturated photo is compared with a render that
 is clipped like it. How the render itself changes with the pose (occlusion, highlights) is ignored: render again at the
 result, and repeat.
@@ -25,11 +25,10 @@ from jaxtyping import Bool, Float64, UInt8
 
 from service.geometry import moved, se3_log
 from service.interfaces import Frame
-from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.pyramid_level import NEUTRAL, PyramidLevel, RefinementState, linearized_levels
 from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
-from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose
+from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior, Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +58,7 @@ def refine_photometric(
     start: Camera,
     levels: int,
     correction: IntrinsicsCorrection = NO_CORRECTION,
-    focal_sigma: float = 0.0,
+    lens_prior: LensPrior | None = None,
     valid_mask: Bool[np.ndarray, "h w"] | None = None,
     coarse: bool = False,
     config: RefinementConfig = REFINEMENT,
@@ -67,16 +66,15 @@ def refine_photometric(
     """Refine the pose of `start`, so that the photo agrees with the frame, which `camera` rendered nearby.
 
     Photo and frame have the same size, `valid_mask` is False where the photo has no content. `start` has the photo's
-    intrinsics without `correction`, from which their correction starts; it is estimated unless `focal_sigma`, the
-    prior standard deviation of log focal, is 0. `levels` counts those of the pyramid, the photo's own size included.
+    intrinsics without `correction`, from which their correction starts; it is estimated if there is a `lens_prior`.
+    `levels` counts those of the pyramid, the photo's own size included.
     `coarse` ends the finest level, too, at the tolerance of coarse ones: enough where another refinement follows.
     """
     photo_from_render = start.pose.camera_from_world @ camera.pose.world_from_camera
-    prior = IntrinsicsPrior(focal_sigma) if focal_sigma else None
-    state = RefinementState(photo_from_render, correction, prior, NEUTRAL.copy())
+    state = RefinementState(photo_from_render, correction, lens_prior, NEUTRAL.copy())
     loss, level = np.inf, None
     coarse_to_fine = linearized_levels(
-        photo, valid_mask, frame, camera.intrinsics, start.intrinsics, levels, bool(focal_sigma), config
+        photo, valid_mask, frame, camera.intrinsics, start.intrinsics, levels, bool(lens_prior), config
     )
     for finer, level in zip(reversed(range(levels)), coarse_to_fine, strict=True):
         if finer and len(level.pixels) < config.min_pixels:

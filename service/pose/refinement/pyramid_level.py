@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.interfaces import Frame
-from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
 from service.pose.refinement.kernels import fill_residuals, linearize
 from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, intensity, occluder_depth, pyramid
 from service.pose.refinement.refinement_config import RefinementConfig
-from service.types import Intrinsics, IntrinsicsCorrection
+from service.types import Intrinsics, IntrinsicsCorrection, LensPrior
 
-TWIST, PHOTOMETRIC, CORRECTION = slice(0, 6), slice(6, 10), slice(10, 13)
+TWIST, PHOTOMETRIC, CORRECTION = slice(0, 6), slice(6, 10), slice(10, 14)
 """Places of the unknowns: twist, (gain, bias, gamma, blur), and `correction_vector`."""
 UNKNOWN = np.float32(-1e4)
 """Value of a photo's invalid pixels; blurred or interpolated with valid ones it stays negative."""
@@ -29,15 +28,15 @@ class RefinementState:
 
     photo_from_render: Float64[np.ndarray, "4 4"]
     correction: IntrinsicsCorrection
-    prior: IntrinsicsPrior | None
+    prior: LensPrior | None
     """On the photo's intrinsics; None: they are exact, and not estimated."""
     photometric: Float64[np.ndarray, "4"]
     """Gain, bias, gamma, blur (in squared pixels of the level)."""
 
     @property
-    def factors(self) -> Float64[np.ndarray, "13"]:
+    def factors(self) -> Float64[np.ndarray, "14"]:
         """Factors of the jacobian's rows: the photo shows the render's gradients times the gain."""
-        factors = np.full(13, self.photometric[0])
+        factors = np.full(14, self.photometric[0])
         factors[PHOTOMETRIC] = 1.0
         return factors
 
@@ -50,7 +49,7 @@ class PyramidLevel:
     """Places in the render without its border, row by row."""
     points: Float32[np.ndarray, "3 n"]
     """In the render's camera frame, scene units."""
-    jacobian: Float32[np.ndarray, "13 n"]
+    jacobian: Float32[np.ndarray, "14 n"]
     photo_intrinsics: Intrinsics
     """At this level, without the correction."""
 
@@ -62,7 +61,7 @@ class PyramidLevel:
         The mean is infinite where fewer than `min_pixels` overlap.
         """
         residuals, weights = np.empty((2, len(self.pixels)), np.float32)
-        k = intrinsics_vector(self.photo_intrinsics.corrected(state.correction))
+        k = np.append(intrinsics_vector(self.photo_intrinsics.corrected(state.correction)), state.correction.k1)
         total, count = fill_residuals(
             self.photo, self.points, self.jacobian[PHOTOMETRIC], state.photo_from_render, k,
             state.photometric, config.l1_floor, residuals, weights,

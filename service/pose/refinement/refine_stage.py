@@ -33,8 +33,6 @@ class RefineStageConfig:
     as large as the others."""
     settled_px: float = 0.3
     """Where refinement moved the image by less, another render would be the same."""
-    free_focal_settled_px: float = 0.05
-    """The same where the focal length is estimated: it is confounded with the distance and hardly moves the image."""
     levels: int = 2
     """Levels of the image pyramid."""
     first_levels: int = 4
@@ -109,8 +107,8 @@ def refine_stage(
     if config.max_renders == 0:
         return RefineOutcome((yield from _as_matched(found, renderer)))
     # Many agreeing matches outweigh a refinement that leads far away from them.
-    trusted, free_focal = found.num_inliers >= config.trusted_inliers, bool(images.query.focal_sigma)
-    small_px = None if free_focal else config.first_render_px
+    trusted, free_lens = found.num_inliers >= config.trusted_inliers, images.query.lens_prior is not None
+    small_px = None if free_lens else config.first_render_px
     now, refined, rendered = found, None, None
     for round_number in range(config.max_renders):
         following = _next_render(rendered, now, images, renderer, config, small_px)
@@ -129,7 +127,7 @@ def refine_stage(
         refined = RefinedPose(result.pose, result.correction, result.loss, found.num_inliers or None, rendered, result)
         yield _record_of(refined, now.pose)
         now, small_px = replace(found, pose=result.pose, correction=result.correction), None
-    if refined is None or not free_focal:
+    if refined is None or not free_lens:
         return RefineOutcome(refined)
     following = _next_render(rendered, now, images, renderer, config, None)
     if following is None:
@@ -151,8 +149,7 @@ def _next_render(
     camera = camera_of(query, now.pose, long_side)
     if last is None:
         return renderer.near(camera)
-    settled_px = config.free_focal_settled_px if query.focal_sigma else config.settled_px
-    return None if last.shows_the_same_as(camera, settled_px) else renderer.render(camera)
+    return None if last.shows_the_same_as(camera, config.settled_px) else renderer.render(camera)
 
 
 def _record_of(refined: RefinedPose, before: Pose) -> IterationRecord:
@@ -186,7 +183,7 @@ def _refined_on(
         start,
         levels,
         now.correction,
-        images.query.focal_sigma,
+        images.query.lens_prior,
         images.valid_mask(size),
         coarse,
         config.photometric,

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from service.geometry import se3_log
 from service.interfaces import Frame
-from service.pose.absolute_pose.intrinsics_prior import IntrinsicsPrior
+from service.pose.absolute_pose.lens_prior import prior_precision
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale, scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.photometric import RefinementResult
@@ -22,7 +22,7 @@ from service.pose.refinement.pyramid_level import (
     linearized_levels,
 )
 from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
-from service.types import NO_CORRECTION, Camera
+from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior
 
 FOCAL = CORRECTION.start
 """Place of log focal in the vector of unknowns."""
@@ -45,7 +45,7 @@ def pose_uncertainty(
     frame: Frame,
     camera: Camera,
     answer: Camera,
-    focal_sigma: float,
+    lens_prior: LensPrior | None,
     valid_mask: Bool[np.ndarray, "h w"] | None = None,
     result: RefinementResult | None = None,
     config: RefinementConfig = REFINEMENT,
@@ -58,29 +58,31 @@ def pose_uncertainty(
     """
     final = result.final_level if result else None
     if final:
-        level, photometric = replace(final.level, photo_intrinsics=answer.intrinsics), final.photometric
+        level, photometric = final.level, final.photometric
     else:
         (level,) = linearized_levels(
-            photo, valid_mask, frame, camera.intrinsics, answer.intrinsics, 1, bool(focal_sigma), config
+            photo, valid_mask, frame, camera.intrinsics, answer.intrinsics, 1, bool(lens_prior), config
         )
         photometric = NEUTRAL
     before = answer.pose.camera_from_world @ camera.pose.world_from_camera
-    state = RefinementState(before, NO_CORRECTION, None, photometric.copy())
+    # The level of a refinement has the photo as it is, else photo and camera are corrected already.
+    correction = result.correction if result and final else NO_CORRECTION
+    state = RefinementState(before, correction, None, photometric.copy())
     if not np.isfinite(minimize(level, state, config.settled_px, config)):
         return None
     last_step = se3_log(before @ np.linalg.inv(state.photo_from_render))
     scores, hessians, scale = _scores(level, state, frame, config)
     hessian = hessians.sum(0)
-    covariance = _covariance(hessian, scale, focal_sigma)
+    covariance = _covariance(hessian, scale, lens_prior, correction)
     if covariance is None:
         return None
-    focal_step, focal_error = _focal(level, state, scores, hessian, focal_sigma, config)
+    focal_step, focal_error = _focal(level, state, scores, hessian, lens_prior, config)
     return PoseUncertainty(last_step, covariance, focal_step, focal_error)
 
 
 def _scores(
     level: PyramidLevel, state: RefinementState, frame: Frame, config: RefinementConfig
-) -> tuple[Float64[np.ndarray, "cells 13"], Float64[np.ndarray, "cells 13 13"], float]:
+) -> tuple[Float64[np.ndarray, "cells 14"], Float64[np.ndarray, "cells 14 14"], float]:
     """Return the cells' scores and hessians at the state, and the variance scale of the unknowns but the correction."""
     residuals, weights, _ = level.residuals(state, config)
     jacobian = level.jacobian * state.factors[:, None].astype(np.float32)
@@ -97,9 +99,9 @@ def _scores(
 def _focal(
     level: PyramidLevel,
     state: RefinementState,
-    scores: Float64[np.ndarray, "cells 13"],
-    hessian: Float64[np.ndarray, "13 13"],
-    focal_sigma: float,
+    scores: Float64[np.ndarray, "cells 14"],
+    hessian: Float64[np.ndarray, "14 14"],
+    lens_prior: LensPrior | None,
     config: RefinementConfig,
 ) -> tuple[float, float]:
     """Return the step of log focal, were it free, and its standard deviation."""
@@ -108,9 +110,9 @@ def _focal(
     if inverse is None:  # a flat wall seen straight on doesn't determine it
         return 0.0, np.inf
     focal_step = float((inverse @ scores.sum(0)[: FOCAL + 1])[-1])
-    if not focal_sigma and abs(focal_step) > uncertainty.suspicious_focal_step:
+    if not lens_prior and abs(focal_step) > uncertainty.suspicious_focal_step:
         # From a pose that makes up for a wrong focal length one step leads only a fifth of the way.
-        prior = IntrinsicsPrior(uncertainty.free_focal_sigma)
+        prior = LensPrior(uncertainty.free_focal_sigma)
         free = replace(state, prior=prior, photometric=state.photometric.copy())
         minimize(level, free, config.settled_px, config)
         focal_step = float(np.log(free.correction.focal_factor))
@@ -120,7 +122,10 @@ def _focal(
 
 
 def _covariance(
-    hessian: Float64[np.ndarray, "13 13"], scale: float, focal_sigma: float
+    hessian: Float64[np.ndarray, "14 14"],
+    scale: float,
+    lens_prior: LensPrior | None,
+    correction: IntrinsicsCorrection,
 ) -> Float64[np.ndarray, "k k"] | None:
     """Return the covariance of the twist, with an approximate camera also of its correction.
 
@@ -128,12 +133,12 @@ def _covariance(
     """
     if not np.isfinite(scale):
         return None
-    if not focal_sigma:
+    if lens_prior is None:
         found = inverse_spd(hessian[:FOCAL, :FOCAL])
         return None if found is None else scale * found[TWIST, TWIST]
     information = hessian / scale
     # A prior is information: added before the photometric parameters are marginalized.
-    information[CORRECTION, CORRECTION] += np.diag(IntrinsicsPrior(focal_sigma).precision)
+    information[CORRECTION, CORRECTION] += np.diag(prior_precision(lens_prior, correction))
     keep = np.r_[TWIST, CORRECTION]
     found = inverse_spd(information)
     return None if found is None else found[np.ix_(keep, keep)]

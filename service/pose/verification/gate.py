@@ -28,7 +28,7 @@ from service.pose.verification.appearance import GLOBAL_SIGNALS, appearance, vis
 from service.pose.verification.gate_model import SHIPPED_MODEL, GateModel
 from service.pose.verification.signals import NO_MATCHES, geometry_signals, match_signals
 from service.results import Reason, Status, Verdict
-from service.types import Camera, Pose
+from service.types import Camera, LensPrior, Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,19 +88,19 @@ def verify(
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification.
     if pixels_may_decide and photometric_suffices(signals, config):
-        verdict = verdict_of(signals, uncertainty, query.focal_sigma, config=config)
+        verdict = verdict_of(signals, uncertainty, query.lens_prior, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
     few = len(features.scores) < config.min_features
     # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
-        return verdict_of(signals | NO_MATCHES, uncertainty, query.focal_sigma, few, config)
+        return verdict_of(signals | NO_MATCHES, uncertainty, query.lens_prior, few, config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
-    return _within_prior(verdict_of(signals, uncertainty, query.focal_sigma, few, config), images, pose)
+    return _within_prior(verdict_of(signals, uncertainty, query.lens_prior, few, config), images, pose)
 
 
 def _photometric_signals(
@@ -118,7 +118,7 @@ def _photometric_signals(
     if not _is_unlike(signals, config):
         answer = Camera(images.query.intrinsics.resized(size.width, size.height), pose)
         uncertainty = pose_uncertainty(
-            photo, frame, rendered.camera, answer, images.query.focal_sigma, valid, refinement, config.refinement
+            photo, frame, rendered.camera, answer, images.query.lens_prior, valid, refinement, config.refinement
         )
     return signals | geometry_signals(frame, size, uncertainty), uncertainty
 
@@ -147,19 +147,18 @@ def downgraded(verdict: Verdict, reason: Reason, score: float = VERIFICATION.dou
 def verdict_of(
     signals: Mapping[str, float],
     uncertainty: PoseUncertainty | None,
-    focal_sigma: float,
+    lens_prior: LensPrior | None,
     few_features: bool = False,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
     """Return the verdict on a pose with these signals.
 
-    `focal_sigma` is the standard deviation of the logarithm of the photo's focal length before localization, 0 where
-    it was given as exact.
+    `lens_prior` is the photo's; None: its intrinsics were given as exact.
     """
     # The sum of the model could compensate for one bad signal; floors don't.
     doubtful = config.model.below_floor(signals)
     score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
-    doubt, covariance, sigma = _doubt_about_intrinsics(uncertainty, focal_sigma, config)
+    doubt, covariance, sigma = _doubt_about_intrinsics(uncertainty, lens_prior, config)
     little = signals["coverage"] < config.min_coverage
     if little:
         doubt = Reason.LOW_COVERAGE
@@ -198,15 +197,15 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
 
 
 def _doubt_about_intrinsics(
-    uncertainty: PoseUncertainty | None, focal_sigma: float, config: VerificationConfig
+    uncertainty: PoseUncertainty | None, lens_prior: LensPrior | None, config: VerificationConfig
 ) -> tuple[Reason | None, Float64[np.ndarray, "6 6"] | None, float]:
     """Return a doubt about the focal length, the pose's covariance, and the deviation of the focal length's log."""
     if uncertainty is None:
-        return None, None, focal_sigma
+        return None, None, lens_prior.log_focal_scale if lens_prior else 0.0
     # What another step would still change is an error, too: it adds its square.
     covariance = uncertainty.covariance[:6, :6] + np.outer(uncertainty.last_step, uncertainty.last_step)
     off = abs(uncertainty.focal_step)
-    if focal_sigma:
+    if lens_prior:
         # The step counts, too: a method may not have estimated the focal length at all.
         sigma = max(float(np.sqrt(uncertainty.covariance[6, 6])), off)
         return (Reason.FOCAL_UNCERTAIN if sigma > config.max_focal_sigma else None), covariance, sigma

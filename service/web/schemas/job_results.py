@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 from pydantic import Field
 
 from service.results import Reason, Status
+from service.types import IntrinsicsSource
 from service.web.api_model import Model
 from service.web.schemas.poses import (
     CameraOut,
@@ -144,9 +143,9 @@ class Result(Model):
     """The pose on Earth, for scenes whose manifest has a `geo_anchor`."""
     intrinsics: IntrinsicsOut
     """Camera model used for the whole upright photo."""
-    intrinsics_source: Literal["given", "exif", "guessed"]
-    """Where the intrinsics come from. Unless they are `exact`, focal length and principal point were then estimated
-    together with the pose."""
+    intrinsics_source: IntrinsicsSource
+    """Where the intrinsics come from. Unless they are `exact`, focal length, radial distortion and principal point
+    were then estimated together with the pose. `memory`: earlier photos of the same camera."""
     focal_sigma_px: float | None
     """Standard deviation of the estimated focal length; null if it was given as exact."""
     inliers: int

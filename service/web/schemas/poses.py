@@ -72,6 +72,8 @@ class IntrinsicsCorrectionOut(Model):
     """Of the principal point to the right, as a share of the image's longer side."""
     shift_y: float
     """Of the principal point downwards, as a share of the image's longer side."""
+    k1: float
+    """Radial distortion beside that of the assumed intrinsics, as in COLMAP's SIMPLE_RADIAL."""
 
 
 class CameraOut(Model):
