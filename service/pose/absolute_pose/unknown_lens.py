@@ -126,9 +126,10 @@ def refine_with_lens(
     with the prior as four more observations. `intrinsics` are those given, without the start's correction.
     """
     problem = _Problem(photo_px, points_in_world, intrinsics, prior, config.noise * max_error_px)
-    pose, correction = start.pose, start.correction
-    for scale in config.cauchy_scales:
-        now = problem.linearized(pose, correction, scale / config.noise)
+    scales = [scale / config.noise for scale in config.cauchy_scales]
+    now = problem.linearized(start.pose, start.correction, scales[0])
+    for scale in scales:
+        now = problem.linearized(now.pose, now.correction, scale)
         damping = 1e-4
         for _ in range(config.max_iterations):
             step = now.step(damping)
@@ -142,8 +143,7 @@ def refine_with_lens(
             now, damping = after, 0.1 * damping
             if settled:
                 break
-        pose, correction = now.pose, now.correction
-    return AbsolutePose(pose, now.error_px < max_error_px, correction)
+    return AbsolutePose(now.pose, now.error_px < max_error_px, now.correction)
 
 
 @dataclass(frozen=True, slots=True)
