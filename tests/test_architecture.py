@@ -66,6 +66,7 @@ WRAPPED = {
         "service/matchers",
         "service/pose",
         "service/bench/modified_photo.py",
+        "service/bench/capture_modifications.py",
         "viewer/comparison_images.py",
     },
     "numba": {"service/jit.py", "service/render/simd.py"},

@@ -16,15 +16,19 @@ from service.bench import field, field_queries
 from service.bench import localize as bench
 from service.bench.bench_photos import BenchPhoto
 from service.bench.field_queries import FieldQuery, Sent, decoded, send
+from service.bench.field_random import random_row
 from service.bench.field_rows import TOLD, Row, all_rows, chosen_rows
 from service.bench.field_table import chi_square_6, outcome_of, summary, table
 from service.bench.modifications import modify
 from service.bench.modified_photo import Photo
+from service.bench.pose_metrics import Units
+from service.bench.scene_modifications import modified_scene
 from service.errors import InvalidOptions, InvalidRequest, UnknownName
 from service.geometry import moved
 from service.pose.refinement.refine_stage import RefinedPose, RefineOutcome
 from service.results import PoseEstimate, Reason, Status, Verdict
-from service.types import Camera, Intrinsics, Pose
+from service.scene_formats import splat
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
 LENS = Intrinsics(240, 180, 200.0, 204.0, 124.0, 86.0)
 RNG = np.random.default_rng(0)
@@ -126,6 +130,195 @@ class TestLenses:
             modify(map_photo(), ["k1=0.1", "fisheye=1"], RNG)
         with pytest.raises(InvalidOptions, match="fold"):
             modify(map_photo(replace(LENS, fx=80.0, fy=80.0)), ["k1=-0.1"], RNG)
+
+
+def grey(height: int = 120, width: int = 160, value: float = 0.5) -> Photo:
+    camera = Intrinsics(width, height, 150.0, 150.0, width / 2, height / 2)
+    return Photo(np.full((height, width, 3), value, np.float32), camera, poses()[0])
+
+
+def linear(photo: Photo) -> np.ndarray:
+    return photo.rgb.astype(np.float64) ** 2.2
+
+
+class TestCapture:
+    def test_vignetting_is_a_share_of_light_at_the_corners(self):
+        light = linear(modify(grey(), ["vignetting=0.6"], RNG)) / linear(grey())
+        assert light[0, 0] == pytest.approx(0.4, abs=0.01)
+        assert light[60, 80] == pytest.approx(1.0, abs=0.01)
+        # half of the radius: a quarter of the loss
+        assert light[30, 40] == pytest.approx(0.85, abs=0.01)
+
+    def test_local_light_has_smooth_regions_and_one_hard_edge(self):
+        light = np.log(linear(modify(grey(value=0.3), ["local_light=0.6"], np.random.default_rng(1))))
+        assert np.ptp(light[..., 1]) > 0.5
+        assert np.ptp(light[..., 0] - light[..., 2]) > 0.05
+        steps = np.abs(np.diff(light[..., 1], axis=1))
+        # The edge is one pixel wide, and elsewhere the light changes by little from one to the next.
+        assert steps.max() > 0.4
+        assert np.median(steps) < 0.02
+        assert 0 < (steps > 0.4).any(1).mean() <= 1
+
+    def test_a_cast_keeps_the_mean_of_the_logarithms(self):
+        logs = np.log(linear(modify(grey(), ["colour_cast=0.3"], RNG)) / linear(grey()))[0, 0]
+        assert np.linalg.norm(logs) == pytest.approx(0.3, rel=1e-4)
+        assert logs.sum() == pytest.approx(0, abs=1e-4)
+
+    def test_motion_spreads_a_dot_along_a_line_about_its_place(self):
+        dot = grey(value=0.0)
+        dot.rgb[60, 80] = 1.0
+        smeared = modify(dot, ["motion_blur=50"], np.random.default_rng(2)).rgb[..., 0]
+        rows, columns = np.nonzero(smeared > 1e-4)
+        weights = smeared[rows, columns].astype(float)
+        assert weights.sum() == pytest.approx(1, abs=1e-3)
+        offsets = np.stack([columns - 80, rows - 60], 1)
+        assert weights @ offsets == pytest.approx([0, 0], abs=0.01)
+        variances = np.linalg.eigvalsh((offsets * weights[:, None]).T @ offsets)
+        # A line of 50 px at 800 is one of 10 px at 160; across it only the pixels' own width is left.
+        assert variances[1] == pytest.approx(10**2 / 12, rel=0.1)
+        assert variances[0] < 0.3
+
+    def test_noise_is_greater_in_the_light_and_smeared(self):
+        def spread(value: float, sigma: float) -> float:
+            noisy = modify(grey(200, 800, value), [f"phone_noise={sigma}"], np.random.default_rng(0))
+            return float((linear(noisy) - linear(noisy).mean()).std())
+
+        assert spread(0.8, 0.05) > 2 * spread(0.3, 0.05)
+        # Without a smear it would be 0.05 sqrt(0.8^2.2 + 0.02) = 0.040.
+        assert spread(0.8, 0.05) < 0.03
+        step = grey(value=0.2)
+        step.rgb[:, 80:] = 0.8
+        columns = modify(step, ["phone_noise=0.05"], np.random.default_rng(0)).rgb.mean((0, 2))
+        assert columns[79] < 0.25 < 0.75 < columns[80]
+
+    def test_bars_are_a_share_of_the_screenshot(self):
+        for spec, size, value in (("letterbox=0.25", (160, 160), 0), ("white_bars=0.2", (150, 200), 1)):
+            photo = modify(grey(), [spec], RNG)
+            assert photo.rgb.shape[:2] == size
+            assert (photo.intrinsics.height, photo.intrinsics.width) == size
+            assert (photo.rgb == value).all(2).mean() == pytest.approx(1 - 160 * 120 / np.prod(size))
+            assert (photo.intrinsics.cx, photo.intrinsics.cy) == (size[1] / 2, size[0] / 2)
+            assert photo.focal_of_whole == 150 / 160
+
+
+def some_scene(count: int = 400) -> GaussianScene:
+    rng = np.random.default_rng(4)
+    quats = rng.normal(size=(count, 4))
+    named = tuple(NamedCamera(str(i), Camera(LENS, pose)) for i, pose in enumerate(poses()))
+    return GaussianScene(
+        rng.normal(size=(count, 3)),
+        quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        np.exp(rng.normal(-3, 0.7, (count, 3))),
+        rng.uniform(0.01, 0.999, count),
+        rng.normal(0, 0.3, (count, 16, 3)),
+        SceneInfo("s", "s", "abc", "ply"),
+        named,
+    )
+
+
+UNITS = Units(np.zeros(3), 2.0, False)
+
+
+def changed(spec: str, scene: GaussianScene | None = None) -> GaussianScene:
+    return modified_scene(scene or some_scene(), [spec], UNITS, 0)
+
+
+class TestScenes:
+    def test_each_is_another_scene_in_the_same_frame(self):
+        scene = some_scene()
+        digests = {modified_scene(scene, row.modify_scene, UNITS, 0).info.sha256 for row in all_rows()}
+        assert len(digests) == 1 + sum(bool(row.modify_scene) for row in all_rows())
+        assert scene.info.sha256 in digests
+        assert changed("floaters=1", scene).cameras is scene.cameras
+        with pytest.raises(UnknownName, match="floaters"):
+            changed("smoke=1")
+        with pytest.raises(InvalidOptions, match=r"0 to 0\.95"):
+            changed("thin=2")
+
+    def test_a_splat_file_keeps_as_much(self, tmp_path):
+        """Written as web viewers' converters do, and read by our reader."""
+        scene, record = some_scene(), np.dtype([("f", "<f4", 6), ("b", "u1", 8)])
+        records = np.zeros(scene.count, record)
+        records["f"] = np.concatenate([scene.means, scene.scales], 1)
+        rgba = np.concatenate([0.5 + 0.28209479 * scene.sh[:, 0], scene.opacities[:, None]], 1)
+        both = np.concatenate(
+            [np.rint(np.clip(rgba, 0, 1) * 255), np.clip(np.rint(scene.quats * 128 + 128), 0, 255)], 1
+        )
+        records["b"] = both.astype(np.uint8)
+        records.tofile(tmp_path / "s.splat")
+        stored, own = splat.read(tmp_path / "s.splat"), changed("splat=1")
+        assert np.allclose(own.sh, stored.sh, atol=1e-5)
+        assert np.allclose(own.opacities, stored.opacities, atol=1e-6)
+        quats = stored.quats / np.linalg.norm(stored.quats, axis=1, keepdims=True)
+        assert np.allclose(own.quats, quats, atol=1e-6)
+        assert np.array_equal(own.scales, stored.scales)
+
+    @pytest.mark.parametrize(("spec", "position"), [("spz=1", 1 / 8192), ("sog=1", 2e-4)])
+    def test_rounding_is_as_fine_as_the_format(self, spec, position):
+        scene, own = some_scene(), changed(spec)
+        assert 0 < np.abs(own.means - scene.means).max() <= position * 1.01
+        assert np.abs(own.opacities - scene.opacities).max() <= 0.5 / 255 + 1e-6
+        angle = 2 * np.arccos(np.clip(np.abs((own.quats * scene.quats).sum(1)), 0, 1))
+        assert 0.02 < np.degrees(angle.max()) < 1.2  # seen: 0.2 and 0.8; float32 of 1 - 6e-8 alone is 0.04
+        scales, colours = np.abs(np.log(own.scales / scene.scales)), np.abs(own.sh[:, 0] - scene.sh[:, 0])
+        if spec == "spz=1":
+            assert scales.max() < 1 / 32 + 1e-5
+            assert colours.max() < 0.5 / 0.15 / 255 + 1e-5
+        else:
+            assert len(np.unique(own.scales)) <= len(np.unique(own.sh[:, 1:])) <= 256
+            # Of 1200 values 256 codes each stand for five; at the ends they are farther apart.
+            assert np.quantile(scales, 0.9) < 0.02
+            assert np.quantile(colours, 0.9) < 0.01
+        assert np.abs(own.sh - scene.sh).max() < 0.3  # SPZ clips at 1, which is 3.3 deviations here
+
+    def test_what_is_removed(self):
+        scene = some_scene()
+        assert changed("sh_degree=1").sh.shape[1] == 4
+        thin, soft, hole = changed("thin=0.5"), changed("soft=0.25"), changed("hole=0.125")
+        assert (thin.count, soft.count, hole.count) == (200, 300, 350)
+        # Three quarters of what covers the picture are left by half of the Gaussians.
+        cover = [np.sum(s.opacities * s.scales.prod(1) / s.scales.min(1)) for s in (thin, scene)]
+        assert cover[0] > 0.75 * cover[1]
+        kept = {tuple(mean): scale for mean, scale in zip(scene.means.tolist(), scene.scales, strict=True)}
+        for mean, scale in zip(soft.means.tolist(), soft.scales, strict=True):
+            assert np.allclose(scale, 1.35 * kept[tuple(mean)])
+        gone = np.array(sorted(set(map(tuple, scene.means.tolist())) - set(map(tuple, hole.means.tolist()))))
+        inside = ((scene.means >= gone.min(0)) & (scene.means <= gone.max(0))).all(1)
+        assert inside.sum() == len(gone) == 50
+
+    def test_what_is_added_floats_among_the_cameras(self):
+        scene, more = some_scene(), changed("floaters=1")
+        new = np.s_[scene.count :]
+        assert more.count == scene.count + 3300
+        assert (more.opacities[new] < 0.1).sum() == 3000
+        assert more.scales[new].max() <= 0.15  # 0.3 units, of which two are one of the scene's
+        positions = np.stack([pose.position_in_world for pose in poses()])
+        assert (np.abs(more.means[new]).max(0) <= np.abs(positions).max(0) + 1).all()
+
+    @pytest.mark.parametrize(("spec", "gain"), [("warm=1", [1.18, 1.02, 0.85]), ("dark=0.5", [0.5] * 3)])
+    def test_colours_from_anywhere_are_multiplied(self, spec, gain):
+        scene, own = some_scene(), changed(spec)
+        basis = np.random.default_rng(0).normal(size=16)
+        basis[0] = 0.28209479
+        before, after = (0.5 + np.einsum("k,nkc->nc", basis, s.sh) for s in (scene, own))
+        assert np.allclose(after, before * gain, atol=1e-5)
+
+
+class TestRandom:
+    def test_combinations_are_those_of_their_number_and_can_be_made(self):
+        drawn = [random_row(np.random.default_rng([0, n]), LENS) for n in range(200)]
+        assert drawn[:5] == [random_row(np.random.default_rng([0, n]), LENS) for n in range(5)]
+        assert {row.told for row in drawn} == set(TOLD)
+        names = {spec.partition("=")[0] for row in drawn for spec in (*row.modify, *row.modify_scene)}
+        assert {"k1", "fisheye", "shutter_yaw", "zoom", "roll", "focal", "occlusion", "hole", "local_light"} <= names
+        assert all(row.fits(LENS) for row in drawn)
+        photo = replace(map_photo(), occluders=(map_photo().rgb,))
+        for row in drawn[:25]:
+            modify(photo, row.modify, RNG)
+
+    def test_a_distorted_photo_is_not_bent_again(self):
+        lens = replace(LENS, model="SIMPLE_RADIAL", distortion=(-0.05,), fy=LENS.fx)
+        assert all(random_row(np.random.default_rng(n), lens).fits(lens) for n in range(100))
 
 
 def photo_file(path) -> BenchPhoto:
@@ -287,6 +480,26 @@ class TestRun:
         assert len(whole) == 4
         assert [json.loads(text) for text in file.read_text().splitlines()] == whole
         assert field.read_results(self.spec(tmp_path)) == whole
+
+    def test_each_modified_scene_is_loaded_once(self, tmp_path, answers, monkeypatch):
+        loaded = []
+
+        def load(scene, **_):
+            loaded.append(scene.info.sha256)
+            return FakeLoaded(scene, FakeRasterizer(), FakeMatcher())
+
+        monkeypatch.setattr(bench.LoadedScene, "of", load)
+        field.run(self.spec(tmp_path, "scene/dark=0.5", "scene/warm=1", "lens/told"))
+        assert len(loaded) == len(set(loaded)) == 3
+        assert [sha.partition("-")[2] for sha in loaded] == ["", "dark=0.5-0", "warm=1-0"]
+
+    def test_random_combinations_come_after_the_rows(self, tmp_path, answers):
+        more = replace(self.spec(tmp_path, "lens/told"), random=6, occluders=tmp_path / "s" / "images")
+        found = field.run(more)
+        drawn = [one for one in found if one["row"].startswith("random/")]
+        assert len(found) == 8
+        assert sorted(one["number"] for one in drawn) == list(range(6))
+        assert len(field.run(replace(more, random=8))) == 10
 
     def test_results_of_another_seed_are_not_mixed(self, tmp_path, answers):
         field.run(self.spec(tmp_path, "lens/told"))

@@ -10,20 +10,23 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float32
 
 from service.bench.field_queries import FieldQuery, answer, decoded
+from service.bench.field_random import random_row
 from service.bench.field_rows import Row
 from service.bench.localize import BenchScene, load_bench_scene, read_occluders
 from service.bench.modified_photo import Photo
 from service.bench.paper.runs import code_digest, read_lines
+from service.bench.scene_modifications import modified_scene
 from service.errors import InvalidRequest
-from service.localize import DEFAULT_ESTIMATOR, Request
+from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +37,8 @@ class FieldSpec:
     """Name -> scene, and its photos where they are elsewhere."""
     rows: Sequence[Row]
     out: Path
+    random: int = 0
+    """Random combinations a scene."""
     photos: int | None = None
     """Test photos a scene, evenly spread; None: all."""
     seed: int = 0
@@ -78,18 +83,22 @@ def _run_scene(
     facts = {"scene": name, "scene_sha256": one.loaded.scene.info.sha256, "seed": spec.seed}
     _require_same(lines, facts, file)
     done = {(line["row"], line["photo"], line["number"]) for line in lines}
-    todo = [query for query in queries(one, spec) if query.key not in done]
+    todo = [query for query in queries(name, one, spec) if query.key not in done]
+    # Each modified scene is made and indexed once.
+    todo.sort(key=lambda query: query.row.modify_scene)
     photos: dict[str, Photo] = {}
+    place, prepared = one, None
     with file.open("a", encoding="utf-8") as stream:
         for number, query in enumerate(todo):
             if query.photo.name not in photos:
                 photos[query.photo.name] = decoded(query.photo, one.background_rgb, occluders)
             photo = photos[query.photo.name]
-            if number == 0:
-                one.loaded.prepare(DEFAULT_ESTIMATOR)
+            if query.row.modify_scene != prepared:
+                prepared = query.row.modify_scene
+                place = _modified(one, prepared, spec)
                 # Not kept: its time would include compilation.
-                answer(one, photo, query, spec.seed, spec.request)
-            line = facts | {"code": code_digest()} | answer(one, photo, query, spec.seed, spec.request)
+                answer(place, photo, query, spec.seed, spec.request)
+            line = facts | {"code": code_digest()} | answer(place, photo, query, spec.seed, spec.request)
             stream.write(json.dumps(line) + "\n")
             stream.flush()
             os.fsync(stream.fileno())
@@ -97,6 +106,15 @@ def _run_scene(
             if progress:
                 progress(name, number + 1, len(todo))
     return lines
+
+
+def _modified(one: BenchScene, specs: tuple[str, ...], spec: FieldSpec) -> BenchScene:
+    """Return the scene with its modifications, ready to localize in; photos and units remain."""
+    if specs:
+        scene = modified_scene(one.loaded.scene, specs, one.units, spec.seed)
+        one = replace(one, loaded=LoadedScene.of(scene, cache_dir=spec.cache_dir))
+    one.loaded.prepare(DEFAULT_ESTIMATOR)
+    return one
 
 
 def _require_same(lines: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], file: Path) -> None:
@@ -111,12 +129,20 @@ def _require_same(lines: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], 
                 )
 
 
-def queries(one: BenchScene, spec: FieldSpec) -> Iterator[FieldQuery]:
-    """Yield the queries of a scene, row by row."""
+def queries(name: str, one: BenchScene, spec: FieldSpec) -> Iterator[FieldQuery]:
+    """Yield the queries of a scene: row by row, then random combinations.
+
+    A combination depends on the seed, the scene's name and its number, and on which photos there are.
+    """
     photos = one.photos
     if spec.photos is not None and spec.photos < len(photos):
         photos = tuple(photos[int(i * len(photos) / spec.photos)] for i in range(spec.photos))
     for row in spec.rows:
-        if row.needs_occluders and spec.occluders is None:
-            continue
-        yield from (FieldQuery(row, photo) for photo in photos if row.fits(photo.camera.intrinsics))
+        if not row.needs_occluders or spec.occluders:
+            yield from (FieldQuery(row, photo) for photo in photos if row.fits(photo.camera.intrinsics))
+    for number in range(spec.random):
+        rng = np.random.default_rng([spec.seed, crc32(name.encode()), number])
+        photo = one.photos[int(rng.integers(len(one.photos)))]
+        row = random_row(rng, photo.camera.intrinsics)
+        if not row.needs_occluders or spec.occluders:
+            yield FieldQuery(row, photo, number)

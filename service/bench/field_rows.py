@@ -76,28 +76,44 @@ def lens_rows() -> list[Row]:
     rows += [_lens_row(f"zoom={factor:g}", one) for factor in (1.5, 2) for one in told]
     rows += [_lens_row("fisheye=1", one) for one in (*told, "pinhole")]
     rows += [_lens_row(f"shutter_{axis}=30", one) for axis in ("yaw", "pitch") for one in told]
-    return rows
+    return rows + [Row(f"lens/phone/{one}", one, PHONE) for one in (*told, "pinhole")]
 
 
 def _lens_row(spec: str, told: Told) -> Row:
     return Row(f"lens/{spec}/{told}" if spec else f"lens/{told}", told, (spec,) if spec else ())
 
 
+PHONE = ("k1=-0.08", "vignetting=0.3", "gamma=0.9", "saturation=1.2", "white_balance=1.05", "phone_noise=0.03",
+         "jpeg=60")  # fmt: skip
+"""What a phone makes of a photo."""
 PHOTO_SPECS = (
     "gain=0.7", "gain=1.4", "gamma=0.6", "gamma=1.6", "white_balance=1.2", "saturation=0", "blur=4", "noise=0.1",
     "jpeg=20", "scale=0.5", "scale=0.25", "roll=45", "roll=90", "roll=180", "occlusion=0.2", "occlusion=0.35",
+    "vignetting=0.5", "vignetting=0.8", "local_light=0.4", "local_light=0.8", "local_light=1.2", "motion_blur=4",
+    "motion_blur=8", "colour_cast=0.2", "colour_cast=0.5", "phone_noise=0.05", "phone_noise=0.15",
 )  # fmt: skip
 """Modifications of the rows of photos."""
+SCREEN_SPECS = ("letterbox=0.2", "letterbox=0.4", "white_bars=0.1")
+SCENE_SPECS = (
+    "sh_degree=0", "sh_degree=1", "splat=1", "spz=1", "sog=1", "thin=0.5", "thin=0.75", "soft=0.33", "floaters=1",
+    "hole=0.125", "warm=1", "dark=0.5",
+)  # fmt: skip
 
 
 def photo_rows() -> list[Row]:
-    """Return the rows of photos: told lens, other pixels."""
-    return [Row(f"photo/{spec}", modify=(spec,)) for spec in PHOTO_SPECS]
+    """Return the rows of photos: told lens, other pixels. A screenshot says nothing of its lens."""
+    rows = [Row(f"photo/{spec}", modify=(spec,)) for spec in PHOTO_SPECS]
+    return rows + [Row(f"photo/{spec}/{told}", told, (spec,)) for spec in SCREEN_SPECS for told in ("told", "withheld")]
+
+
+def scene_rows() -> list[Row]:
+    """Return the rows of scenes: plain photos with a told lens, in a scene that something was done to."""
+    return [Row(f"scene/{spec}", modify_scene=(spec,)) for spec in SCENE_SPECS]
 
 
 def all_rows() -> list[Row]:
     """Return the written list of rows."""
-    return lens_rows() + photo_rows()
+    return lens_rows() + photo_rows() + scene_rows()
 
 
 def chosen_rows(patterns: Sequence[str]) -> list[Row]:

@@ -11,6 +11,12 @@ Those of other lenses (`lens_modifications`), at most one of the first column in
 k1              of a radial distortion          off_centre    a corner: this share of width and height
 fisheye         1: equidistant                  zoom          digital: by this factor, to the same size
 shutter_yaw     degrees a second while a rolling shutter reads the photo in 20 ms; shutter_pitch likewise
+
+Those of light, motion, sensor and screen (`capture_modifications`):
+
+vignetting      share, in the corners           motion_blur   length in px at 800 px
+local_light     strength of regions, shadow     phone_noise   sigma at full signal, then smeared
+colour_cast     strength                        letterbox, white_bars  share of the sides
 """
 
 from __future__ import annotations
@@ -21,6 +27,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32, Float64
 
+from service.bench.capture_modifications import CAPTURE_MODIFICATIONS
 from service.bench.lens_modifications import LENS_MODIFICATIONS, require_pinhole
 from service.bench.modified_photo import Change, Photo
 from service.errors import InvalidOptions, UnknownName
@@ -202,18 +209,22 @@ def _sample(
     return ((upper * (1 - v) + lower * v) * inside[..., None]).astype(np.float32)
 
 
-MODIFICATIONS: dict[str, tuple[float, float, Change]] = {
-    "gain": (0.05, 20.0, _gain),
-    "gamma": (0.1, 10.0, _gamma),
-    "white_balance": (0.2, 5.0, _white_balance),
-    "saturation": (0.0, 3.0, _saturation),
-    "noise": (0.0, 1.0, _noise),
-    "blur": (0.0, 50.0, _blur),
-    "jpeg": (1.0, 100.0, _jpeg),
-    "occlusion": (0.0, 0.9, _occlusion),
-    "scale": (0.05, 4.0, _scale),
-    "focal": (0.5, 2.0, _focal),
-    "crop": (0.1, 1.0, _crop),
-    "roll": (-180.0, 180.0, _roll),
-} | LENS_MODIFICATIONS
+MODIFICATIONS: dict[str, tuple[float, float, Change]] = (
+    {
+        "gain": (0.05, 20.0, _gain),
+        "gamma": (0.1, 10.0, _gamma),
+        "white_balance": (0.2, 5.0, _white_balance),
+        "saturation": (0.0, 3.0, _saturation),
+        "noise": (0.0, 1.0, _noise),
+        "blur": (0.0, 50.0, _blur),
+        "jpeg": (1.0, 100.0, _jpeg),
+        "occlusion": (0.0, 0.9, _occlusion),
+        "scale": (0.05, 4.0, _scale),
+        "focal": (0.5, 2.0, _focal),
+        "crop": (0.1, 1.0, _crop),
+        "roll": (-180.0, 180.0, _roll),
+    }
+    | LENS_MODIFICATIONS
+    | CAPTURE_MODIFICATIONS
+)
 """Name -> smallest value, largest value, function."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -89,7 +90,8 @@ def resampled_within(photo: Photo, source_of: Sampling, camera: Intrinsics) -> P
     rectangle of the same aspect whose edge lies inside of the photo: padding would tell an estimator of the distortion.
     """
     width, height = photo.intrinsics.width, photo.intrinsics.height
-    margin = next(m for m in range(width // 2) if _edge_is_inside(m, width, height, source_of))
+    margins = range(width // 2)
+    margin = bisect_left(margins, True, key=lambda m: _edge_is_inside(m, width, height, source_of))
     top = round(margin * height / width)
     rows, columns = np.mgrid[top : height - top, margin : width - margin]
     x, y = source_of(columns + 0.5, rows + 0.5)

@@ -18,6 +18,7 @@ def bench_field(
         "field"
     ),
     rows: Annotated[list[str] | None, typer.Option("--row", help="Only rows like this, e.g. 'lens/k1=*'.")] = None,
+    random: Annotated[int, typer.Option(min=0, help="Random combinations a scene; rows only if named, too.")] = 0,
     photos: Annotated[int | None, typer.Option(min=1, help="Test photos a scene, at most.")] = None,
     seed: int = 0,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, to hide parts with.")] = None,
@@ -30,7 +31,7 @@ def bench_field(
     from service.bench.field_rows import chosen_rows
     from service.bench.field_table import table
 
-    chosen = chosen_rows(rows or ())
+    chosen = chosen_rows(rows or ()) if rows or not random else []
     if show_rows:
         for row in chosen:
             say(row.name)
@@ -38,6 +39,7 @@ def bench_field(
     spec = field.FieldSpec(
         scenes=scene_arguments(scenes or [], named_by_photos=True),
         rows=chosen,
+        random=random,
         out=folder,
         photos=photos,
         seed=seed,
@@ -49,6 +51,7 @@ def bench_field(
         with progress_bar() as progress:
             bars = {name: counter(progress, name) for name in spec.scenes}
             field.run(spec, lambda name, done, total: bars[name](done, total))
-    names = {row.name for row in chosen}
-    lines = [line for line in field.read_results(spec) if line["row"] in names]
+    lines, names = field.read_results(spec), {row.name for row in chosen}
+    if rows or random:
+        lines = [one for one in lines if one["row"] in names or (random and one["group"] == "random")]
     say(table(lines, by_scene))
