@@ -109,13 +109,13 @@ def measure_folder(folder: Path, units: Units) -> dict[str, Any]:
         return result
 
     timed("warm_up", _warm_up)
-    before = _memory()
+    before = process_memory()
     loaded = timed("load", lambda: LoadedScene.load(folder, cache_dir=cache))
     index = timed("index", lambda: loaded.prepare(DEFAULT_ESTIMATOR))
     # Read before the queries: it is the peak of loading and indexing.
-    peak = _memory()["VmHWM"]
+    peak = process_memory()["VmHWM"]
     outcomes = _outcomes(folder, loaded, units)
-    after = _memory()
+    after = process_memory()
     # One copy of the scene in memory at a time.
     del loaded
     again = timed("load_again", lambda: LoadedScene.load(folder, cache_dir=cache))
@@ -161,7 +161,7 @@ def _outcomes(folder: Path, loaded: LoadedScene, units: Units) -> list[Outcome]:
     return outcomes[1:]
 
 
-def _memory() -> dict[str, int]:
+def process_memory() -> dict[str, int]:
     """Return the counters of /proc/self/status for this process, in bytes."""
     found = re.findall(r"(\w+):\s+(\d+) kB", _STATUS.read_text())
     return {name: 1024 * int(value) for name, value in found}

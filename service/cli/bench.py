@@ -7,6 +7,7 @@ import typer
 from service.cli.bench_ablation import bench_ablation
 from service.cli.bench_field import bench_field
 from service.cli.bench_gate import bench_gate
+from service.cli.bench_gpu import bench_gpu
 from service.cli.bench_localize import bench_localize
 from service.cli.bench_paper import bench_paper
 from service.cli.bench_render import bench_render
@@ -19,6 +20,7 @@ bench_app.command("track")(bench_track)
 bench_app.command("paper")(bench_paper)
 bench_app.command("gate")(bench_gate)
 bench_app.command("render")(bench_render)
+bench_app.command("gpu")(bench_gpu)
 bench_app.command("scale")(bench_scale)
 bench_app.command("ablation")(bench_ablation)
 bench_app.command("field")(bench_field)

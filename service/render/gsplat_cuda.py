@@ -65,6 +65,40 @@ def create(scene: GaussianScene) -> GsplatRasterizer:
     return _put(scene, torch.device("cuda"), kernels)
 
 
+def device_facts() -> dict[str, Any]:
+    """Return the GPU's name, compute capability, multiprocessors and bytes of memory, and PyTorch's CUDA version."""
+    found = torch.cuda.get_device_properties(0)
+    return {
+        "name": found.name,
+        "compute_capability": f"{found.major}.{found.minor}",
+        "multiprocessors": found.multi_processor_count,
+        "memory_bytes": found.total_memory,
+        "cuda": torch.version.cuda,
+    }
+
+
+def device_memory() -> dict[str, int]:
+    """Return bytes of GPU memory: this process's tensors now and at most since the last call, its pool, free ones."""
+    found = {
+        "allocated_bytes": torch.cuda.memory_allocated(),
+        "peak_bytes": torch.cuda.max_memory_allocated(),
+        "reserved_bytes": torch.cuda.memory_reserved(),
+        "free_bytes": torch.cuda.mem_get_info()[0],
+    }
+    torch.cuda.reset_peak_memory_stats()
+    return found
+
+
+def limit_device_memory(more_bytes: int | None) -> None:
+    """Let this process take no more GPU memory than this beyond what it has now; None: as much as there is."""
+    torch.cuda.empty_cache()
+    share = 1.0
+    if more_bytes is not None:
+        total = torch.cuda.get_device_properties(0).total_memory
+        share = min(1.0, (torch.cuda.memory_reserved() + more_bytes) / total)
+    torch.cuda.set_per_process_memory_fraction(share)
+
+
 def _put(scene: GaussianScene, device: torch.device, kernels: Kernels) -> GsplatRasterizer:
     try:
         return GsplatRasterizer(scene, device, kernels)
