@@ -7,6 +7,7 @@ a reference in float64.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
@@ -45,7 +46,7 @@ def pictures(shared: Shared) -> Iterator[Row]:
     """Yield for each camera and size how the tested renderer's image differs from the CPU's."""
     scene, tested, reference = _compared(shared)
     for width in shared.work.widths:
-        for named in every(scene.cameras, shared.work.views):
+        for named in scene.cameras:
             camera = _resized(named.camera, width)
             (ours,), (theirs,) = tested.render([camera]), reference.render([camera])
             differences = image_differences(ours, theirs)
@@ -53,7 +54,8 @@ def pictures(shared: Shared) -> Iterator[Row]:
                 mean is not None and mean < MEAN_BOUND and quantile is not None and quantile < QUANTILE_BOUND
                 for mean, quantile in differences.values()
             )
-            yield {"camera": named.name, "width": camera.intrinsics.width, "within": within, **differences}
+            shown = finite(theirs.alpha.mean())  # of nothing, two images are equal whatever the renderers do
+            yield {"camera": named.name, "width": width, "within": within, "alpha": shown, "differences": differences}
 
 
 def image_differences(ours: Frame, theirs: Frame) -> dict[str, tuple[float | None, float | None]]:
@@ -68,7 +70,7 @@ def image_differences(ours: Frame, theirs: Frame) -> dict[str, tuple[float | Non
 def gradients(shared: Shared) -> Iterator[Row]:
     """Yield for each camera the relative difference of the gradients by pose and scene, of a random linear loss."""
     scene, tested, reference = _compared(shared)
-    for number, named in enumerate(every(scene.cameras, shared.work.views)):
+    for number, named in enumerate(scene.cameras):
         camera = _resized(named.camera, min(GRADIENT_PX, max(shared.work.widths)))
         rng = np.random.default_rng(number)
         k = camera.intrinsics
@@ -81,13 +83,15 @@ def gradients(shared: Shared) -> Iterator[Row]:
             full = [_scattered(g.index, getattr(g, name), scene.count) for g in (ours, theirs)]
             found[name] = _relative(*full)
         within = all(value is not None and value < GRADIENT_BOUND for value in found.values())
-        yield {"camera": named.name, "width": k.width, "within": within, **found}
+        seen = len(theirs.index)
+        yield {"camera": named.name, "width": k.width, "within": within, "gaussians": seen, "differences": found}
 
 
 def poses(shared: Shared) -> Iterator[Row]:
     """Yield for each photo, the scene's own and rendered ones, what is found with either renderer.
 
-    The own photos are sent as they are; rendered ones are taken near training cameras and spoilt in turn by `SPOILT_BY`.
+    Its own photos are sent as they are; rendered ones are taken near training cameras and spoilt, in turn, by
+    `SPOILT_BY`.
     """
     background = shared.scene.info.background_rgb
     for name, data, truth in _photos(shared):
@@ -138,11 +142,12 @@ def spoilt_photos(
 
 
 def _compared(shared: Shared) -> tuple[GaussianScene, Rasterizer, Rasterizer]:
-    """Return the scene whose images are compared, with the tested and the CPU's renderer of it."""
+    """Return the scene with the cameras that images are compared of, and the tested and the CPU's renderer of it."""
     tested, reference, count = shared.tested.rasterizer, shared.reference.rasterizer, shared.work.compared
+    scene = replace(shared.scene, cameras=tuple(every(shared.scene.cameras, shared.work.views)))
     if count is None:
-        return shared.scene, tested, reference
-    scene = keep_most_contributing(shared.scene, count, reference)
+        return scene, tested, reference
+    scene = keep_most_contributing(scene, count, reference)
     return scene, tested.of(scene), reference.of(scene)
 
 

@@ -1,4 +1,4 @@
-"""What the parts of `splatfix bench gpu` share: the scene with both renderers, and how much of everything is measured."""
+"""What the parts of `splatfix bench gpu` share: the scene with both renderers, and how much is measured."""
 
 from __future__ import annotations
 
@@ -45,6 +45,8 @@ class Workload:
     spoilt_px: int
     repeats: int
     """Localizations of each photo for latencies."""
+    at_a_time: tuple[int, ...]
+    """Jobs."""
     throughput_s: float
     """For each number of jobs at a time."""
     sizes: tuple[int, ...]
@@ -54,10 +56,10 @@ class Workload:
 
 
 FULL = Workload(
-    None, (200, 800), 6, 16, 60, 800, 3, 6.0,
+    None, (200, 800), 6, 16, 60, 800, 3, (1, 4, 16), 6.0,
     (250_000, 500_000, 1_000_000, 2_000_000, 4_000_000, 8_000_000, 12_000_000), 800, 1000,
 )  # fmt: skip
-SMALL = Workload(300, (40,), 1, 1, 1, 320, 1, 0.2, (20_000, 30_000), 160, 4)
+SMALL = Workload(300, (40,), 1, 1, 1, 320, 1, (1, 2), 0.1, (20_000, 30_000), 160, 4)
 """For a stand-in that compares every Gaussian with every pixel, or renders on the CPU."""
 
 

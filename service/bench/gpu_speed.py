@@ -16,9 +16,6 @@ from service.interfaces import Tools
 from service.localize import DEFAULT_ESTIMATOR, LoadedScene
 from service.pose.retrieval.index import prepared_index
 
-AT_A_TIME = (1, 4, 16)
-"""Jobs."""
-
 
 def latency(shared: Shared) -> Iterator[Row]:
     """Yield for each renderer the milliseconds of a photo: of all of it, and by stage.
@@ -57,7 +54,7 @@ def throughput(shared: Shared) -> Iterator[Row]:
     """
     for renderer, loaded in shared.both:
         loaded.prepare(DEFAULT_ESTIMATOR)
-        for at_a_time in AT_A_TIME:
+        for at_a_time in shared.work.at_a_time:
             jobs, seconds = _localize_for(shared, loaded, at_a_time, shared.work.throughput_s)
             yield {"renderer": renderer, "at_a_time": at_a_time, "jobs": jobs, "jobs_per_s": jobs / seconds}
 

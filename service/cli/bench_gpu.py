@@ -15,7 +15,7 @@ from service.errors import BackendMissing, InvalidRequest
 
 def bench_gpu(
     folder: Annotated[Path, typer.Argument(help="A scene folder with test photos.")] = Path("scenes/studio"),
-    renderer: Annotated[str, typer.Option(help="Compared with the CPU's; `splatfix doctor` lists them.")] = "gsplat_cuda",
+    renderer: Annotated[str, typer.Option(help="Compared with the CPU's.")] = "gsplat_cuda",
     small: Annotated[bool, typer.Option("--small", help="Few and small images, for a stand-in without a GPU.")] = False,
     part: Annotated[list[str] | None, typer.Option(help="Only this part; may be repeated.")] = None,
     limit_s: Annotated[float, typer.Option(min=1, help="Seconds for all parts.")] = 470.0,

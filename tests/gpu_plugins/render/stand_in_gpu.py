@@ -36,8 +36,12 @@ def device_memory() -> dict[str, int]:
 
 
 def limit_device_memory(more_bytes: int | None) -> None:
+    left = more_bytes or 0
+
     def limited(self: GsplatRasterizer, values: Any) -> Tensor:
-        if np.asarray(values, np.float32).nbytes > (more_bytes or 0):
+        nonlocal left
+        left -= np.asarray(values, np.float32).nbytes
+        if left < 0:
             raise torch.OutOfMemoryError("the stand-in's memory is full")
         return TENSOR(self, values)
 

@@ -1,6 +1,6 @@
 """Compile gsplat's CUDA kernels for one machine: only those that `service/render/gsplat_cuda.py` calls.
 
-    python tests/gpu_kernels.py [ARCHITECTURE]
+    python tests/gpu_kernels_run.py [ARCHITECTURE]
 
 The sources come from the installed gsplat, whose `csrc` is tried before it compiles everything by itself: half an hour
 of one core for kernels of 2D splats, of other camera models and of up to 513 channels. Without an argument the
@@ -99,7 +99,8 @@ def main() -> None:
         module = compile_module(gsplat, Path(work))
         target = gsplat / f"csrc{sysconfig.get_config_var('EXT_SUFFIX')}"
         shutil.copy(module, target)
-    print(f"{target.name} for {architecture}: {target.stat().st_size / 1e6:.1f} MB, {time.perf_counter() - began:.0f} s")
+    size_mb, seconds = target.stat().st_size / 1e6, time.perf_counter() - began
+    print(f"{target.name} for {architecture}: {size_mb:.1f} MB, {seconds:.0f} s")
 
 
 if __name__ == "__main__":
