@@ -164,4 +164,4 @@ def _scattered(
 
 
 def _relative(ours: Float64[np.ndarray, "*k"], theirs: Float64[np.ndarray, "*k"]) -> float | None:
-    return finite(np.linalg.norm(ours - theirs) / max(float(np.linalg.norm(theirs)), 1e-30))
+    return finite(float(np.linalg.norm(ours - theirs)) / max(float(np.linalg.norm(theirs)), 1e-30))

@@ -126,7 +126,12 @@ def machine(shared: Shared) -> Iterator[Row]:
     yield {"versions": versions}
     describe = getattr(shared.module, "device_facts", None)
     yield {"device": describe() if describe else {"name": shared.renderer}, "memory": shared.device_memory()}
-    yield {"gaussians": shared.scene.count, "cameras": len(shared.scene.cameras), "photos": len(shared.photos)}
+    yield {
+        "gaussians": shared.scene.count,
+        "sh_degree": shared.scene.sh_degree,
+        "cameras": len(shared.scene.cameras),
+        "photos": len(shared.photos),
+    }
 
 
 def every(items: Sequence[Any], count: int) -> list[Any]:

@@ -29,10 +29,11 @@ def _heading(outcome: dict[str, Any], rows: Rows) -> str:
     extras = [f"compute capability {device['compute_capability']}"] if "compute_capability" in device else []
     extras += [f"{_mb(device['memory_bytes'])} MB", f"CUDA {device['cuda']}"] if "memory_bytes" in device else []
     where = ", ".join([str(device.get("name", _UNKNOWN)), *extras])
+    scene = f"{outcome['scene']}, {facts.get('gaussians', _UNKNOWN)} Gaussians"
+    scene += f" of SH degree {facts.get('sh_degree', _UNKNOWN)}"
     return (
         f"`{outcome['renderer']}` on {where}; CPU: {outcome.get('processor', _UNKNOWN)}. "
-        f"{outcome.get('started', _UNKNOWN)}; scene {outcome['scene']}, {facts.get('gaussians', _UNKNOWN)} Gaussians; "
-        f"{named}.{small}"
+        f"{outcome.get('started', _UNKNOWN)}; scene {scene}; {named}.{small}"
     )
 
 
