@@ -25,7 +25,8 @@ def failing(shared: Shared) -> Iterator[dict[str, Any]]:
 
 
 def unwritable(shared: Shared) -> Iterator[dict[str, Any]]:
-    yield {"row": lambda: 0}
+    yield {"row": 1}
+    yield {"row": float("nan")}
 
 
 def dying(shared: Shared) -> Iterator[dict[str, Any]]:

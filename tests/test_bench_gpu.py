@@ -59,11 +59,11 @@ class TestRunner:
     @pytest.mark.parametrize(
         ("name", "state", "told"),
         [("failing", "failed", "ArithmeticError: no result"), ("dying", "died", "exit code 7"),
-         ("endless", "too late", "after 1 s")],
+         ("unwritable", "failed", "JSON"), ("endless", "too late", "after 1 s")],
     )  # fmt: skip
     def test_the_next_part_runs_whatever_becomes_of_one(self, tmp_path, name, state, told):
         file = tmp_path / "f.json"
-        good, bad, after = run(part("good"), part(name, 1.0), part("good"), file=file)
+        good, bad, after = run(part("good"), part(name, 1.0 if name == "endless" else 60.0), part("good"), file=file)
         assert (bad["state"], bad["rows"]) == (state, [{"row": 1}])
         assert told in bad["error"]
         assert after["state"] == "done"

@@ -140,7 +140,8 @@ def _work(connection: Connection, setup: tuple[str, tuple[Any, ...]]) -> None:
                 if shared is None:
                     shared = _function(setup[0])(*setup[1])
                 for row in _function(name)(shared):
-                    connection.send(("row", row))
+                    # What JSON can't hold is this part's failure, not that of the process that writes the file.
+                    connection.send(("row", json.loads(json.dumps(row, allow_nan=False))))
             except Exception as error:  # whatever it is, it is this part's result
                 text = f"{type(error).__name__}: {error}"
                 connection.send((FAILED, {"error": text, "traceback": traceback.format_exc()[-2000:]}))
