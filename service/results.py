@@ -103,7 +103,7 @@ class Reason(StrEnum):
     FEW_INLIERS = "few_inliers"
     LOW_COVERAGE = "low_coverage"
     FOCAL_UNCERTAIN = "focal_uncertain"
-    INTRINSICS_INCONSISTENT = "intrinsics_inconsistent"
+    INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
     POSITION_UNCERTAIN = "position_uncertain"
     OUTSIDE_PRIOR = "outside_prior"
     AMBIGUOUS = "ambiguous"
@@ -126,9 +126,9 @@ HINTS: dict[Reason, str] = {
     Reason.FOCAL_UNCERTAIN: (
         "The photo fits the scene, but does not determine its focal length, hence its position: send intrinsics."
     ),
-    Reason.INTRINSICS_INCONSISTENT: (
-        "The photo fits the scene far better with another focal length: check the intrinsics, or send them with "
-        'trust "approximate".'
+    Reason.INTRINSICS_CONTRADICTED: (
+        "The photo fits the scene far better with other intrinsics, which `fitting_intrinsics` lists: check focal "
+        'length, distortion and cropping, or send the intrinsics with trust "approximate".'
     ),
     Reason.POSITION_UNCERTAIN: (
         "The photo fits the scene, but hardly determines the camera position: show more of the scene, or nearer things."
@@ -171,6 +171,10 @@ class Verdict:
     true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
     focal_sigma: float = 0.0
     """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
+    covariance_given_lens: Float64[np.ndarray, "6 6"] | None = None
+    """The covariance if the estimated intrinsics were the true ones; None where they were given as exact."""
+    fitting_correction: IntrinsicsCorrection | None = None
+    """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)
     """All signals that the gate measured, by name; `service/pose/verification/gate.py` describes them."""
 

@@ -73,7 +73,7 @@ class TrackingConfig:
 
 
 TRACKING = TrackingConfig()
-INTRINSICS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_INCONSISTENT)
+INTRINSICS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
 """Doubts about the intrinsics, not about the pose: no reason to search elsewhere."""
 
 
@@ -280,7 +280,7 @@ def verify_tracked(
     # A shared focal length is not for one photo to doubt.
     focal_step = 0.0 if lens_prior else found.uncertainty.focal_step
     uncertainty = replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step)
-    return verdict_of(signals, uncertainty, lens_prior, config=config)
+    return verdict_of(signals, uncertainty, config=config)
 
 
 @dataclass(slots=True)

@@ -362,12 +362,14 @@ class Query:
     valid_mask: Bool[np.ndarray, "h w"] | None = None
     """False where a pixel shows nothing: transparent, or outside a distorted photo's edge. None: valid everywhere."""
     lens_prior: LensPrior | None = None
-    """None: the intrinsics are exact, and nothing of them is estimated."""
+    """Of approximate intrinsics, by default that of their source; None of exact ones: nothing of them is estimated."""
     region: PriorRegion | None = None
     """Poses outside are refused."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+        if self.lens_prior is None and self.intrinsics.trust == "approximate":
+            object.__setattr__(self, "lens_prior", LENS_PRIORS[self.intrinsics_source])
         if self.valid_mask is not None:
             object.__setattr__(self, "valid_mask", frozen(self.valid_mask, np.bool_))
 

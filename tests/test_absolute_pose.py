@@ -94,15 +94,15 @@ def test_too_few_inliers_are_not_refined() -> None:
     assert steps == pytest.approx(round(steps), abs=1e-9)
 
 
-def test_assumed_focal_lengths_end_two_and_a_half_scales_away() -> None:
+def test_assumed_focal_lengths_end_two_scales_below_and_four_above() -> None:
     """Unrefined answers on both sides; one step is tried in any case."""
     for factor in (0.2, 5.0):
         points, px = points_and_pixels(camera=CAMERA.corrected(IntrinsicsCorrection(factor)))
         config = LensSearchConfig(min_inliers=1000, error_factor=100)
-        for scale, last in ((0.35, 2), (0.06, 1)):  # 2.5 * 0.35 / 0.4 = 2.2
+        for scale, first, last in ((0.45, -2, 4), (0.06, -1, 1)):  # 2 and 4 * 0.45 / 0.4 = 2.25 and 4.5
             found = absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(scale), 8.0, config)
             assert found is not None
-            assert abs(np.log(found.correction.focal_factor)) <= 0.4 * last + 1e-9
+            assert 0.4 * first - 1e-9 <= np.log(found.correction.focal_factor) <= 0.4 * last + 1e-9
 
 
 def test_no_other_focal_length_is_tried_once_enough_agree(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -114,7 +114,7 @@ def test_no_other_focal_length_is_tried_once_enough_agree(monkeypatch: pytest.Mo
         return estimate_absolute_pose(*args, **kwargs)
 
     monkeypatch.setattr(unknown_lens, "estimate_absolute_pose", counted)
-    for sufficient, steps in ((50, 1), (51, 7)):
+    for sufficient, steps in ((50, 1), (51, 8)):
         tried.clear()
         config = LensSearchConfig(sufficient_inliers=sufficient)
         absolute_pose_unknown_lens(px, points, CAMERA, LensPrior(0.5), 8.0, config)

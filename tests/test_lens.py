@@ -107,6 +107,26 @@ def test_refinement_estimates_the_intrinsics_with_the_pose() -> None:
     assert distance < 0.015
 
 
+def distorted_photo(pose: Pose, lens: IntrinsicsCorrection) -> np.ndarray:
+    """The photo of a camera with this lens: a larger one without distortion, resampled by OpenCV."""
+    camera = LENS.corrected(lens)
+    margin = 60
+    large = replace(
+        camera,
+        width=camera.width + 2 * margin,
+        height=camera.height + 2 * margin,
+        cx=camera.cx + margin,
+        cy=camera.cy + margin,
+    )
+    rgb = photo_from(pose, large).rgb
+    row, column = np.mgrid[: LENS.height, : LENS.width] + 0.5
+    px = np.stack([column.ravel(), row.ravel()], 1)
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    straight = cv2.undistortPoints(px, matrix, np.array([lens.k1, 0.0, 0.0, 0.0]), P=matrix)[:, 0] + margin - 0.5
+    x, y = straight.T.reshape(2, LENS.height, LENS.width).astype(np.float32)
+    return np.asarray(cv2.remap(rgb, x, y, cv2.INTER_CUBIC))
+
+
 def bent(rgb: np.ndarray, soft_px: float, rng: np.random.Generator) -> np.ndarray:
     """The image as a model with faults shows it: its parts are shifted by a third of a pixel, neighbours alike."""
     height, width = rgb.shape[:2]
@@ -187,23 +207,33 @@ def test_the_last_step_measures_how_far_a_pose_is_off() -> None:
     assert np.allclose(found.last_step, -off, atol=2e-3)
 
 
-@pytest.mark.parametrize("factor", [1.0, 1.05])
-def test_another_focal_length_than_given_shows(factor: float) -> None:
-    """The pose is the best one for the focal length given; the pixels still show another one."""
+LENSES = [
+    (NO_CORRECTION, False),
+    (IntrinsicsCorrection(1.05), True),
+    (IntrinsicsCorrection(0.97), True),
+    (IntrinsicsCorrection(k1=-0.08), True),
+    (IntrinsicsCorrection(1.0, 0.08, -0.05), True),
+]
+
+
+@pytest.mark.parametrize(("lens", "wrong"), LENSES)
+def test_intrinsics_that_the_pixels_contradict(lens: IntrinsicsCorrection, wrong: bool) -> None:
+    """The pose is the best one for the intrinsics given; the pixels still show the planted ones."""
     truth = true_pose(1)
-    rgb = photo_from(truth, LENS.corrected(IntrinsicsCorrection(factor))).rgb
+    rgb = distorted_photo(truth, lens)
     pose = truth
-    for _ in range(3):
+    for _ in range(4):
         camera = Camera(LENS, pose)
         frame = PaintedWalls().render([camera])[0]
         pose = refine_photometric(rgb, frame, camera, camera, 3).pose
     found = pose_uncertainty(rgb, frame, camera, Camera(LENS, pose), None)
     assert found is not None
-    if factor == 1.0:
-        assert abs(found.focal_step) < 0.002
-    else:
-        assert found.focal_step > 0.02
-        assert found.focal_step > found.focal_sigma
+    assert bool(found.lens_fit and found.lens_fit.contradicts) == wrong
+    if found.lens_fit and wrong:
+        fit = found.lens_fit.correction
+        assert fit.focal_factor == pytest.approx(lens.focal_factor, rel=0.01)
+        assert fit.k1 == pytest.approx(lens.k1, abs=0.02)
+        assert np.allclose([fit.shift_x, fit.shift_y], [lens.shift_x, lens.shift_y], atol=0.015)
 
 
 def test_corrected_is_undone_by_nothing_but_its_opposite() -> None:

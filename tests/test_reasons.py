@@ -18,7 +18,7 @@ from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
 from service.pose.refinement.photometric import refine_photometric
 from service.results import HINTS, Reason, Status, Verdict
-from service.types import BoxPrior, Camera, Pose, Query
+from service.types import LENS_PRIORS, BoxPrior, Camera, Pose, Query
 
 TRUTH = unseen_pose()
 UP = np.array([0.0, 0.0, 1.0])
@@ -55,8 +55,8 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
     Reason.RENDER_MISMATCH: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
     Reason.FEW_INLIERS: lambda room, _: judged(room, blurred(photo_at(room, TRUTH), 10.0)),
     Reason.LOW_COVERAGE: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
-    Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room)), BEFORE_A_WALL),
-    Reason.INTRINSICS_INCONSISTENT: lambda room, _: judged(room, *with_a_wrong_lens(room)),
+    Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room, 0.1)), BEFORE_A_WALL),
+    Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
     Reason.POSITION_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
     Reason.AMBIGUOUS: lambda _, rooms: localize(photo_at(rooms["repeated"], TRUTH), rooms["repeated"], FAST).verdict,
@@ -75,7 +75,7 @@ def with_swapped_colours(query: Query) -> Query:
 
 
 def with_any_lens(query: Query) -> Query:
-    return replace(query, intrinsics=replace(query.intrinsics, trust="approximate"))
+    return replace(query, lens_prior=LENS_PRIORS["given"])
 
 
 def with_a_wrong_lens(room: LoadedScene) -> tuple[Query, Pose]:
@@ -88,12 +88,12 @@ def with_a_wrong_lens(room: LoadedScene) -> tuple[Query, Pose]:
     return replace(query, intrinsics=lens, photo_intrinsics=lens), pose
 
 
-def middle_of_a_wall(room: LoadedScene) -> Query:
+def middle_of_a_wall(room: LoadedScene, margin: float = 0.25) -> Query:
     """A small, flat part: a step aside is as good as a turn, a shorter distance as good as a longer lens."""
     query = photo_at(room, BEFORE_A_WALL)
     known = np.zeros(query.rgb.shape[:2], bool)
-    height, width = known.shape
-    known[height // 4 : -height // 4, width // 4 : -width // 4] = True
+    top, left = (int(margin * side) for side in known.shape)
+    known[top:-top, left:-left] = True
     return replace(query, valid_mask=known)
 
 

@@ -262,11 +262,9 @@ def test_the_scale_of_the_covariance_has_a_lower_bound_and_a_share() -> None:
         assert found is not None
         return found
 
-    usual, high, half, inflated = of(), of(min_variance_scale=0.9), of(variance_share=0.455), of(focal_inflation=5.0)
+    usual, high, half = of(), of(min_variance_scale=0.9), of(variance_share=0.455)
     assert np.allclose(high.covariance, 10 * usual.covariance)  # a photo of the frame itself is at the bound
     assert np.allclose(half.covariance, 0.5 * usual.covariance)
-    assert inflated.focal_sigma == pytest.approx(2 * usual.focal_sigma)
-    assert inflated.focal_step == usual.focal_step
 
 
 def test_the_result_of_a_refinement_saves_linearizing_anew() -> None:

@@ -64,7 +64,7 @@ OCCLUDERS = 2
 """Photos of each other scene that rectangles are cut from."""
 OTHER_DOUBTS = (
     Reason.FOCAL_UNCERTAIN,
-    Reason.INTRINSICS_INCONSISTENT,
+    Reason.INTRINSICS_CONTRADICTED,
     Reason.LOW_COVERAGE,
     Reason.POSITION_UNCERTAIN,
     Reason.AMBIGUOUS,

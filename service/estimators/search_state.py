@@ -43,7 +43,7 @@ from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import Query
 
 Result = TypeVar("Result")
-CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_INCONSISTENT)
+CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
 """Doubts about a pose at which photo and render agree: another search would find the same."""
 
 

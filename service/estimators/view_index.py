@@ -5,18 +5,18 @@
     -> refine photometrically on a small render, then on larger ones
     -> verification gate -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
-At first a small copy of the photo is compared, unless its focal length is approximate. Only if the gate refuses the
-answer costlier stages follow: the photo in its full size, rotated as its corners suggest; larger still, with further
-views; then poses sampled near views. From a prior pose refinement is tried first; where that fails, a render at the
-prior pose is the first candidate view of the first search, if that is of the upright photo. `SearchConfig` says where
-sizes and thresholds come from.
+At first a small copy of the photo is compared, rotated as its corners suggest if no view is much like it. Only if the
+gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; then poses
+sampled near views. From a prior pose refinement is tried first; where that fails, a render at the prior pose is the
+first candidate view of the first search, if that is of the upright photo. `SearchConfig` says where sizes and
+thresholds come from.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -102,20 +102,19 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     has_cameras = bool(state.tools.scene.cameras)
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
     variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
-    first = True
-    if not state.images.query.lens_prior:  # estimating the focal length needs many matches
-        small = variant.scaled(config.small_photo_factor)
-        views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
-        yield Stage(_search_views("retrieve", small, deque(views), state, try_prior_view=True), small, tentative=True)
-        first = False
-    # Not before: comparing rotations costs as much as a search.
-    variant = retrieval.rotated_variant(variant)
-    views = top_indices(retrieval.scores(variant), options.candidates)
-    rotated = variant.roll_steps_45deg != 0
-    name = "retrieve_rotated" if rotated else "retrieve" if first else "retrieve_full_size"
+    small = retrieval.rotated_variant(variant.scaled(config.small_photo_factor))
+    views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
+    rotated = small.roll_steps_45deg != 0
+    name = "retrieve_rotated" if rotated else "retrieve"
     # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
-    prior_view = first and not rotated
-    yield Stage(_search_views(name, variant, deque(views), state, try_prior_view=prior_view), variant)
+    yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small, tentative=True)
+    # A rotation that the small photo shows is the large one's, too.
+    variant = (
+        replace(variant, roll_steps_45deg=small.roll_steps_45deg) if rotated else retrieval.rotated_variant(variant)
+    )
+    views = top_indices(retrieval.scores(variant), options.candidates)
+    name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
+    yield Stage(_search_views(name, variant, deque(views), state), variant)
     variant = variant.scaled(config.large_photo_factor)
     ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])

@@ -22,7 +22,6 @@ _RENAMED_REASONS = {
     "agrees": Reason.VERIFIED,
     "render_disagrees": Reason.RENDER_MISMATCH,
     "little_scene_in_view": Reason.LOW_COVERAGE,
-    "intrinsics_contradicted": Reason.INTRINSICS_INCONSISTENT,
     "place_uncertain": Reason.POSITION_UNCERTAIN,
 }
 
@@ -108,8 +107,8 @@ def _verdict(result: dict[str, Any], intrinsics: Intrinsics) -> Verdict:
         result["agreement"],
         result["coverage"],
         _covariance(result["covariance"]),
-        (result["focal_sigma_px"] or 0.0) / intrinsics.fx,
-        result["signals"],
+        focal_sigma=(result["focal_sigma_px"] or 0.0) / intrinsics.fx,
+        signals=result["signals"],
     )
 
 

@@ -29,7 +29,7 @@ from service.photos.camera_identity import CameraIdentity, identity_from_exif
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
-from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
+from service.types import Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,8 +140,7 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
         if valid_mask is not None:
             inside = inside & (undistorted(valid_mask.astype(np.uint8), camera)[0] > 0)
         valid_mask = inside
-    lens_prior = None if intrinsics.trust == "exact" else LENS_PRIORS[source]
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask, lens_prior)
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask)
 
 
 def encode_image(

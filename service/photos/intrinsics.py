@@ -212,6 +212,7 @@ def undistorted_points(photo_px: Float32[np.ndarray, "n 2"], intrinsics: Intrins
         square = undistorted_radius**2
         slope = np.maximum(1.0 + 3.0 * k1 * square, 0.1)
         undistorted_radius -= (undistorted_radius * (1.0 + k1 * square) - radius) / slope
+        undistorted_radius = np.clip(undistorted_radius, 0.0, 3.0 * radius)
     factor = np.where(radius > 1e-9, undistorted_radius / np.maximum(radius, 1e-9), 1.0)
     return (centre + focal * distorted * factor[:, None]).astype(np.float32)
 

@@ -24,7 +24,7 @@ FOCAL, K1, SHIFT = 0, 1, slice(2, 4)
 class CorrectionBounds:
     """Largest components of a correction: one that goes further has diverged."""
 
-    log_focal: float = 1.6
+    log_focal: float = 2.3
     k1: float = 0.4
     shift: float = 0.35
 

@@ -26,8 +26,10 @@ from service.types import Intrinsics, IntrinsicsCorrection, LensPrior, Pose
 class LensSearchConfig:
     log_step: float = 0.4
     """Between two assumed values of log focal: refinement converges from half of it."""
-    reach_scales: float = 2.5
-    """Half width of the values that are tried, in scales of the prior; one step at least."""
+    reach_scales: float = 2.0
+    reach_scales_longer: float = 4.0
+    """How far values are tried on either side, in scales of the prior; one step at least. Lenses of 200 mm and digital
+    zoom are met, and wider ones than half of a usual one are not."""
     error_factor: float = 2.0
     """Inlier threshold of PnP-RANSAC, times that of the refined pose: focal length and distortion are still off."""
     trials: int = 200
@@ -92,8 +94,13 @@ def absolute_pose_unknown_lens(
 
 def _focal_ladder(prior: LensPrior, config: LensSearchConfig) -> Float64[np.ndarray, "n"]:
     """Return the values of log focal that are tried, nearest to the prior's centre first, the longer of two first."""
-    steps = max(1, int(config.reach_scales * prior.log_focal_scale / config.log_step))
-    return config.log_step * np.array([0, *(sign * step for step in range(1, steps + 1) for sign in (1, -1))])
+    shorter, longer = (
+        max(1, int(reach * prior.log_focal_scale / config.log_step))
+        for reach in (config.reach_scales, config.reach_scales_longer)
+    )
+    # A stable sort by distance: the longer of two comes first.
+    steps = sorted([*range(longer + 1), *range(-1, -shorter - 1, -1)], key=abs)
+    return config.log_step * np.array(steps)
 
 
 def _with_crop(

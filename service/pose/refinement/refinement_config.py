@@ -50,12 +50,30 @@ class UncertaintyConfig:
     variance_share: float = 0.91
     """Times the jackknife's variance scale: what three quarters fit, the jackknife can't see; were all quarters alike
     it would be 3/4. With it the mean normalized error squared of those scenes is 4.3, 6.0 and 7.7, of six expected."""
-    focal_inflation: float = 2.5
-    """Times the standard deviation of the focal length from the cells' residuals."""
-    suspicious_focal_step: float = 0.004
-    """Of log focal: from this step on an exact focal length is estimated after all, to measure how far off it is."""
-    free_focal_sigma: float = 0.15
-    """Prior standard deviation of log focal in that test."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensTestConfig:
+    """When intrinsics that were given as exact are tested, and when they are contradicted."""
+
+    log_focal_scale: float = 0.3
+    k1_sigma: float = 0.2
+    principal_point_scale: float = 0.2
+    """Of the prior while they are free: wide, for wrong ones may be off by any amount."""
+    suspicious_deg: float = 0.5
+    suspicious_share: float = 0.002
+    """Predicted motion of the pose (degrees; share of the median depth) from which on they are refined."""
+    contradicting_deg: float = 1.25
+    contradicting_share: float = 0.0025
+    """Motion of the pose beyond which wrong intrinsics matter: about half of what counts as right where the scene is
+    two to three times as far away as its training cameras' focus."""
+    max_untested_share: float = 0.004
+    """Standard deviation of the position, as a share of the median depth, where the pixels can't tell."""
+    max_loss_ratio: float = 0.96
+    """Residual that is left, at most, if the given intrinsics are wrong."""
+    max_steps: int = 24
+    settled_px: float = 0.02
+    """Of that refinement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +82,7 @@ class RefinementConfig:
 
     pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     uncertainty: UncertaintyConfig = field(default_factory=UncertaintyConfig)
+    lens_test: LensTestConfig = field(default_factory=LensTestConfig)
     weighting: Literal["l1", "least_squares"] = "l1"
     """IRLS weights 1 / max(|r|, l1_floor), or the same weight 1 / l1_floor for all."""
     l1_floor: float = 0.02

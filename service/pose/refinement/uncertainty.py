@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -12,6 +12,7 @@ from service.interfaces import Frame
 from service.pose.absolute_pose.lens_prior import prior_precision
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale, scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
+from service.pose.refinement.lens_test import LensFit, fit_lens
 from service.pose.refinement.photometric import RefinementResult
 from service.pose.refinement.pyramid_level import (
     CORRECTION,
@@ -22,7 +23,7 @@ from service.pose.refinement.pyramid_level import (
     linearized_levels,
 )
 from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
-from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior
+from service.types import NO_CORRECTION, Camera, LensPrior
 
 FOCAL = CORRECTION.start
 """Place of log focal in the vector of unknowns."""
@@ -34,10 +35,12 @@ class PoseUncertainty:
     """The right twist (rad, scene units) by which refinement would still move the pose: refined = pose @ exp(twist)."""
     covariance: Float64[np.ndarray, "k k"]
     """Of the right twist, true = pose @ exp(twist); with an approximate camera also of its `correction_vector`."""
-    focal_step: float
-    """By how much the logarithm of the focal length would change if it were free..."""
-    focal_sigma: float
-    """...and the standard deviation of that; infinite where the pixels don't determine it."""
+    given_lens: Float64[np.ndarray, "6 6"] | None = None
+    """Covariance of the twist if the intrinsics were known; None: they are."""
+    focal_step: float = 0.0
+    """By how much the logarithm of an approximate focal length would still change."""
+    lens_fit: LensFit | None = None
+    """Of exact intrinsics: others that fit the photo, where these would move the pose; None: there are none."""
 
 
 def pose_uncertainty(
@@ -68,16 +71,29 @@ def pose_uncertainty(
     # The level of a refinement has the photo as it is, else photo and camera are corrected already.
     correction = result.correction if result and final else NO_CORRECTION
     state = RefinementState(before, correction, None, photometric.copy())
-    if not np.isfinite(minimize(level, state, config.settled_px, config)):
+    loss = minimize(level, state, config.settled_px, config)
+    if not np.isfinite(loss):
         return None
     last_step = se3_log(before @ np.linalg.inv(state.photo_from_render))
     scores, hessians, scale = _scores(level, state, frame, config)
-    hessian = hessians.sum(0)
-    covariance = _covariance(hessian, scale, lens_prior, correction)
+    hessian, score = hessians.sum(0), scores.sum(0)
+    if lens_prior is None:
+        covariance = _covariance(hessian[:FOCAL, :FOCAL], scale)
+        if covariance is None:
+            return None
+        lens_fit = fit_lens(level, state, score, hessian, loss, config)
+        if lens_fit and not lens_fit.contradicts:
+            # The pixels can't tell whether the given intrinsics are right.
+            covariance = covariance + np.outer(lens_fit.untested, lens_fit.untested)
+        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit)
+    # A prior is information: added before the photometric parameters are marginalized.
+    information = hessian.copy()
+    information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(lens_prior, correction))
+    covariance = _covariance(information, scale)
     if covariance is None:
         return None
-    focal_step, focal_error = _focal(level, state, scores, hessian, lens_prior, config)
-    return PoseUncertainty(last_step, covariance, focal_step, focal_error)
+    given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
+    return PoseUncertainty(last_step, covariance, given_lens, _focal_step(hessian, score))
 
 
 def _scores(
@@ -96,49 +112,18 @@ def _scores(
     return scores, hessians, uncertainty.variance_share * max(found, uncertainty.min_variance_scale)
 
 
-def _focal(
-    level: PyramidLevel,
-    state: RefinementState,
-    scores: Float64[np.ndarray, "cells 14"],
-    hessian: Float64[np.ndarray, "14 14"],
-    lens_prior: LensPrior | None,
-    config: RefinementConfig,
-) -> tuple[float, float]:
-    """Return the step of log focal, were it free, and its standard deviation."""
-    uncertainty = config.uncertainty
-    inverse = inverse_spd(hessian[: FOCAL + 1, : FOCAL + 1])
-    if inverse is None:  # a flat wall seen straight on doesn't determine it
-        return 0.0, np.inf
-    focal_step = float((inverse @ scores.sum(0)[: FOCAL + 1])[-1])
-    if not lens_prior and abs(focal_step) > uncertainty.suspicious_focal_step:
-        # From a pose that makes up for a wrong focal length one step leads only a fifth of the way.
-        prior = LensPrior(uncertainty.free_focal_sigma)
-        free = replace(state, prior=prior, photometric=state.photometric.copy())
-        minimize(level, free, config.settled_px, config)
-        focal_step = float(np.log(free.correction.focal_factor))
-    # A wrong focal length makes residuals that are correlated over quarters, so only the cells' scatter is used here.
-    sigma = uncertainty.focal_inflation * float(np.linalg.norm(scores[:, : FOCAL + 1] @ inverse[-1]))
-    return focal_step, sigma
+def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray, "14"]) -> float:
+    """Return the step of log focal, distortion and pose free; 0 where the pixels don't determine it."""
+    free = FOCAL + 2
+    inverse = inverse_spd(hessian[:free, :free])
+    return 0.0 if inverse is None else float((inverse @ score[:free])[FOCAL])
 
 
-def _covariance(
-    hessian: Float64[np.ndarray, "14 14"],
-    scale: float,
-    lens_prior: LensPrior | None,
-    correction: IntrinsicsCorrection,
-) -> Float64[np.ndarray, "k k"] | None:
-    """Return the covariance of the twist, with an approximate camera also of its correction.
+def _covariance(information: Float64[np.ndarray, "n n"], scale: float) -> Float64[np.ndarray, "k k"] | None:
+    """Return the covariance of the twist and, if it is among the unknowns, the correction.
 
     The photometric parameters are marginalized. None if it isn't positive definite.
     """
-    if not np.isfinite(scale):
-        return None
-    if lens_prior is None:
-        found = inverse_spd(hessian[:FOCAL, :FOCAL])
-        return None if found is None else scale * found[TWIST, TWIST]
-    information = hessian / scale
-    # A prior is information: added before the photometric parameters are marginalized.
-    information[CORRECTION, CORRECTION] += np.diag(prior_precision(lens_prior, correction))
-    keep = np.r_[TWIST, CORRECTION]
-    found = inverse_spd(information)
-    return None if found is None else found[np.ix_(keep, keep)]
+    found = inverse_spd(information) if np.isfinite(scale) else None
+    keep = np.r_[TWIST, CORRECTION] if len(information) > FOCAL else np.r_[TWIST]
+    return None if found is None else scale * found[np.ix_(keep, keep)]

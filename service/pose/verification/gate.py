@@ -15,7 +15,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
 
 from service.pose.absolute_pose.prior_region import inside_prior
 from service.pose.features.query_images import QueryImages
@@ -28,7 +27,7 @@ from service.pose.verification.appearance import GLOBAL_SIGNALS, appearance, vis
 from service.pose.verification.gate_model import SHIPPED_MODEL, GateModel
 from service.pose.verification.signals import NO_MATCHES, geometry_signals, match_signals
 from service.results import Reason, Status, Verdict
-from service.types import Camera, LensPrior, Pose
+from service.types import Camera, Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +55,9 @@ class VerificationConfig:
     """Standard deviation of the position, relative to the distance to what is seen: six in seven such positions are
     within the bound of what is right (0.0125). Photos of the test scenes have 0.0002 to 0.002, cropped to an eighth
     0.01."""
-    max_focal_sigma: float = 0.008
-    """Of the logarithm of an estimated focal length: one that is 1 % off moves the camera by 1 % of the distance."""
-    focal_contradiction: float = 0.02
-    contradiction_sigmas: float = 3.0
-    """A given focal length is contradicted if another step would change its logarithm by more than the first, and by
-    more than this many standard deviations of that step (which `focal_inflation` enlarges)."""
+    max_focal_step: float = 0.008
+    """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
+    it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
     max_inlier_scale: float = 10.0
     """Inliers of a partly invalid photo are scaled up to those of a whole one, at most by this factor."""
 
@@ -88,19 +84,19 @@ def verify(
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification.
     if pixels_may_decide and photometric_suffices(signals, config):
-        verdict = verdict_of(signals, uncertainty, query.lens_prior, config=config)
+        verdict = verdict_of(signals, uncertainty, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
     few = len(features.scores) < config.min_features
     # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
-        return verdict_of(signals | NO_MATCHES, uncertainty, query.lens_prior, few, config)
+        return verdict_of(signals | NO_MATCHES, uncertainty, few, config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
-    return _within_prior(verdict_of(signals, uncertainty, query.lens_prior, few, config), images, pose)
+    return _within_prior(verdict_of(signals, uncertainty, few, config), images, pose)
 
 
 def _photometric_signals(
@@ -147,23 +143,15 @@ def downgraded(verdict: Verdict, reason: Reason, score: float = VERIFICATION.dou
 def verdict_of(
     signals: Mapping[str, float],
     uncertainty: PoseUncertainty | None,
-    lens_prior: LensPrior | None,
     few_features: bool = False,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
-    """Return the verdict on a pose with these signals.
-
-    `lens_prior` is the photo's; None: its intrinsics were given as exact.
-    """
+    """Return the verdict on a pose with these signals."""
     # The sum of the model could compensate for one bad signal; floors don't.
     doubtful = config.model.below_floor(signals)
     score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
-    doubt, covariance, sigma = _doubt_about_intrinsics(uncertainty, lens_prior, config)
     little = signals["coverage"] < config.min_coverage
-    if little:
-        doubt = Reason.LOW_COVERAGE
-    elif doubt is None and signals["sigma_share"] > config.max_sigma_share:
-        doubt = Reason.POSITION_UNCERTAIN
+    doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals["sigma_share"], uncertainty, config)
     if score < config.min_localized:
         reason = Reason.FEW_FEATURES if few_features else _reason_of_refusal(signals, doubtful, config)
         if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_MISMATCH):
@@ -173,8 +161,10 @@ def verdict_of(
     else:
         reason = Reason.VERIFIED
     inliers, correlation = int(signals.get("inliers", 0)), signals["gradients"]
-    status = _status(score, config)
-    return Verdict(status, reason, score, inliers, correlation, signals["coverage"], covariance, sigma, signals)
+    verdict = Verdict(
+        _status(score, config), reason, score, inliers, correlation, signals["coverage"], None, signals=signals
+    )
+    return verdict if uncertainty is None else _with_uncertainty(verdict, uncertainty)
 
 
 def _status(score: float, config: VerificationConfig) -> Status:
@@ -196,18 +186,34 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
     return Reason.FEW_INLIERS if matches < pixels else Reason.RENDER_MISMATCH
 
 
-def _doubt_about_intrinsics(
-    uncertainty: PoseUncertainty | None, lens_prior: LensPrior | None, config: VerificationConfig
-) -> tuple[Reason | None, Float64[np.ndarray, "6 6"] | None, float]:
-    """Return a doubt about the focal length, the pose's covariance, and the deviation of the focal length's log."""
+def _doubt_about_position(
+    sigma_share: float, uncertainty: PoseUncertainty | None, config: VerificationConfig
+) -> Reason | None:
+    """Return why the position may be wrong at a pose where photo and render agree; None if there is no reason."""
     if uncertainty is None:
-        return None, None, lens_prior.log_focal_scale if lens_prior else 0.0
+        return Reason.POSITION_UNCERTAIN if sigma_share > config.max_sigma_share else None
+    if uncertainty.lens_fit and uncertainty.lens_fit.contradicts:
+        return Reason.INTRINSICS_CONTRADICTED
+    if abs(uncertainty.focal_step) > config.max_focal_step:
+        return Reason.FOCAL_UNCERTAIN
+    if sigma_share <= config.max_sigma_share:
+        return None
+    if uncertainty.given_lens is None:
+        return Reason.POSITION_UNCERTAIN
+    # With known intrinsics the position would be certain: then they are what is missing.
+    known, unknown = (np.trace(matrix[3:6, 3:6]) for matrix in (uncertainty.given_lens, uncertainty.covariance))
+    is_known = sigma_share * np.sqrt(known / unknown) <= config.max_sigma_share
+    return Reason.FOCAL_UNCERTAIN if is_known else Reason.POSITION_UNCERTAIN
+
+
+def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict:
     # What another step would still change is an error, too: it adds its square.
-    covariance = uncertainty.covariance[:6, :6] + np.outer(uncertainty.last_step, uncertainty.last_step)
-    off = abs(uncertainty.focal_step)
-    if lens_prior:
-        # The step counts, too: a method may not have estimated the focal length at all.
-        sigma = max(float(np.sqrt(uncertainty.covariance[6, 6])), off)
-        return (Reason.FOCAL_UNCERTAIN if sigma > config.max_focal_sigma else None), covariance, sigma
-    contradicted = off > config.focal_contradiction and off > config.contradiction_sigmas * uncertainty.focal_sigma
-    return (Reason.INTRINSICS_INCONSISTENT if contradicted else None), covariance, 0.0
+    step, given_lens = np.outer(uncertainty.last_step, uncertainty.last_step), uncertainty.given_lens
+    fit = uncertainty.lens_fit
+    return replace(
+        verdict,
+        covariance=uncertainty.covariance[:6, :6] + step,
+        covariance_given_lens=None if given_lens is None else given_lens + step,
+        focal_sigma=0.0 if given_lens is None else float(np.sqrt(uncertainty.covariance[6, 6])),
+        fitting_correction=fit.correction if fit and fit.contradicts else None,
+    )

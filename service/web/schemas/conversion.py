@@ -179,7 +179,7 @@ def timing_out(timing: StageTiming) -> Timing:
 def result_out(result: JobResult) -> Result:
     """Convert a finished estimate. `decode` is the time to read the photo, `anchor` the scene's geo_anchor."""
     estimate, anchor = result.estimate, result.geo_anchor
-    verdict = estimate.verdict
+    verdict, fitting = estimate.verdict, estimate.verdict.fitting_correction
     return Result(
         status=verdict.status,
         reason=verdict.reason,
@@ -190,12 +190,16 @@ def result_out(result: JobResult) -> Result:
         geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
+        fitting_intrinsics=fitting and intrinsics_out(estimate.intrinsics.distorted(fitting)),
         focal_sigma_px=verdict.focal_sigma * estimate.intrinsics.fx if verdict.focal_sigma else None,
         inliers=verdict.inliers,
         gradient_correlation=verdict.gradient_correlation,
         coverage=verdict.coverage,
         signals=dict(verdict.signals),
         covariance=None if verdict.covariance is None else covariance_out(verdict.covariance),
+        covariance_given_lens=(
+            None if verdict.covariance_given_lens is None else covariance_out(verdict.covariance_given_lens)
+        ),
         timings=[timing_out(timing) for timing in (result.decode, *estimate.timings)],
         budget_exhausted=estimate.budget_exhausted,
         seed=estimate.seed,

@@ -146,6 +146,8 @@ class Result(Model):
     intrinsics_source: IntrinsicsSource
     """Where the intrinsics come from. Unless they are `exact`, focal length, radial distortion and principal point
     were then estimated together with the pose. `memory`: earlier photos of the same camera."""
+    fitting_intrinsics: IntrinsicsOut | None = None
+    """Of exact intrinsics that the photo contradicts (`reason` is `intrinsics_contradicted`): those that fit it."""
     focal_sigma_px: float | None
     """Standard deviation of the estimated focal length; null if it was given as exact."""
     inliers: int
@@ -158,6 +160,8 @@ class Result(Model):
     """Inputs of the verification's probability model, by name."""
     covariance: Covariance | None
     """Uncertainty of the pose; null if the photo does not determine it."""
+    covariance_given_lens: Covariance | None = None
+    """Uncertainty of the pose if the estimated intrinsics were the true ones; null if they were given as exact."""
     timings: list[Timing]
     """Time by stage, in order of the stages; `decode` is reading the photo."""
     budget_exhausted: bool
