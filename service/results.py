@@ -169,14 +169,20 @@ class Verdict:
     covariance: Float64[np.ndarray, "6 6"] | None
     """Of the right perturbation (rotation in rad, translation in units) in the camera frame:
     true = world_from_camera @ exp(twist). None if the evidence does not determine it."""
-    focal_sigma: float = 0.0
-    """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
+    correction_sigma: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    """Standard deviations of the estimated intrinsics, prior included: logarithm of the focal length, k1, principal
+    point (x, y) in long sides. 0 where they were given as exact."""
     covariance_given_lens: Float64[np.ndarray, "6 6"] | None = None
     """The covariance if the estimated intrinsics were the true ones; None where they were given as exact."""
     fitting_correction: IntrinsicsCorrection | None = None
     """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)
     """All signals that the gate measured, by name; `service/pose/verification/gate.py` describes them."""
+
+    @property
+    def focal_sigma(self) -> float:
+        """Standard deviation of the logarithm of the estimated focal length; 0 where it was given as exact."""
+        return self.correction_sigma[0]
 
 
 @dataclass(frozen=True, slots=True)

@@ -342,7 +342,7 @@ LENS_PRIORS: dict[IntrinsicsSource, LensPrior] = {
     "exif": LensPrior(0.06),
     "guessed": LensPrior(0.5, k1_sigma=0.1),
 }
-"""By the source of approximate intrinsics. EXIF is rounded to a millimetre, and its definition is ambiguous by 4 %."""
+"""By the source of approximate intrinsics; of EXIF where nothing more is known of the tag."""
 
 
 @dataclass(frozen=True, slots=True)

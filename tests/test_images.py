@@ -34,12 +34,17 @@ def gradient(width=80, height=60) -> np.ndarray:
     return np.stack([columns * 255 // (width - 1), rows * 255 // (height - 1), blue], -1).astype(np.uint8)
 
 
-def exif_with(orientation: int | None = None, focal_35mm: float | None = None) -> bytes:
+def exif_with(
+    orientation: int | None = None, focal_35mm: float | None = None, size: tuple[int, int] | None = None
+) -> bytes:
     exif = Image.Exif()
     if orientation is not None:
         exif[ExifTags.Base.Orientation] = orientation
     if focal_35mm is not None:
         exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = focal_35mm
+    if size is not None:
+        tags = exif.get_ifd(ExifTags.IFD.Exif)
+        tags[ExifTags.Base.ExifImageWidth], tags[ExifTags.Base.ExifImageHeight] = size
     return exif.tobytes()
 
 
@@ -75,7 +80,7 @@ class TestFormats:
         assert query.rgb.shape == (128, 96, 3)
         assert np.abs(query.rgb.astype(int) - expected).max() <= 6  # seen: 4
         assert query.intrinsics_source == "exif"
-        assert query.intrinsics.fx == pytest.approx(26 / 36 * 128)
+        assert query.intrinsics.fx == pytest.approx(between_definitions(26, 128))
 
     @pytest.mark.parametrize("mode", ["L", "P", "CMYK", "1", "LA", "RGBA"])
     def test_modes_become_rgb(self, mode):
@@ -270,13 +275,28 @@ def colmap_pixels(rays: np.ndarray, camera: Intrinsics) -> np.ndarray:
     return np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], 1)
 
 
+def between_definitions(focal_35mm: float, long_side: int) -> float:
+    """The focal length in pixels of a 4:3 photo, between those by the width (36 mm) and by the diagonal (43.27 mm)."""
+    by_width, by_diagonal = focal_35mm / 36 * long_side, focal_35mm / 43.2666 * 1.25 * long_side
+    return float(np.sqrt(by_width * by_diagonal))
+
+
 class TestFocalLength:
     def test_from_exif(self):
         query = read_query(encoded(Image.fromarray(gradient()), "JPEG", exif=exif_with(focal_35mm=27)))
         assert query.intrinsics_source == "exif"
-        assert query.intrinsics.fx == query.intrinsics.fy == pytest.approx(27 / 36 * 80)
+        assert query.intrinsics.fx == query.intrinsics.fy == pytest.approx(between_definitions(27, 80))
         assert (query.intrinsics.cx, query.intrinsics.cy) == (40, 30)
         assert query.warnings == ()
+
+    def test_a_crop_that_exif_betrays(self):
+        """Half of the width is left of what the camera stored: its focal length in pixels stays."""
+        query = read_query(encoded(Image.fromarray(gradient()), "JPEG", exif=exif_with(focal_35mm=27, size=(160, 60))))
+        whole = read_query(encoded(Image.fromarray(gradient()), "JPEG", exif=exif_with(focal_35mm=27)))
+        assert query.lens_prior is not None
+        assert whole.lens_prior is not None
+        assert query.intrinsics.fx == pytest.approx(27 / 36 * 160, rel=0.08)
+        assert query.lens_prior.principal_point_scale > 5 * whole.lens_prior.principal_point_scale
 
     @pytest.mark.parametrize("focal", [None, 0, 60000])
     def test_guessed_with_a_warning(self, focal):

@@ -107,7 +107,7 @@ def _verdict(result: dict[str, Any], intrinsics: Intrinsics) -> Verdict:
         result["agreement"],
         result["coverage"],
         _covariance(result["covariance"]),
-        focal_sigma=(result["focal_sigma_px"] or 0.0) / intrinsics.fx,
+        correction_sigma=((result["focal_sigma_px"] or 0.0) / intrinsics.fx, 0.0, 0.0, 0.0),
         signals=result["signals"],
     )
 

@@ -3,10 +3,8 @@
 JPEG, PNG, WebP and HEIC. The size is checked in the header before anything is decoded. Colour profiles are
 not applied: a phone's Display P3 comes out slightly paler, which gain and bias of the photometric refinement absorb.
 
-Focal lengths without calibration: EXIF's 35 mm equivalent f is taken as fx = f / 36 mm x long side. Makers
-who define it by the diagonal (43.27 mm) instead mean 4 % more on a 4:3 sensor and the same on a 3:2 one.
-Without EXIF, fx = 0.78 x long side: 28 mm, near the main camera of phones (24 to 28 mm), whose photos lose
-their EXIF in messengers.
+Focal lengths without calibration are EXIF's 35 mm equivalent (`exif_focal_prior`). Without EXIF, fx = 0.78 x long side:
+28 mm, near the main camera of phones (24 to 28 mm), whose photos lose their EXIF in messengers.
 """
 
 from __future__ import annotations
@@ -25,11 +23,11 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from service.errors import InvalidImage
-from service.photos.camera_identity import CameraIdentity, identity_from_exif
+from service.photos.camera_identity import CameraIdentity, exif_focal_prior, identity_from_exif
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
-from service.types import Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
+from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +55,8 @@ class DecodeConfig:
     """Alpha, of 255, from which on a pixel is valid."""
     default_focal: float = 0.78
     """In long sides; see the module's docstring."""
+    cropped_principal_point_scale: float = 0.1
+    """Scale of the principal point's prior, in long sides, of a photo that has another shape than its camera's."""
 
 
 DEFAULTS = DecodeConfig()
@@ -92,8 +92,7 @@ def read_query(
     """
     name, photo = _open(data)
     decoded = _decode(photo, name, background_rgb, long_side)
-    focal_mm = _identity(photo).focal_35mm if intrinsics is None else None
-    query = _query(decoded, focal_mm, intrinsics, prior)
+    query = _query(decoded, _identity(photo), intrinsics, prior)
     return query if lens_prior is None else replace(query, intrinsics_source="memory", lens_prior=lens_prior)
 
 
@@ -115,23 +114,21 @@ def query_of(
     return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, prior)
 
 
-def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | None, prior: Pose | None) -> Query:
+def _query(
+    decoded: _Decoded, identity: CameraIdentity | None, intrinsics: Intrinsics | None, prior: Pose | None
+) -> Query:
     """Choose the intrinsics (given, EXIF, default), scale them to the decoded image, and undistort it."""
-    warnings = list(decoded.warnings)
+    source: IntrinsicsSource = "given"
+    warnings, lens_prior = list(decoded.warnings), None
     if intrinsics is not None:
         require_size(intrinsics, decoded.width, decoded.height, decoded.upright_from_stored)
-        source: IntrinsicsSource = "given"
     else:
-        source = "exif" if focal_mm else "guessed"
-        if not focal_mm:
+        intrinsics, source, lens_prior = _assumed_intrinsics((decoded.width, decoded.height), identity)
+        if source == "guessed":
             warnings.append(
                 "The photo says nothing of its focal length; it is estimated with the pose, starting from 28 mm "
                 "(35 mm equivalent). Send intrinsics for an exact pose."
             )
-        long_side = max(decoded.width, decoded.height)
-        focal = focal_mm / 36.0 * long_side if focal_mm else DEFAULTS.default_focal * long_side
-        size = decoded.width, decoded.height
-        intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
     camera = decoded.camera(intrinsics)
     rgb, pinhole, inside = undistorted(decoded.rgb, camera)
     valid_mask = decoded.valid_mask
@@ -140,7 +137,23 @@ def _query(decoded: _Decoded, focal_mm: float | None, intrinsics: Intrinsics | N
         if valid_mask is not None:
             inside = inside & (undistorted(valid_mask.astype(np.uint8), camera)[0] > 0)
         valid_mask = inside
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask)
+    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask, lens_prior)
+
+
+def _assumed_intrinsics(
+    size: tuple[int, int], identity: CameraIdentity | None
+) -> tuple[Intrinsics, IntrinsicsSource, LensPrior]:
+    """Return the intrinsics of a photo that came without any: by EXIF's likeliest focal length, or the default."""
+    modes = exif_focal_prior(identity) if identity else ()
+    focal = max(size) * (float(np.exp(modes[0].log_focal)) if modes else DEFAULTS.default_focal)
+    source: IntrinsicsSource = "exif" if modes else "guessed"
+    prior = LENS_PRIORS[source]
+    if modes:
+        prior = replace(prior, log_focal_scale=modes[0].sigma)
+    if identity and identity.is_cropped:
+        prior = replace(prior, principal_point_scale=DEFAULTS.cropped_principal_point_scale)
+    intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, trust="approximate")
+    return intrinsics, source, prior
 
 
 def encode_image(

@@ -210,10 +210,12 @@ def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict
     # What another step would still change is an error, too: it adds its square.
     step, given_lens = np.outer(uncertainty.last_step, uncertainty.last_step), uncertainty.given_lens
     fit = uncertainty.lens_fit
+    # Exact intrinsics are no unknowns of the covariance.
+    sigmas = np.sqrt(uncertainty.covariance.diagonal()[6:]).tolist() or [0.0] * 4
     return replace(
         verdict,
         covariance=uncertainty.covariance[:6, :6] + step,
         covariance_given_lens=None if given_lens is None else given_lens + step,
-        focal_sigma=0.0 if given_lens is None else float(np.sqrt(uncertainty.covariance[6, 6])),
+        correction_sigma=(sigmas[0], sigmas[1], sigmas[2], sigmas[3]),
         fitting_correction=fit.correction if fit and fit.contradicts else None,
     )
