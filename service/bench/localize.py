@@ -121,11 +121,18 @@ def run(
     settings |= {"layout": bench_scene.layout, "background_rgb": list(bench_scene.background_rgb)}
     settings |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
     settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
-    scene, units = bench_scene.loaded.scene, bench_scene.units
-    facts = {"photos": len(bench_scene.photos), "training_cameras": len(bench_scene.training)}
-    facts |= {"gaussians": scene.count, "forward_facing": units.forward_facing}
-    facts |= {"units_per_scene_unit": units.units_per_scene_unit, "prepare_s": prepare_s}
-    return {"scene": scene.info.name, **settings, **facts, **summary(outcomes), "per_query": per_query}
+    facts = {"scene": bench_scene.loaded.scene.info.name, **settings, **_facts(bench_scene), "prepare_s": prepare_s}
+    return {**facts, **summary(outcomes), "per_query": per_query}
+
+
+def _facts(bench_scene: BenchScene) -> dict[str, Any]:
+    return {
+        "photos": len(bench_scene.photos),
+        "training_cameras": len(bench_scene.training),
+        "gaussians": bench_scene.loaded.scene.count,
+        "forward_facing": bench_scene.units.forward_facing,
+        "units_per_scene_unit": bench_scene.units.units_per_scene_unit,
+    }
 
 
 @dataclass(frozen=True, slots=True)
