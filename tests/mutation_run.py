@@ -5,7 +5,7 @@
 Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/, all kinds alike, is applied in a
 copy of the last commit, and the tests that run its line are started until one fails. Which those are is measured first,
 by one run of all tests (some ten minutes), and kept beside the output. Compiled kernels and processes of their own
-can't be measured: they have the test files that name the module, then those of the modules that import it, else all. A
+can't be measured: they have the test files that name the module, then those of the modules that import it, then all. A
 failing test counts if it passes without the mutant; one that does not end within the limit has not noticed anything.
 
 The output has a line of JSON for each mutant; a run that was stopped goes on where it was. A mutant that changes
@@ -104,7 +104,10 @@ def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]
     if not tests:
         importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
         yield sorted(near)
-        yield sorted(importing - near) if importing else ["tests"]
+        yield sorted(importing - near)
+        # What only an import runs, such as a default in a model of the API, may show anywhere.
+        everything = {f"tests/{path.name}" for path in (copy / "tests").glob("test_*.py")}
+        yield sorted(everything - near - importing)
     elif len(tests) <= FEW:
         yield tests
     else:
