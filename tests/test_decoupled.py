@@ -10,7 +10,7 @@ from service.pose.absolute_pose.decoupled import MatchedPoints, least_squares_so
 from service.pose.descent.contribution_pruning import contributions, prune
 from service.pose.descent.decoupled_gradient import angle_loss, gradient_solve, length_loss
 from service.pose.descent.hypotheses import around, even_points
-from service.pose.descent.losses import LOSSES, loss_against
+from service.pose.descent.losses import LOSSES, LossConfig, loss_against
 from service.pose.features.scene_focus import Focus, focus_of_scene
 from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
@@ -205,6 +205,31 @@ class TestLosses:
         assert values["corner"] == pytest.approx(0.01 + 7.5e-5 * 0.01 * 4 * 13 * 13 * 3, rel=1e-3)
         # Blurred with sigma 1.25; only the border, which sees zeros outside, lies below 0.1.
         assert 0.01 * 1.8 * 0.97 < values["blur"] < 0.01 * 1.8
+
+    @pytest.mark.parametrize(("contrast", "squares"), [(0.08, 1), (0.12, 2)])
+    def test_corners_of_a_hundredth_of_the_best_ones_response_count(self, contrast: float, squares: int) -> None:
+        """The response is quadratic in contrast: 0.0064 and 0.0144 of the best corner's."""
+        photo = np.zeros((200, 200, 3), np.uint8)
+        photo[20:80, 20:80], photo[120:180, 120:180] = 255, round(contrast * 255)
+        value, _ = loss_against("corner", photo)(photo.astype(np.float32) / 255 + np.float32(0.1))
+        assert value == pytest.approx(0.01 + 7.5e-5 * 0.01 * 4 * squares * 13 * 13 * 3, rel=1e-3)
+
+    @pytest.mark.parametrize(("side", "corners"), [(16, 4), (8, 1)])
+    def test_corners_nearer_than_10_px_to_another_do_not_count(self, side: int, corners: int) -> None:
+        photo = np.zeros((200, 200, 3), np.uint8)
+        photo[90 : 90 + side, 90 : 90 + side] = 255
+        value, _ = loss_against("corner", photo)(photo.astype(np.float32) / 255 + np.float32(0.1))
+        assert value == pytest.approx(0.01 + 7.5e-5 * 0.01 * corners * 13 * 13 * 3, rel=1e-3)
+
+    @pytest.mark.parametrize(("columns", "counted"), [(12, 4 * 48), (13, 200)])
+    def test_of_more_than_200_corners_the_best_count(self, columns: int, counted: int) -> None:
+        """Squares of 30 px, in rows 60 px apart; no two corners share a pixel of their kernels (13 px at 200)."""
+        photo = np.zeros((4 * 60, columns * 60, 3), np.uint8)
+        for x, y in np.ndindex(columns, 4):
+            photo[60 * y + 15 : 60 * y + 45, 60 * x + 15 : 60 * x + 45] = 255
+        config = LossConfig(reference_px=4 * columns * 60)
+        value, _ = loss_against("corner", photo, config=config)(photo.astype(np.float32) / 255 + np.float32(0.1))
+        assert value == pytest.approx(0.01 + 7.5e-5 * 0.01 * counted * 13 * 13 * 3, rel=1e-3)
 
     def test_an_unknown_one_is_refused(self) -> None:
         with pytest.raises(UnknownName, match="l1, l2, relative, feature, corner, blur"):

@@ -168,6 +168,20 @@ def test_poses_near_views_approach_their_target_by_a_share_of_the_way() -> None:
     assert 5.9 < max(distances) <= 6.0
 
 
+@pytest.mark.parametrize("distance", [0.5, 4.0])
+def test_poses_near_views_stand_aside_in_proportion_to_the_distance(distance: float) -> None:
+    here = look_at(np.array([distance, 0.0, 0.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    config = NearViewConfig(approach=(0.0, 0.0), lateral_share=0.1)
+    view = view_at(here, np.zeros((1, 3)))
+    poses = poses_near_views([view], np.ones(1), 0.0, 400, np.random.default_rng(0), config)
+    aside = np.array([pose.position_in_world for pose in poses]) - here.position_in_world
+    # Of 400 samples a standard deviation is known to 4 %.
+    assert aside.std(axis=0) == pytest.approx(3 * [0.1 * distance], rel=0.15)
+    # They look at the target still.
+    off_axis = [np.cross(pose.axis_in_world, pose.position_in_world) for pose in poses]
+    assert np.abs(off_axis).max() < 1e-9
+
+
 def test_hypotheses_without_range_are_their_parents_in_turn() -> None:
     other = moved(TRUTH, np.array([0.1, 0, 0, 0, 0.2, 0]))
     poses = around([TRUTH, other], FOCUS, 0.0, 0.0, 5, np.random.default_rng(0))

@@ -12,6 +12,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from test_images import COLMAP_PARAMETERS
 
 from service.errors import CorruptScene, SceneError, SceneNotFound, UnsupportedFormat
 from service.geometry import look_at, quat_from_rotation, se3_exp, so3_exp
@@ -584,6 +585,27 @@ class TestColmap:
         expected = np.eye(4)
         expected[:3, :3], expected[:3, 3] = so3_exp(np.array([0.3, 0, 0])), [1, 2, 3]
         assert np.allclose(b.camera.pose.camera_from_world, expected)
+
+    @pytest.mark.parametrize("kind", ["txt", "bin"])
+    def test_every_model_of_colmap(self, tmp_path, kind):
+        """One after the other in one file: a wrong number of parameters would spoil the next camera."""
+        folder = colmap_folder(tmp_path, kind) / "sparse" / "0"
+        cameras, images, known = b"", b"", []
+        for number, (model, listed) in enumerate(COLMAP_PARAMETERS.items()):
+            given = {"f": 700 + number, "fx": 710 + number, "fy": 720 + number, "cx": 390 + number, "cy": 290 + number}
+            values = [given.get(name, 0.25) for name in listed.split(", ")]
+            if kind == "txt":
+                cameras += f"{number} {model} 800 600 {' '.join(map(str, values))}\n".encode()
+                images += f"{number} 1 0 0 0 0 0 0 {number} {number:02}.jpg\n\n".encode()
+            else:
+                cameras += struct.pack(f"<iiQQ{len(values)}d", number, number, 800, 600, *values)
+                images += struct.pack("<i7di", number, 1, *[0.0] * 6, number) + f"{number:02}.jpg\0".encode() + bytes(8)
+            focals = ("f", "f") if listed.startswith("f,") else ("fx", "fy")
+            known.append(Intrinsics(800, 600, *(float(given[name]) for name in (*focals, "cx", "cy"))))
+        head = struct.pack("<Q", len(known)) if kind == "bin" else b""
+        (folder / f"cameras.{kind}").write_bytes(head + cameras)
+        (folder / f"images.{kind}").write_bytes(head + images)
+        assert [named.camera.intrinsics for named in load_scene(tmp_path).cameras] == known
 
     def test_transforms_win(self, tmp_path):
         folder = colmap_folder(tmp_path, "bin")

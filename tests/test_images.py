@@ -3,7 +3,7 @@
 import struct
 import time
 import zlib
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from io import BytesIO
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from PIL import ExifTags, Image, ImageOps
 from service.errors import InvalidImage, InvalidIntrinsics
 from service.photos import images
 from service.photos.images import photo_size, read_query
-from service.photos.intrinsics import intrinsics_from, undistorted
+from service.photos.intrinsics import DISTORTION_COUNTS, intrinsics_from, undistorted
 from service.types import Intrinsics, Pose
 
 DATA = Path(__file__).parent / "data"
@@ -279,6 +279,44 @@ def between_definitions(focal_35mm: float, long_side: int) -> float:
     """The focal length in pixels of a 4:3 photo, between those by the width (36 mm) and by the diagonal (43.27 mm)."""
     by_width, by_diagonal = focal_35mm / 36 * long_side, focal_35mm / 43.2666 * 1.25 * long_side
     return float(np.sqrt(by_width * by_diagonal))
+
+
+COLMAP_PARAMETERS = {
+    "SIMPLE_PINHOLE": "f, cx, cy",
+    "PINHOLE": "fx, fy, cx, cy",
+    "SIMPLE_RADIAL": "f, cx, cy, k",
+    "RADIAL": "f, cx, cy, k1, k2",
+    "OPENCV": "fx, fy, cx, cy, k1, k2, p1, p2",
+    "OPENCV_FISHEYE": "fx, fy, cx, cy, k1, k2, k3, k4",
+    "FULL_OPENCV": "fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, k5, k6",
+    "FOV": "fx, fy, cx, cy, omega",
+    "SIMPLE_RADIAL_FISHEYE": "f, cx, cy, k",
+    "RADIAL_FISHEYE": "f, cx, cy, k1, k2",
+    "THIN_PRISM_FISHEYE": "fx, fy, cx, cy, k1, k2, p1, p2, k3, k4, sx1, sy1",
+}
+"""Camera models by their number -> their parameters, as `src/colmap/sensor/models.h` of COLMAP lists them."""
+WITHOUT = {"FOV", "THIN_PRISM_FISHEYE"}
+"""Models that photos can't have here."""
+
+
+class TestCameraModels:
+    def test_all_are_known(self):
+        assert set(DISTORTION_COUNTS) == set(COLMAP_PARAMETERS) - WITHOUT
+
+    @pytest.mark.parametrize("model", [m for m in COLMAP_PARAMETERS if m not in WITHOUT])
+    def test_each_takes_the_distortion_parameters_of_colmap(self, model):
+        names = COLMAP_PARAMETERS[model].split(", ")
+        count = len(names) - names.index("cy") - 1
+        given = {"width": 80, "height": 60, "fx": 50, "fy": 50, "cx": 40, "cy": 30, "model": model}
+        camera = intrinsics_from(given | {"distortion": [0.001] * count})
+        assert (camera.model, camera.distortion) == (model, (0.001,) * count)
+        for wrong in {count - 1, count + 1} - {-1}:
+            with pytest.raises(InvalidIntrinsics, match=f"has {count} parameters .* here are {wrong}") as caught:
+                intrinsics_from(given | {"distortion": [0.001] * wrong})
+            assert caught.value.where == "distortion"
+        one_focal = names[0] == "f"
+        with pytest.raises(InvalidIntrinsics, match="one focal length") if one_focal else nullcontext():
+            intrinsics_from(given | {"fy": 51, "distortion": [0.001] * count})
 
 
 class TestFocalLength:

@@ -61,6 +61,15 @@ def test_other_scenes_are_put_around(room: GaussianScene) -> None:
         large_scenes.surround_with_copies(room, 10)
 
 
+def test_a_scene_of_just_the_count_gets_no_copies(room: GaussianScene) -> None:
+    alone = large_scenes.surround_with_copies(room, COUNT)
+    assert np.array_equal(alone.means, room.means)
+    assert alone.cameras == room.cameras
+    assert large_scenes.surround_with_copies(room, COUNT + 1).count == COUNT + 1
+    with pytest.raises(ValueError, match="more than"):
+        large_scenes.surround_with_copies(room, COUNT - 1)
+
+
 def test_the_most_contributing_gaussians_are_kept(room: GaussianScene) -> None:
     rasterizer = CpuRasterizer(room)
     half = large_scenes.keep_most_contributing(room, COUNT // 2, rasterizer)

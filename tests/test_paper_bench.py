@@ -18,8 +18,10 @@ from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, estimate, folder
 
 from service.bench import localize as bench
 from service.bench.paper import claims, plan, report, runs, tables
+from service.bench.pose_metrics import COARSE, Outcome
 from service.errors import InvalidRequest, UnknownName
 from service.geometry import moved
+from service.results import Status
 
 ROOT = Path(__file__).parents[1]
 
@@ -328,6 +330,49 @@ class TestReport:
     def test_nothing_to_report(self, scene):
         with pytest.raises(InvalidRequest, match="no results"):
             report.write(asked_for(scene), scene.parent / "page")
+
+
+@pytest.mark.parametrize(
+    ("degrees", "units"), [(5, 0.05), (np.nextafter(5, 6), 0.05), (5, np.nextafter(0.05, 1)), (0, 0)]
+)
+def test_the_curves_count_what_the_tables_count(degrees, units):
+    from service.bench.paper.illustrations import _share_curve
+
+    counted = Outcome(Status.LOCALIZED, degrees, units, 0, 0).success(COARSE)
+    assert _share_curve([[(0, degrees, units)]]) == ([0], [float(counted)])
+
+
+def test_figure_4_has_each_starts_own_curves_by_method(monkeypatch):
+    from service.bench.paper import illustrations
+
+    right, wrong = [(0, 1, 0.01)], [(0, 90, 1)]
+    lines = [
+        {"protocol": "easy", "method": "icomma", "curve": right},
+        {"protocol": "easy", "method": "icomma", "curve": wrong},
+        {"protocol": "easy", "method": "inerf"},
+        {"protocol": "hard", "method": "icomma", "curve": wrong},
+        {"protocol": "hard", "method": "inerf", "curve": right},
+        {"protocol": "other", "method": "inerf", "curve": right},
+        {"protocol": "easy", "method": "another", "curve": right},
+    ]
+    monkeypatch.setattr(illustrations.figures, "shares_by_step", lambda panels: panels)
+    assert illustrations.figure_4(lines) == {
+        "start 'easy'": {"icomma": ([0.0], [0.5], 2)},
+        "start 'hard'": {"inerf": ([0.0], [1.0], 1), "icomma": ([0.0], [0.0], 1)},
+    }
+    assert illustrations.figure_4(lines[2:3]) is None
+
+
+def test_the_query_that_most_methods_answered_is_shown():
+    from service.bench.paper.illustrations import _most_answered
+
+    def line(study: str, photo: str, method: str) -> dict:
+        return {"study": study, "photo": photo, "trial": 0, "method": method}
+
+    often = [line("table3", "a", "icomma"), line("table3", "a", "inerf"), line("table2", "a", "another")]
+    shown = [line("table2", "b", "icomma"), line("table2", "b", "inerf")]
+    assert _most_answered([line("table2", "a", "icomma"), *often, *shown]) == {"icomma": shown[0], "inerf": shown[1]}
+    assert _most_answered(often) == {}
 
 
 def test_the_share_below_the_bound_by_step():

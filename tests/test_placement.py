@@ -11,11 +11,12 @@ from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
 from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
-from service.pose.retrieval.free_space import _steps_in_the_clear
+from service.pose.retrieval.free_space import _steps_in_the_clear, free_space_of
 from service.pose.retrieval.index import built_index
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, lod_proxy, occlusion_depths
 from service.pose.retrieval.view_placement import (
     PlacementConfig,
+    _Views,
     coverage,
     find_views,
     floaters,
@@ -86,6 +87,30 @@ def test_pixels_show_single_opaque_surfaces() -> None:
     assert not shows_single_surface(Frame(rgb, 0.6 * ones, 2 * ones, 2 * ones), 0.5).any()
 
 
+@pytest.mark.parametrize(
+    ("enclosures", "good", "interior"),
+    [
+        # Half of the best view's share of solid pixels is enough; a view of nothing is not good where all are such.
+        ([0.0] * 5, [0, 1], False),
+        # Of solid views alone: the last ones' enclosure says nothing.
+        ([0.6, 0.6, 0.9, 0.9, 0.9], [0, 1], False),
+        ([1.0, 0.7, 0.9, 0.9, 0.9], [0, 1], True),
+        ([1.0, 0.5, 0.9, 0.9, 0.9], [0], True),
+        ([0.75, 0.45, 0.0, 0.0, 0.0], [0, 1], True),
+        ([0.75, 0.44, 0.0, 0.0, 0.0], [0], True),
+    ],
+)
+def test_good_views_by_hand(enclosures: list[float], good: list[int], interior: bool) -> None:
+    room = synthetic_room(500)
+    config = replace(FEW, score_quantile=1.0, enclosure_quantile=1.0)
+    views = _Views(free_space_of(room), CpuRasterizer(room), config)
+    views.scores, views._enclosures = [0.8, 0.4, 0.39, 0.1, 0.0], enclosures
+    assert views.good().tolist() == good
+    assert views.interior is interior
+    views.scores = [0.0] * 5
+    assert views.good().tolist() == []
+
+
 @pytest.mark.parametrize(("scale", "shift"), [(1.0, (0, 0, 0)), (0.01, (5, -3, 2)), (300.0, (1e4, 0, 0))])
 def test_a_closed_room_is_seen_from_inside_whatever_its_unit(scale, shift) -> None:
     room = closed_room()
@@ -139,6 +164,19 @@ def test_floaters_are_counted() -> None:
     assert floaters(walls) < 0.01
     haze = blobs(rng.uniform((-3, -3, 3), (3, 3, 9), (200, 3)), 0.02)
     assert floaters(joined(walls, haze)) == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(("spacing", "share"), [(0.8, 0.0), (1.5, 1.0)])
+def test_a_surface_has_more_than_eight_gaussians_in_three_twentieths_of_the_typical_distance(
+    spacing: float, share: float
+) -> None:
+    """A lattice in a plane, spaced in twentieths of the distance: 3 x 3 cells have 9 of its points or more, or 4."""
+    at = np.arange(0, 40, spacing) / 20 + 0.001
+    lattice = np.stack([*map(np.ravel, np.meshgrid(at, at)), np.full(at.size**2, 0.5)], 1)
+    # Seen from 1 unit, where 1.2 px of a focal length of 1000 px are 0.0012 units.
+    scene = blobs(lattice, 0.0012)
+    assert free_space_of(scene).distance == pytest.approx(1)
+    assert floaters(scene) == pytest.approx(share, abs=0.2)  # its rim has fewer
 
 
 def test_coverage_is_the_share_that_is_seen() -> None:

@@ -6,6 +6,7 @@ import io
 import json
 import threading
 import zipfile
+from contextlib import nullcontext
 from pathlib import Path
 
 import httpx
@@ -14,11 +15,12 @@ import pytest
 from api_server import assert_problem, create_app, finished, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
-from service.errors import BadInput
+from service.errors import BadInput, InvalidRequest, UnsupportedFormat
 from service.localize import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
-from service.scene_manager.scene_store import named_scenes
+from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.warm_up import overview
 from service.types import GaussianScene, GeoAnchor
 
@@ -143,6 +145,27 @@ def test_a_scene_in_use_is_not_dropped_for_another(stepping, folder):
         finished(client, held)
         assert client.post("/scenes/hall/load").status_code == 202
         until(lambda: states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready"}, 120)
+
+
+@pytest.mark.parametrize("unexpected", [False, True])
+def test_a_scene_that_fails_to_load_is_logged_and_a_bug_with_its_traceback(folder, monkeypatch, caplog, unexpected):
+    (folder / "attic" / "scene.ply").unlink()
+    if unexpected:
+        monkeypatch.setattr(LoadedScene, "load", lambda *_, **__: {}["a bug"])
+    scenes, entry = Scenes("view_index", None), Entry("attic", folder / "attic", required=True)
+    scenes.add(entry)
+    with caplog.at_level("ERROR"):
+        scenes.start()
+        until(lambda: entry.state == "failed")
+        scenes.close()
+    (logged,) = [record for record in caplog.records if "attic" in record.getMessage()]
+    assert bool(logged.exc_info) is unexpected
+    # Clients learn neither the operator's folders nor the bug.
+    told = entry.status().failure
+    assert told is not None
+    assert (told.code, told.where) == (("internal_error", "") if unexpected else ("scene_not_found", "attic"))
+    assert str(folder) not in told.message
+    assert "a bug" not in told.message
 
 
 def test_unloading_waits_for_the_jobs_and_lets_no_new_one_in(stepping, folder):
@@ -275,6 +298,36 @@ def test_an_archives_names_cannot_leave_the_folder(uploading, name):
     assert not (stored.parent.parent / "evil.ply").exists()
 
 
+@pytest.mark.parametrize(("length", "kept"), [(255, True), (256, False)])
+def test_names_in_an_archive_may_be_as_long_as_those_of_files(tmp_path, length, kept):
+    store = FolderSceneStore([], tmp_path, 10**6)
+    # Two bytes a letter: file systems count bytes.
+    name = f"{'é' * ((length - 4) // 2)}{'e' * (length % 2)}.ply"
+    assert len(name.encode()) == length
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as opened:
+        opened.writestr(name, ply())
+    with (
+        store.draft("house") as draft,
+        nullcontext() if kept else pytest.raises(UnsupportedFormat, match="no scene file"),
+    ):
+        draft.write(buffer.getvalue())
+        draft.commit("house.zip")
+    assert [file.name for file in tmp_path.glob("house/*")] == [name] * kept
+
+
+def test_a_scenes_name_has_at_most_64_characters(tmp_path):
+    store = FolderSceneStore([], tmp_path, 10**6)
+    for name in ("x", "x" * 64):
+        with store.draft(name) as draft:
+            draft.write(ply())
+            draft.commit("scene.ply")
+    assert [scene.id for scene in store.scenes()] == ["x", "x" * 64]
+    for name in ("", "x" * 65):
+        with pytest.raises(InvalidRequest, match="1 to 64"):
+            store.draft(name)
+
+
 # ------------------------------------------------------------------ mapped files
 
 
@@ -309,8 +362,12 @@ def test_a_changed_or_damaged_scene_is_read_anew(folder, tmp_path):
     mapped_scene(path, cache)
     (kept,) = (cache / "scenes").iterdir()
     (kept / "sh.npy").write_bytes(b"\x93NUMPY garbage")
-    assert mapped_scene(path, cache).count == 50
-    assert mapped_scene(path, cache).sh.shape == (50, 1, 3)
+    (kept / "of another version.npy").touch()
+    repaired = mapped_scene(path, cache)
+    assert (repaired.count, repaired.sh.shape) == (50, (50, 1, 3))
+    assert isinstance(repaired.means.base, np.memmap)  # the next start is quick again
+    assert [file.name for file in (cache / "scenes").glob("*/*another*")] == []
+    assert [entry.name for entry in (cache / "scenes").iterdir()] == [kept.name]
     (path / "scene.ply").write_bytes(ply(60))
     assert mapped_scene(path, cache).count == 60
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -21,13 +22,14 @@ from service.results import IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.splat_sample import importance, packed_splats
 from service.types import Camera, Intrinsics
 from service.web.schemas.conversion import record_out
-from viewer import camera_views, charts, colours, frusta, match_geometry
+from viewer import camera_views, charts, colours, frusta, job_stream, match_geometry, service_lists
 from viewer import comparison_images as images
 from viewer.job_stream import JobStream
 from viewer.layers.splat_layer import full_covariances
 from viewer.panel_html import headline_html, record_html, scene_html
 from viewer.playback import Playback
 from viewer.service_client import Job, JobOutcome, ServiceClient, ServiceError, parse_record, parse_splats, sse_events
+from viewer.service_lists import ServiceLists
 from viewer.shared_data import SharedData
 
 # ---------------------------------------------------------------- what the service says
@@ -224,6 +226,12 @@ def test_match_lines_end_where_the_matches_are(width: int, height: int) -> None:
     for x, y in spots:
         nearest = np.hypot(columns + 0.5 - x, rows + 0.5 - y).min()
         assert nearest < 3, (x, y)  # the dot's radius is 4
+        # A dot is opaque, the line through it isn't.
+        inked = (lined == colours.INLIER_COLOUR).all(-1)
+        dot = inked[round(y) - 6 : round(y) + 7, round(x) - 6 : round(x) + 7]
+        at = np.argwhere(dot).mean(0) + 0.5 - 6 + [round(y), round(x)]
+        assert np.abs(at - (y, x)).max() < 1
+        assert dot.sum() == pytest.approx(np.pi * 3.3**2, rel=0.15)
     # And nowhere beyond: the line lies in the box that the two ends span, but for the dots.
     (x0, y0), (x1, y1) = np.min(spots, 0) - 6, np.max(spots, 0) + 6
     assert columns.min() > x0
@@ -482,6 +490,28 @@ def test_a_job_that_is_gone_is_reported_and_not_requested_again() -> None:
     until(lambda: stream.error and not threads("job-gone"), "the thread's end")
     assert "no job gone" in stream.error
     assert fake.asked == ["/jobs/gone"]
+
+
+@pytest.mark.parametrize("lists", [True, False])
+def test_between_polls_and_between_retries_there_is_a_pause(lists: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    pause = 0.05
+    monkeypatch.setattr(service_lists, "_POLL_S", pause)
+    monkeypatch.setattr(job_stream, "_RETRY_S", pause)
+    asked: list[float] = []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path != "/scenes":
+            asked.append(time.monotonic())
+        return httpx.Response(200, json={"jobs": [], "scenes": []}) if lists else httpx.Response(503)
+
+    client = ServiceClient("http://fake", httpx.MockTransport(answer))
+    polled, stream = ServiceLists(client), JobStream(client, "d")
+    polled.add_listener(lambda: None)
+    (polled if lists else stream).start()
+    until(lambda: len(asked) >= 4, "three pauses")
+    polled.close()
+    stream.stop()
+    assert np.diff(asked).min() > 0.9 * pause
 
 
 def test_a_stream_is_shared_and_ends_with_its_last_listener() -> None:

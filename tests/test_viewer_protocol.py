@@ -16,6 +16,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import fake_service
 import httpx
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ import zstandard
 from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
+from service.geometry import transformed
 from service.results import Reason, Status
 from service.types import IntrinsicsCorrection
 from viewer import camera_views, job_display, step_display, viewer_server, viser_internals
@@ -90,6 +92,25 @@ def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: Fa
         fake.job("second", 2, finished=True)
         browser.wait(lambda: "second" in browser.widget("job")["value"], "the next job, by itself")
         browser.wait(lambda: browser.widget("step")["max"] == 1, "its steps")
+
+
+def test_cameras_that_one_looks_through_are_cut_away_and_the_scene_is_not(fake: FakeService, viewer: Viewer) -> None:
+    """The planes between which a browser draws, against the fake scene: cameras on a circle, a ball inside."""
+    fake.job("j", 3, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: {"/training cameras/cameras", "/trajectory/final"} <= set(browser.nodes), "the cameras")
+        said = {m["type"]: m for frame in browser.frames for m in frame if m["type"].startswith("SetCamera")}
+        near, far = said["SetCameraNearMessage"]["near"], said["SetCameraFarMessage"]["far"]
+        final = browser.nodes["/trajectory/final"]["props"]
+    # viser draws a pyramid with the volume of one of the base `scale` squared and the height `scale`.
+    half_height = np.tan(final["fov"] / 2)
+    depth = final["scale"] / np.cbrt(half_height**2 * final["aspect"] / 3)
+    assert depth < near
+    everything = fake_service.scene()
+    for named in everything.cameras:
+        seen = transformed(named.camera.pose.camera_from_world, everything.means)[:, 2]
+        assert near < 0.25 * seen.min()
+        assert far > 100 * seen.max()  # backgrounds are far away
 
 
 def _render_shown(browser: FakeBrowser) -> np.ndarray:
