@@ -288,6 +288,31 @@ def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monk
     assert (code, "two scenes 'a'" in complaint) == (2, True)
 
 
+def test_bench_field_runs_what_its_flags_say_and_prints_the_table(splatfix, monkeypatch, tmp_path):
+    from service.bench import field
+
+    seen = []
+    monkeypatch.setattr(field, "run", lambda asked, show: seen.append(asked))
+    line = {"scene": "s", "localized": True, "right": True, "reason": "verified", "below_floor": [], "cpu_ms": 1.0}
+    line |= {"rotation_deg": 0.1, "translation_units": 0.01, "nees": 5.0, "focal_error": 0.0, "k1_error": 0.0}
+    rows = [("lens/told", "lens"), ("photo/blur=4", "photo"), ("random/exif", "random")]
+    lines = [line | {"row": row, "pool": row, "group": group} for row, group in rows]
+    monkeypatch.setattr(field, "read_results", lambda asked: lines)
+    scenes = [tmp_path / "room", f"{tmp_path / 'room'}={tmp_path / 'night'}"]
+    code, told, _ = splatfix("bench", "field", *scenes, "--out", tmp_path, "--row", "lens/told", "--photos", "3")
+    (asked,) = seen
+    assert code == 0
+    assert asked.scenes == {"room": (scenes[0], None), "room-night": (tmp_path / "room", tmp_path / "night")}
+    assert ([row.name for row in asked.rows], asked.photos, asked.random) == (["lens/told"], 3, 0)
+    assert ("| lens/told | 1 | 1 |" in told, "blur" in told, "random" in told) == (True, False, False)
+    told = splatfix("bench", "field", *scenes, "--out", tmp_path, "--random", "5")[1]
+    assert (seen[1].rows, seen[1].random, "random/exif" in told, "lens/told" in told) == ([], 5, True, False)
+    told = splatfix("bench", "field", *scenes, "--out", tmp_path, "--table-only")[1]
+    assert (len(seen), "random/exif" in told, "blur" in told) == (2, True, True)
+    assert "lens/k1=-0.1/exif" in splatfix("bench", "field", "--list")[1].splitlines()
+    assert splatfix("bench", "field", "--row", "lens/nothing", "--list")[0] == 2
+
+
 def test_bench_paper_shows_how_far_it_is():
     from rich.console import Console
 

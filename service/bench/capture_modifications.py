@@ -106,7 +106,8 @@ def letterbox(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
 def white_bars(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
     """Put white bars on all sides, which are `share` of the new width and height."""
     width, height = photo.intrinsics.width, photo.intrinsics.height
-    return _framed(photo, *(round(side * share / (1 - share) / 2) for side in (width, height)), 1.0)
+    beside, above = (round(side * share / (1 - share) / 2) for side in (width, height))
+    return _framed(photo, beside, above, 1.0)
 
 
 def _framed(photo: Photo, beside: int, above: int, value: float) -> Photo:

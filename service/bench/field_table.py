@@ -12,8 +12,9 @@ MIN_SHARED = 40
 """Queries from which on a share is printed; of fewer the counts."""
 HEADER = (
     "row", "photos", "right & localized", "right, but refused", "wrong, but localized", "lost", "not answerable",
-    "of the answerable", "CPU ms", "error", "focal, k1 error", "in 68, 95 %", "refused by",
+    "of the answerable", "CPU ms", "error", "focal, k1 error", "in 68, 95 %", "right, refused by", "others, refused by",
 )  # fmt: skip
+REFUSALS = ("refused_by", "not_found_by")
 Line = Mapping[str, Any]
 
 
@@ -30,8 +31,8 @@ def outcome_of(line: Line) -> str:
 
 
 def refused_by(line: Line) -> str:
-    """Return what refused a right answer: the reason, and the signals below their floors."""
-    signals = "+".join(line["below_floor"])
+    """Return what refused an answer: the reason; of a right one also the signals below their floors."""
+    signals = "+".join(line["below_floor"]) if line["right"] else ""
     return f"{line['reason']} ({signals})" if signals else line["reason"]
 
 
@@ -63,8 +64,13 @@ def summary(lines: Sequence[Line]) -> dict[str, Any]:
         "with_covariance": len(inside),
         "in_68": float(np.mean([p <= 0.68 for p in inside])) if inside else None,
         "in_95": float(np.mean([p <= 0.95 for p in inside])) if inside else None,
-        "refused_by": dict(Counter(refused_by(line) for line in lines if outcome_of(line) == "refused").most_common()),
+        "refused_by": _reasons(line for line in lines if outcome_of(line) == "refused"),
+        "not_found_by": _reasons(line for line in lines if outcome_of(line) in ("lost", "unanswerable")),
     }
+
+
+def _reasons(lines: Iterable[Line]) -> dict[str, int]:
+    return dict(Counter(map(refused_by, lines)).most_common())
 
 
 def _median(values: Iterable[float]) -> float | None:
@@ -112,7 +118,7 @@ def _cells(name: str, lines: Sequence[Line]) -> str:
         _joined(found["error_deg"], "{:.3f}°", found["error_units"], "{:.4f}"),
         _joined(focal_percent, "{:.2f} %", found["k1_error"], "{:.4f}"),
         ellipsoids,
-        ", ".join(f"{reason} {count}" for reason, count in found["refused_by"].items()),
+        *(", ".join(f"{reason} {count}" for reason, count in found[key].items()) for key in REFUSALS),
     ]
     return "| " + " | ".join(cells) + " |"
 
