@@ -260,11 +260,22 @@ class TestRun:
         assert outcome["success_1deg_0p01"] == 1
         assert outcome["modify"] == ["roll=90", "gain=0.5"]
 
+    def test_a_modified_scene_keeps_units_and_cameras(self, tmp_path, runs):
+        folder = folder_of(tmp_path / "s", "nerfstudio")
+        plain, spoilt = bench.run(folder), bench.run(folder, modify_scene=("thin=0.5",))
+        scene, modified = runs["scenes"][0], runs["scenes"][-1]
+        assert (scene.count, modified.count, spoilt["modify_scene"]) == (10, 5, ["thin=0.5"])
+        assert modified.info.sha256 != scene.info.sha256
+        assert len(modified.cameras) == len(scene.cameras) == spoilt["training_cameras"]
+        assert spoilt["units_per_scene_unit"] == plain["units_per_scene_unit"]
+
     @pytest.mark.parametrize(
         ("arguments", "error"),
         [
             ({"start": "hrad"}, UnknownName),
             ({"modify": ("sharpen=3",)}, UnknownName),
+            ({"modify_scene": ("smoke=3",)}, UnknownName),
+            ({"modify_scene": ("dark=x",)}, InvalidOptions),
             ({"modify": ("blur=x",)}, InvalidOptions),
             ({"modify": ("blur",)}, InvalidOptions),
             ({"modify": ("occlusion=2",)}, InvalidOptions),

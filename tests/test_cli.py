@@ -216,6 +216,8 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         tmp_path,
         "--modify",
         "blur=2",
+        "--modify-scene",
+        "dark=0.5",
         "--options",
         '{"candidates": 3}',
         "--misses",
@@ -233,7 +235,7 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
     assert asked == {
         "folder": tmp_path, "estimator": "view_index", "matcher": "sift", "start": "hard", "trials": 3, "seed": 4,
         "intrinsics": "withheld", "cameras": "ignored", "modify": ("blur=2",),
-        "data": None, "layout": "auto", "background": "white", "occluders": tmp_path,
+        "modify_scene": ("dark=0.5",), "data": None, "layout": "auto", "background": "white", "occluders": tmp_path,
     }  # fmt: skip
     assert json.loads(written.read_text())["per_query"] == [{"photo": "a"}]
     assert "success_5deg_0p05" in told

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -21,12 +21,11 @@ from jaxtyping import Float32
 from service.bench.field_queries import FieldQuery, answer, decoded
 from service.bench.field_random import random_row
 from service.bench.field_rows import Row
-from service.bench.localize import BenchScene, load_bench_scene, read_occluders
+from service.bench.localize import BenchScene, load_bench_scene, read_occluders, with_modified_scene
 from service.bench.modified_photo import Photo
 from service.bench.paper.runs import code_digest, read_lines
-from service.bench.scene_modifications import modified_scene
 from service.errors import InvalidRequest
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request
+from service.localize import DEFAULT_ESTIMATOR, Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +94,8 @@ def _run_scene(
             photo = photos[query.photo.name]
             if query.row.modify_scene != prepared:
                 prepared = query.row.modify_scene
-                place = _modified(one, prepared, spec)
+                place = with_modified_scene(one, prepared, spec.seed, cache_dir=spec.cache_dir)
+                place.loaded.prepare(DEFAULT_ESTIMATOR)
                 # Not kept: its time would include compilation.
                 answer(place, photo, query, spec.seed, spec.request)
             line = facts | {"code": code_digest()} | answer(place, photo, query, spec.seed, spec.request)
@@ -106,15 +106,6 @@ def _run_scene(
             if progress:
                 progress(name, number + 1, len(todo))
     return lines
-
-
-def _modified(one: BenchScene, specs: tuple[str, ...], spec: FieldSpec) -> BenchScene:
-    """Return the scene with its modifications, ready to localize in; photos and units remain."""
-    if specs:
-        scene = modified_scene(one.loaded.scene, specs, one.units, spec.seed)
-        one = replace(one, loaded=LoadedScene.of(scene, cache_dir=spec.cache_dir))
-    one.loaded.prepare(DEFAULT_ESTIMATOR)
-    return one
 
 
 def _require_same(lines: Sequence[Mapping[str, Any]], facts: Mapping[str, Any], file: Path) -> None:

@@ -21,6 +21,7 @@ from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.datasets import PHOTO_SUFFIXES, DataSet, read_data_set
 from service.bench.modifications import require_modifications
 from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, nees, summary, units_of
+from service.bench.scene_modifications import modified_scene, require_scene_modifications
 from service.bench.start_poses import require_kind, start_pose
 from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
@@ -82,6 +83,7 @@ def run(
     intrinsics: Literal["given", "approximate", "withheld"] = "given",
     cameras: Literal["given", "ignored"] = "given",
     modify: Sequence[str] = (),
+    modify_scene: Sequence[str] = (),
     occluders: Path | None = None,
     options: Any = None,
     budget: Budget | None = None,
@@ -92,16 +94,18 @@ def run(
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
     `folder` has the scene; `data` the photos, if they are in another folder. `occluders` is a folder with photos of
-    another scene. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is
+    another scene; `modify_scene` changes its Gaussians. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is
     used without its training cameras, which still define the units. `on_miss` is called for each photo that isn't a
     success at 1 deg and 0.01 units; what it returns is added to the photo's line.
     """
     require_kind(start)
     require_modifications(modify)
+    require_scene_modifications(modify_scene)
     chosen_options, budget = options or ESTIMATORS.load(estimator).Options(), budget or Budget()
     bench_scene = load_bench_scene(
         Path(folder), data, layout=layout, background=background, cameras=cameras, matcher=matcher, cache_dir=cache_dir
     )
+    bench_scene = with_modified_scene(bench_scene, modify_scene, seed, matcher, cache_dir)
     # Preparing is a matter of the scene, and its time isn't a photo's.
     began = time.perf_counter()
     bench_scene.loaded.prepare(estimator)
@@ -120,6 +124,7 @@ def run(
     settings = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
     settings |= {"layout": bench_scene.layout, "background_rgb": list(bench_scene.background_rgb)}
     settings |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
+    settings |= {"modify_scene": list(modify_scene)}
     settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
     facts = {"scene": bench_scene.loaded.scene.info.name, **settings, **_facts(bench_scene), "prepare_s": prepare_s}
     return {**facts, **summary(outcomes), "per_query": per_query}
@@ -193,6 +198,20 @@ def load_bench_scene(
     loaded = LoadedScene.of(scene, cache_dir=cache_dir, matcher=matcher)
     units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
     return BenchScene(loaded, data_set.test, tuple(training), units, data_set.layout)
+
+
+def with_modified_scene(
+    one: BenchScene,
+    specs: Sequence[str],
+    seed: int,
+    matcher: str = DEFAULT_MATCHER,
+    cache_dir: Path | None = None,
+) -> BenchScene:
+    """Return the scene after modifications of its Gaussians; photos, cameras and units remain."""
+    if not specs:
+        return one
+    scene = modified_scene(one.loaded.scene, specs, one.units, seed)
+    return replace(one, loaded=LoadedScene.of(scene, cache_dir=cache_dir, matcher=matcher))
 
 
 def _load_scene(folder: Path, data_set: DataSet, background: str, cameras: bool = True) -> GaussianScene:

@@ -44,6 +44,12 @@ def modified_scene(scene: GaussianScene, specs: Sequence[str], units: Units, see
     return replace(scene, info=replace(info, sha256=digest))
 
 
+def require_scene_modifications(specs: Sequence[str]) -> None:
+    """Raise UnknownName or InvalidOptions for the first modification that doesn't exist or has a wrong value."""
+    for spec in specs:
+        _parse(spec)
+
+
 def _parse(spec: str) -> tuple[_Change, float]:
     name, _, text = spec.partition("=")
     if name not in SCENE_MODIFICATIONS:
