@@ -94,9 +94,10 @@ def run(
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
     `folder` has the scene; `data` the photos, if they are in another folder. `occluders` is a folder with photos of
-    another scene; `modify_scene` changes its Gaussians. `options` are the estimator's `Options`; None: its defaults. With `cameras="ignored"` the scene is
-    used without its training cameras, which still define the units. `on_miss` is called for each photo that isn't a
-    success at 1 deg and 0.01 units; what it returns is added to the photo's line.
+    another scene; `modify_scene` changes the scene's Gaussians. `options` are the estimator's `Options`; None: its
+    defaults. With `cameras="ignored"` the scene is used without its training cameras, which still define the units.
+    `on_miss` is called for each photo that isn't a success at 1 deg and 0.01 units; what it returns is added to the
+    photo's line.
     """
     require_kind(start)
     require_modifications(modify)

@@ -36,9 +36,7 @@ def bench_localize(
     intrinsics: Annotated[Literal["given", "approximate", "withheld"], typer.Option()] = "given",
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "given",
     modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
-    modify_scene: Annotated[
-        list[str] | None, typer.Option(help="NAME=VALUE, of the Gaussians; may be repeated.")
-    ] = None,
+    modify_scene: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
