@@ -96,7 +96,7 @@ PHOTO_SPECS = (
 SCREEN_SPECS = ("letterbox=0.2", "letterbox=0.4", "white_bars=0.1")
 SCENE_SPECS = (
     "sh_degree=0", "sh_degree=1", "splat=1", "spz=1", "sog=1", "thin=0.5", "thin=0.75", "soft=0.33", "floaters=1",
-    "hole=0.125", "warm=1", "dark=0.5",
+    "floaters=2", "hole=0.125", "warm=1", "dark=0.5",
 )  # fmt: skip
 
 

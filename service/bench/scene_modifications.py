@@ -96,13 +96,13 @@ def _floaters(scene: GaussianScene, factor: float, units: Units, rng: np.random.
     faint, opaque = round(factor * FAINT), round(factor * OPAQUE)
     count = faint + opaque
     unit = 1 / units.units_per_scene_unit
-    sizes = np.concatenate([rng.uniform(0.1, 0.6, (faint, 3)), rng.uniform(0.01, 0.04, (opaque, 3))])
+    sizes = np.concatenate([rng.uniform(0.05, 0.3, (faint, 3)), rng.uniform(0.01, 0.04, (opaque, 3))])
     quats = rng.normal(size=(count, 4))
     added = {
         "means": rng.uniform(low, high, (count, 3)),
         "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
         "scales": unit * sizes,
-        "opacities": np.concatenate([rng.uniform(0.02, 0.1, faint), rng.uniform(0.7, 0.99, opaque)]),
+        "opacities": np.concatenate([rng.uniform(0.01, 0.06, faint), rng.uniform(0.7, 0.99, opaque)]),
         "sh": scene.sh[rng.integers(0, scene.count, count)],
     }
     return replace(scene, **{n: np.concatenate([getattr(scene, n), added[n].astype(np.float32)]) for n in _ARRAYS})
