@@ -12,6 +12,7 @@
       |-- JobNotFound, RecordNotFound, JobNotReady
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
       |-- PhotoGone          deleted after the job
+      |-- LensNotFound       no such lens is remembered
       |-- IdempotencyConflict  a key was used for another request
       |-- DeadlineExceeded, Interrupted  why a job ended without a result
       |-- StorageFailed      the disk is full or broken; nothing was accepted
@@ -118,6 +119,10 @@ class JobNotFound(SplatfixError):
 
 class RecordNotFound(SplatfixError):
     code = "record_not_found"
+
+
+class LensNotFound(SplatfixError):
+    code = "lens_not_found"
 
 
 class JobNotReady(SplatfixError):

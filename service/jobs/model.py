@@ -10,12 +10,23 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.errors import Failure
+from service.lenses.lens_memory import RecalledLens
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status
 from service.scene_manager.status import AUTO
 from service.types import GeoAnchor, Intrinsics, Pose, PriorRegion
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]
 ENDED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled", "interrupted")
+
+
+@dataclass(frozen=True, slots=True)
+class LensUse:
+    """What a job has to do with the memory of lenses."""
+
+    owner: str
+    """Among whose lenses the photo's is."""
+    recalled: RecalledLens | None
+    """What was known of it when the job was accepted: its prior, also after a restart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +39,11 @@ class JobSpec:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the estimator's `Options`, those that were given; JSON values that its constructor takes."""
     intrinsics: Intrinsics | None = None
-    """Of the upright photo; None: from its EXIF data, or guessed."""
+    """Of the upright photo; None: as earlier photos of the camera told, from EXIF data, or guessed."""
+    camera_id: str | None = None
+    """What the caller calls the camera."""
+    lens: LensUse | None = None
+    """Decided when the job is accepted; None: lenses aren't remembered."""
     prior: Pose | None = None
     """A guess, which may be wrong."""
     region: PriorRegion | None = None

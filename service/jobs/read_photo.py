@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -11,7 +11,9 @@ import numpy as np
 from service.errors import InvalidPrior, InvalidRequest
 from service.jobs.engine import LocalizeTask, SequenceSource
 from service.jobs.model import JobSpec
-from service.photos.images import read_query
+from service.lenses.lens_memory import RecalledLens
+from service.photos.camera_identity import CameraIdentity
+from service.photos.images import open_photo
 from service.photos.sequence import SequenceOptions, check_sequence, is_sequence, read_sequence
 from service.results import StageTiming
 from service.types import Query
@@ -29,6 +31,10 @@ class DecodedPhoto:
     """What decoding took."""
     source: Query | SequenceSource
     """What is localized: the query, or the whole sequence as it was sent."""
+    camera: CameraIdentity
+    """By the header of the photo, of a sequence the first one's."""
+    recalled: RecalledLens | None
+    """What was known of its lens; None: nothing, or the intrinsics are given."""
 
     def task(self, spec: JobSpec, task_id: str = "", held: str = "", budget_s: float | None = None) -> LocalizeTask:
         """Return what an engine is to do: look in the scenes that are held, within the spec's budget or another."""
@@ -44,30 +50,60 @@ class DecodedPhoto:
         )
 
 
+Recall = Callable[[CameraIdentity], RecalledLens | None]
+"""Returns what is known of the lens of a camera's photo."""
+
+
 def read_photo(
-    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], max_frames: int = MAX_FRAMES
+    data: bytes,
+    spec: JobSpec,
+    background_rgb: tuple[float, float, float],
+    max_frames: int = MAX_FRAMES,
+    recall: Recall | None = None,
 ) -> DecodedPhoto:
     """Decode a photo, of several the first, against what the request says of it. Takes up to seconds.
 
-    `background_rgb` (0..1) is the scene's: what is transparent is filled with it. Raises BadInput.
+    `background_rgb` (0..1) is the scene's: what is transparent is filled with it. `recall` is asked where the spec has
+    no intrinsics; without it, what the spec holds of an earlier answer counts. Raises BadInput.
     """
     wall, cpu = time.perf_counter(), time.thread_time()
-    if is_sequence(data):
-        query, source = _read_sequence(data, spec, background_rgb, max_frames)
-    else:
-        # A value that is the default may not have been sent at all.
-        defaults = {field.name: field.default for field in fields(JobSpec)}
-        for name in _OF_SEQUENCES:
-            if getattr(spec, name) != defaults[name]:
-                raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
-        query = read_query(data, intrinsics=spec.intrinsics, prior=spec.prior, background_rgb=background_rgb)
-        query = source = replace(query, region=spec.region)
-    return DecodedPhoto(query, StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu), source)
+    if recall is None:
+        recalled_before = spec.lens and spec.lens.recalled
+
+        def recall(_: CameraIdentity) -> RecalledLens | None:
+            return recalled_before
+
+    read = _read_sequence if is_sequence(data) else _read_single
+    found = read(data, spec, background_rgb, max_frames, recall)
+    return replace(found, decode=StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu))
+
+
+_UNTIMED = StageTiming("decode", 0.0, 0.0)
+
+
+def _read_single(
+    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], _: int, recall: Recall
+) -> DecodedPhoto:
+    # A value that is the default may not have been sent at all.
+    defaults = {field.name: field.default for field in fields(JobSpec)}
+    for name in _OF_SEQUENCES:
+        if getattr(spec, name) != defaults[name]:
+            raise InvalidRequest("is for several photos, or a video; this is a single photo.", where=name)
+    opened = open_photo(data)
+    recalled = recall(opened.camera) if spec.intrinsics is None else None
+    query = opened.query(
+        intrinsics=recalled.intrinsics if recalled else spec.intrinsics,
+        lens_prior=recalled and recalled.prior,
+        prior=spec.prior,
+        background_rgb=background_rgb,
+    )
+    query = replace(query, region=spec.region)
+    return DecodedPhoto(query, _UNTIMED, query, opened.camera, recalled)
 
 
 def _read_sequence(
-    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], max_frames: int
-) -> tuple[Query, SequenceSource]:
+    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], max_frames: int, recall: Recall
+) -> DecodedPhoto:
     _require_ascending(spec.times_s)
     if spec.truth is not None:
         raise InvalidPrior("a single photo's; this is a sequence.", where="truth")
@@ -82,7 +118,12 @@ def _read_sequence(
     )
     # Before the job is accepted, so that most faults of a sequence are answered at once.
     check_sequence(data, options)
-    return next(read_sequence(data, options)).query, SequenceSource(data, options)
+    first = next(read_sequence(data, options))
+    recalled = recall(first.camera) if spec.intrinsics is None else None
+    if recalled:
+        options = replace(options, intrinsics=recalled.intrinsics, lens_prior=recalled.prior)
+        first = next(read_sequence(data, options))
+    return DecodedPhoto(first.query, _UNTIMED, SequenceSource(data, options), first.camera, recalled)
 
 
 def _require_ascending(times_s: Sequence[float] | None) -> None:

@@ -27,6 +27,7 @@ from service.jobs.model import (
     JobRecord,
     JobResult,
     JobSpec,
+    LensUse,
     NewJob,
     PhotoInfo,
     Retention,
@@ -34,9 +35,10 @@ from service.jobs.model import (
 )
 from service.jobs.photo_store import PhotoStore
 from service.jobs.queue import JobQueue
-from service.jobs.read_photo import DecodedPhoto, read_photo
+from service.jobs.read_photo import DecodedPhoto, Recall, read_photo
 from service.jobs.store import JobStore
 from service.jobs.worker import Worker
+from service.lenses.lens_memory import LensMemory
 from service.photos.images import encode_image
 
 _log = logging.getLogger(__name__)
@@ -63,17 +65,26 @@ class JobOrder:
     idempotency_key: str | None
     digest: str
     """Of the request's meaning: the same for the same request."""
+    lens_owner: str = ""
+    """Among whose lenses the photo's is; empty: the photo's lens isn't remembered."""
 
 
 class Jobs:
     """All jobs of one service."""
 
     def __init__(
-        self, config: JobsConfig, engine: Engine, store: JobStore, photos: PhotoStore, observer: Observer
+        self,
+        config: JobsConfig,
+        engine: Engine,
+        store: JobStore,
+        photos: PhotoStore,
+        observer: Observer,
+        lenses: LensMemory | None = None,
     ) -> None:
-        self._config, self._engine = config, engine
+        """Make the jobs of a service; without `lenses` nothing is learnt of them, and nothing recalled."""
+        self._config, self._engine, self._lenses = config, engine, lenses
         self._photos, self._store = photos, store
-        self._worker = Worker(config, engine, store, photos, observer)
+        self._worker = Worker(config, engine, store, photos, observer, lenses)
         self._live = self._worker.live
         self._queue = JobQueue(
             self._worker.run,
@@ -114,7 +125,12 @@ class Jobs:
             return known
         held = self._engine.hold(order.spec.scene)
         try:
-            photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames)
+            recall = self._recall(order)
+            photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames, recall)
+            if recall:
+                # On record with the job: the same prior after a restart, whatever was learnt meanwhile.
+                lens = LensUse(order.lens_owner, photo.recalled)
+                order = replace(order, spec=replace(order.spec, lens=lens))
             new = _new_job(order, held.ids[0], photo)
             job = self._stored(new, order.photo)
         # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
@@ -127,6 +143,12 @@ class Jobs:
         live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
         self._queue.submit(live)
         return job
+
+    def _recall(self, order: JobOrder) -> Recall | None:
+        """Return what recalls the lens of the order's photo; None: lenses aren't remembered."""
+        if self._lenses is None or not order.lens_owner:
+            return None
+        return partial(self._lenses.recall, order.lens_owner, order.spec.camera_id)
 
     def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
         """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""

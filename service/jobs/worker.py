@@ -17,6 +17,7 @@ from service.jobs.model import Batch, Ending, JobRecord, StoredJob
 from service.jobs.photo_store import PhotoStore
 from service.jobs.read_photo import read_photo
 from service.jobs.store import JobStore
+from service.lenses.lens_memory import LensMemory
 from service.localize import Cancelled
 from service.logs import bound
 from service.photos.images import encode_image
@@ -37,9 +38,15 @@ class Worker:
     """Runs attempts, one on each thread that calls `run`."""
 
     def __init__(
-        self, config: JobsConfig, engine: Engine, store: JobStore, photos: PhotoStore, observer: Observer
+        self,
+        config: JobsConfig,
+        engine: Engine,
+        store: JobStore,
+        photos: PhotoStore,
+        observer: Observer,
+        lenses: LensMemory | None,
     ) -> None:
-        self._config, self._engine, self._observer = config, engine, observer
+        self._config, self._engine, self._observer, self._lenses = config, engine, observer, lenses
         self._store, self._photos = store, photos
         self.live: dict[str, LiveJob] = {}
         """The jobs that haven't ended."""
@@ -114,6 +121,7 @@ class Worker:
             for timing in answer.result.estimate.timings:
                 self._observer.stage(job.estimator, timing.stage, timing.wall_s)
             self._observer.renders(job.estimator, answer.result.estimate.renders)
+            self._learn(live, job, answer)
             several = job.spec.names_several_scenes
             return Ending("succeeded", answer.result, scene=answer.scene if several else None)
         except Cancelled:
@@ -147,6 +155,19 @@ class Worker:
             self._add(live, stored, record)
 
         return self._engine.localize(task, on_record)
+
+    def _learn(self, live: LiveJob, job: StoredJob, answer: EngineAnswer) -> None:
+        """Update the memory of the photo's lens: before the end is on record, so that the next photo profits.
+
+        An attempt that is lost now is made again, and its answer, from the same viewpoint, changes nothing more.
+        """
+        if self._lenses is None or job.spec.lens is None or live.photo is None:
+            return
+        use, estimate = job.spec.lens, answer.result.estimate
+        try:
+            self._lenses.learn(use.owner, job.spec.camera_id, live.photo.camera, use.recalled, estimate)
+        except StorageFailed as error:  # the answer is as good without
+            self.note_storage(error)
 
     def _add(self, live: LiveJob, stored: _Stored, record: JobRecord) -> None:
         # The thread of an attempt that was given up may come to life again.

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from service.errors import InvalidImage, InvalidRequest
-from service.photos.images import photo_size, query_of, read_query
+from service.photos.camera_identity import CameraIdentity
+from service.photos.images import open_photo, photo_size, query_of
 from service.photos.video import frame_count, is_video, read_video
-from service.types import Intrinsics, Pose, PriorRegion, Query
+from service.types import Intrinsics, LensPrior, Pose, PriorRegion, Query
 
 PHOTO_LONG_SIDE = 832
 """Pixels of the photos of a sequence: tracking works at 800 at most, and a JPEG comes at its own next step."""
@@ -29,6 +30,8 @@ class SequencePhoto:
     time_s: float
     """Since any moment; ascending."""
     query: Query
+    camera: CameraIdentity
+    """By the photo's header; of a video it is only known to be one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +48,8 @@ class SequenceOptions:
     """Of the first photo; so is the region."""
     region: PriorRegion | None = None
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    lens_prior: LensPrior | None = None
+    """How certain `intrinsics` are, where earlier photos of the camera are their source."""
 
 
 def is_packed(data: bytes) -> bool:
@@ -92,7 +97,7 @@ def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePh
 
     Count and size are checked again: a video's header need not be true, and its frames are counted as they come.
     """
-    given = {"intrinsics": options.intrinsics, "long_side": PHOTO_LONG_SIDE}
+    given = {"intrinsics": options.intrinsics, "lens_prior": options.lens_prior, "long_side": PHOTO_LONG_SIDE}
     first: tuple[int, int] | None = None
     for count, (index, name, time_s, source) in enumerate(_sources(data, options), 1):
         _check_count(count, options)
@@ -100,8 +105,11 @@ def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePh
             # The prior is of the first pose; later ones start from the pose before.
             prior = options.prior if first is None else None
             if isinstance(source, bytes):
-                query = read_query(source, prior=prior, background_rgb=options.background_rgb, **given)
+                opened = open_photo(source)
+                camera = opened.camera
+                query = opened.query(prior=prior, background_rgb=options.background_rgb, **given)
             else:
+                camera = CameraIdentity(source.shape[1], source.shape[0], is_video=True)
                 query = query_of(source, prior=prior, **given)
             if first is None:
                 query = replace(query, region=options.region)
@@ -109,7 +117,7 @@ def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePh
             size = query.photo_intrinsics.width, query.photo_intrinsics.height
             first = first or size
             _check_size(size, first)
-        yield SequencePhoto(name, time_s, query)
+        yield SequencePhoto(name, time_s, query, camera)
 
 
 def _sources(

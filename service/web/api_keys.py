@@ -84,6 +84,12 @@ class KeyRing:
                 found = Caller(known.name, known.role)
         return found
 
+    def key_id(self, caller: Caller) -> str:
+        """Return what tells a key from an earlier one of the same name: digits of its hash; empty if it was removed."""
+        self._refresh()
+        digests = [key.sha256 for key in (*self._stored, *self._temporary) if key.name == caller.name]
+        return digests[0][:16] if digests else ""
+
     def token(self, caller: Caller, seconds: float) -> str:
         """Return a signed token that is valid for that time, but no longer than the process and the caller's key."""
         claim = json.dumps({"name": caller.name, "role": caller.role, "until": time.time() + seconds})

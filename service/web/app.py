@@ -27,7 +27,9 @@ from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.engine import Engine
 from service.jobs.photo_store import FolderPhotoStore
 from service.jobs.service import Jobs
+from service.jobs.sqlite_lens_store import SqliteLensStore
 from service.jobs.sqlite_store import SqliteJobStore
+from service.lenses.lens_memory import LensMemory
 from service.matchers import MATCHERS
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
@@ -121,7 +123,10 @@ async def _start(
         if scene.uploaded:
             engine.add(scene)
     store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
-    jobs = Jobs(settings.jobs, engine, store, photos, metrics)
+    lenses = SqliteLensStore(folder / "lenses.sqlite", settings.keep_lenses)
+    stack.callback(lenses.close)
+    memory = LensMemory(lenses) if settings.keep_lenses else None
+    jobs = Jobs(settings.jobs, engine, store, photos, metrics, memory)
     stack.push_async_callback(to_thread.run_sync, engine.close)
     await to_thread.run_sync(engine.start)
     # Registered after the engine's, hence called before: running jobs need it until they end.
@@ -129,7 +134,7 @@ async def _start(
     await to_thread.run_sync(jobs.start)
     limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
     _add_gauges(metrics, engine, jobs, settings.workers)
-    return AppState(settings, engine, scene_store, jobs, keys, metrics, *limits)
+    return AppState(settings, engine, scene_store, jobs, lenses, keys, metrics, *limits)
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:

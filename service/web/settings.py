@@ -94,6 +94,9 @@ class Settings(BaseSettings):
     """Disk space of ended jobs, with their records and photos."""
     photo_grace_s: float = Field(default=900.0, ge=0)
     """How long a photo is kept after its job, unless the request has `keep_photo`; 0: deleted with the job's end."""
+    keep_lenses: int = Field(default=10_000, ge=0)
+    """Number of cameras' lenses that are remembered: what earlier photos told is the prior of the next photo. 0: none,
+    and what was remembered is deleted at the start."""
     crashes: int = Field(default=3, ge=1)
     """A job whose attempts were lost this many times, by crashes of the service, is not run again."""
     max_upload_bytes: int = Field(default=50_000_000, ge=1)

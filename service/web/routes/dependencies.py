@@ -14,9 +14,11 @@ from fastapi import Depends, Path, Request
 from service.jobs.engine import Engine
 from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
+from service.lenses.lens_store import LensStore
 from service.scene_manager.scene_store import SceneStore
 from service.web.api_keys import Caller, KeyRing
 from service.web.metrics import Metrics
+from service.web.middleware.limits import client_of
 from service.web.schemas import resources
 from service.web.schemas.jobs import JobOut
 from service.web.settings import Settings
@@ -30,6 +32,7 @@ class AppState:
     engine: Engine
     scene_store: SceneStore
     jobs: Jobs
+    lenses: LensStore
     keys: KeyRing
     metrics: Metrics
     decoding: anyio.CapacityLimiter
@@ -61,6 +64,18 @@ def _caller(request: Request) -> Caller | None:
     return request.state.caller
 
 
+def lens_owner(request: Request, app_state: AppState) -> str:
+    """Return whose lenses the caller's photos are taken with: the API key's, by name and hash, else the address's."""
+    caller, client = _caller(request), client_of(request.scope)
+    # A name can be given to another key later, whose owner must not see what was learnt with the first one.
+    return f"{client}:{app_state.keys.key_id(caller)}" if caller else client
+
+
+def _visible_owner(request: Request, app_state: AppStateOf) -> str | None:
+    caller = _caller(request)
+    return None if caller is None or caller.has_role("admin") else lens_owner(request, app_state)
+
+
 def job_document(app_state: AppState, job_id: str, root: str) -> JobOut:
     """Describe a job in full, as it stands. Not for the event loop: reads the disk. Raises JobNotFound."""
     job = app_state.jobs.get(job_id)
@@ -72,6 +87,8 @@ AppStateOf = Annotated[AppState, Depends(_app_state)]
 CallerOf = Annotated[Caller | None, Depends(_caller)]
 RootOf = Annotated[str, Depends(_root)]
 JobOf = Annotated[StoredJob, Depends(_job)]
+VisibleOwnerOf = Annotated[str | None, Depends(_visible_owner)]
+"""Whose lenses the caller may see and delete; None: anybody's, for an admin, and where there are no keys."""
 
 
 JPEG = {200: {"description": "JPEG", "content": {"image/jpeg": {}}}}

@@ -13,7 +13,7 @@ from service.jobs.model import ENDED, StoredJob
 from service.jobs.service import JobOrder
 from service.web.middleware.limits import client_of
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document
+from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document, lens_owner
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
@@ -125,7 +125,9 @@ async def create_job(
         # Of the validated fields: the same request as form and as JSON is the same job.
         digest = hashlib.sha256((fields.model_dump_json() + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
-        return app_state.jobs.accept(JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest))
+        owner = lens_owner(request, app_state)
+        order = JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest, owner)
+        return app_state.jobs.accept(order)
 
     # Decoding takes up to seconds: not on the event loop.
     return await to_thread.run_sync(accept, limiter=app_state.decoding)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from datetime import UTC, datetime
 
 import numpy as np
 
 from service.geometry import quat_from_rotation
 from service.jobs.model import JobResult, SequenceFrame
+from service.lenses.lens_store import StoredLens
 from service.results import HINTS, IterationRecord, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
 from service.web.schemas.geodesy import geographic
@@ -22,6 +24,7 @@ from service.web.schemas.job_results import (
     SceneRef,
     Timing,
 )
+from service.web.schemas.lenses import LensOut
 from service.web.schemas.poses import (
     Axes,
     CameraOut,
@@ -169,6 +172,30 @@ def region_out(region: PriorRegion) -> RegionOut:
     if isinstance(region, BoxPrior):
         return RegionOut(box=[region.lower_in_world.tolist(), region.upper_in_world.tolist()])
     return RegionOut(covariance=covariance_out(region.covariance))
+
+
+def lens_out(lens: StoredLens) -> LensOut:
+    """Convert what is remembered of a lens; its sigmas are those of the next photo's prior."""
+    key, estimate = lens.key, lens.estimate
+    log_focal, k1, shift_x, shift_y = estimate.mean
+    focal_sigma, k1_sigma, *shift_sigmas = estimate.prior_sigma()
+    described = {name: value for name, value in asdict(key).items() if name != "owner"}
+    return LensOut(
+        id=key.id,
+        # Without the hash of the key.
+        owner=key.owner.removeprefix("key:").rpartition(":")[0] if key.owner.startswith("key:") else key.owner,
+        **described,
+        focal_length=float(np.exp(log_focal)),
+        focal_sigma=focal_sigma,
+        k1=k1,
+        k1_sigma=k1_sigma,
+        principal_point=[shift_x, shift_y],
+        principal_point_sigma=max(shift_sigmas),
+        photos=estimate.photos,
+        viewpoints=estimate.viewpoints,
+        tested=estimate.is_tested(),
+        updated=datetime.fromtimestamp(lens.updated, UTC),
+    )
 
 
 def timing_out(timing: StageTiming) -> Timing:

@@ -83,6 +83,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         e.RecordNotFound("the job has 12 records and is succeeded.", where="iterations"),
         f"{_JOB}/iterations/12/render.jpg",
     ),
+    (e.LensNotFound("you have no lens '0123456789abcdef'.", where="lens"), "/lenses/0123456789abcdef"),
     (e.JobNotReady("the job is running.", where="job"), f"{_JOB}/export/colmap"),
     (
         e.NoPose("the job found no pose that could be used.", where="job", hint="See its reason: GET /jobs/ID."),

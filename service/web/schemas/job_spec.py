@@ -51,6 +51,7 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
         scene=tuple(fields.scene) if isinstance(fields.scene, list) else fields.scene,
         options={name: getattr(options, name) for name in fields.options},
         intrinsics=intrinsics,
+        camera_id=fields.camera_id,
         prior=prior,
         region=region,
         truth=None if fields.truth is None else pose_from(fields.truth, "truth"),

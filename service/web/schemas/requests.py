@@ -76,6 +76,9 @@ class LocalizeFields(Model):
     """Camera model of the upright photo: `width, height, fx, fy, cx, cy`, `model` and `distortion` as in COLMAP, and
     `trust`: `exact` (the default), or `approximate`, so that the focal length is estimated with the pose. Default:
     approximate intrinsics from the EXIF data, or a guess."""
+    camera_id: str | None = Field(default=None, min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._:@ -]+$")
+    """A name of yours for the camera: what its earlier photos told of the lens is the prior of this one's, even without
+    EXIF data. Of a phone name the phone: its lenses are told apart by EXIF data; without these name the lens."""
     prior: PriorIn | None = None
     truth: PoseIn | None = None
     """Ground truth of the pose, if known. Stored with the job, to measure errors by; estimators don't get it."""

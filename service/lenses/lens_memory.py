@@ -1,0 +1,158 @@
+"""The memory of lenses: recalls what is known of a photo's lens, and learns from the photo's answer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.lenses.lens_estimate import LENS_MEMORY, Components, LensEstimate, LensMeasurement, Viewpoint, updated
+from service.lenses.lens_key import lens_key
+from service.lenses.lens_store import LensStore
+from service.photos.camera_identity import CameraIdentity
+from service.photos.intrinsics import ORIENTATIONS, oriented
+from service.results import PoseEstimate, Status
+from service.types import Intrinsics, LensPrior
+
+_INVERSE = {6: 8, 8: 6}
+"""EXIF orientations that aren't undone by themselves."""
+_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
+"""Camera models that an estimate can hold."""
+_LEAST_INFORMATION = 0.5
+"""Share of the posterior's information that must be the photo's own: the difference to the prior's is uncertain."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecalledLens:
+    """What is known of a photo's lens before the photo is localized: fixed when its job is accepted."""
+
+    id: str
+    """Of the lens' key."""
+    intrinsics: Intrinsics
+    """Approximate; of the upright photo in its full size."""
+    prior: LensPrior
+    """How certain they are."""
+    photos: int
+    """That were learnt from."""
+
+
+class LensMemory:
+    """Lenses of all owners. Safe to call from several threads."""
+
+    def __init__(self, store: LensStore) -> None:
+        self.store = store
+
+    def recall(self, owner: str, camera_id: str | None, camera: CameraIdentity) -> RecalledLens | None:
+        """Return what earlier photos of the owner told of the lens; None if they told nothing."""
+        key = lens_key(owner, camera_id, camera)
+        lens = self.store.find(key.id) if key else None
+        if lens is None:
+            return None
+        _, k1_sigma, *shifts = lens.estimate.prior_sigma()
+        shift_sigma = max(shifts)
+        if _is_turned_unknown(camera):
+            shift_sigma = float(np.hypot(shift_sigma, np.hypot(*lens.estimate.mean[2:])))
+        prior = LensPrior(lens.estimate.prior_sigma()[0], k1_sigma, shift_sigma)
+        return RecalledLens(lens.key.id, _intrinsics(lens.estimate, camera), prior, lens.estimate.photos)
+
+    def learn(
+        self,
+        owner: str,
+        camera_id: str | None,
+        camera: CameraIdentity,
+        recalled: RecalledLens | None,
+        answer: PoseEstimate,
+    ) -> bool:
+        """Update the lens of a photo that was localized with `recalled` as its prior; return whether that was done.
+
+        Only a sure answer that determines the focal length is learnt from. Raises StorageFailed.
+        """
+        key = lens_key(owner, camera_id, camera)
+        found = measured(answer, camera, recalled) if key else None
+        if key is None or found is None:
+            return False
+        self.store.change(key, lambda known: updated(known, found))
+        return True
+
+
+def measured(
+    answer: PoseEstimate, camera: CameraIdentity, recalled: RecalledLens | None = None
+) -> LensMeasurement | None:
+    """Return what a photo alone tells of its lens; None where the answer isn't sure, or the lens wasn't estimated.
+
+    An answer's estimate holds what its prior said: the information (inverse variance) of the prior is taken out again,
+    lest what is recalled confirms itself.
+    """
+    verdict, intrinsics = answer.verdict, answer.intrinsics
+    sure = verdict.status is Status.LOCALIZED and verdict.score >= LENS_MEMORY.min_score
+    if not sure or not verdict.focal_sigma or intrinsics.model not in _MODELS:
+        return None
+    # 0: not estimated.
+    sigmas = verdict.focal_sigma, verdict.k1_sigma or math.inf
+    value, sigma = _stored_values(intrinsics, camera), [*sigmas, math.inf, math.inf]
+    if recalled is not None:
+        before = _stored_values(recalled.intrinsics, camera)
+        priors = recalled.prior.log_focal_scale, recalled.prior.k1_sigma
+        for i, (after_sigma, prior_sigma) in enumerate(zip(sigmas, priors, strict=True)):
+            value[i], sigma[i] = _without(value[i], after_sigma, before[i], prior_sigma)
+    if sigma[0] > LENS_MEMORY.max_focal_sigma:
+        return None
+    return LensMeasurement(_tuple(value), _tuple(sigma), _viewpoint(answer))
+
+
+def _without(value: float, sigma: float, prior: float, prior_sigma: float) -> tuple[float, float]:
+    """Return mean and sigma of the evidence that turned a prior into a posterior; its sigma is infinite without any."""
+    information = sigma**-2 - prior_sigma**-2 if math.isfinite(sigma) else 0.0
+    if information < _LEAST_INFORMATION * sigma**-2:
+        return value, math.inf
+    return (value * sigma**-2 - prior * prior_sigma**-2) / information, information**-0.5
+
+
+def _viewpoint(answer: PoseEstimate) -> Viewpoint:
+    verdict = answer.verdict
+    share = verdict.signals.get("sigma_share", 0.0)
+    distance = math.inf
+    # The gate's signal is the position's standard deviation over the distance.
+    if verdict.covariance is not None and share > 0:
+        distance = float(np.sqrt(np.trace(verdict.covariance[3:, 3:]))) / share
+    return Viewpoint(answer.scene_sha256, answer.pose, distance)
+
+
+def _is_turned_unknown(camera: CameraIdentity) -> bool:
+    """Whether the photo is stored upright, so that nothing tells in which direction the camera's frame was turned."""
+    return camera.height > camera.width
+
+
+def _stored_values(upright: Intrinsics, camera: CameraIdentity) -> list[float]:
+    """Return the components of a lens for intrinsics of the upright photo."""
+    stored = oriented(upright, *ORIENTATIONS[_INVERSE.get(camera.orientation, camera.orientation)])
+    long_side = stored.long_side
+    shifts = (stored.cx - stored.width / 2) / long_side, (stored.cy - stored.height / 2) / long_side
+    k1 = stored.distortion[0] if stored.distortion else 0.0
+    return [math.log(stored.fx / long_side), k1, *shifts]
+
+
+def _intrinsics(lens: LensEstimate, camera: CameraIdentity) -> Intrinsics:
+    """Return a lens' intrinsics for the upright photo of a camera."""
+    log_focal, k1, *shifts = lens.mean
+    long_side = max(camera.width, camera.height)
+    shift_x, shift_y = (0.0, 0.0) if _is_turned_unknown(camera) else shifts
+    focal = math.exp(log_focal) * long_side
+    stored = Intrinsics(
+        camera.width,
+        camera.height,
+        focal,
+        focal,
+        camera.width / 2 + shift_x * long_side,
+        camera.height / 2 + shift_y * long_side,
+        "SIMPLE_RADIAL",
+        (k1,),
+        "approximate",
+    )
+    return oriented(stored, *ORIENTATIONS[camera.orientation])
+
+
+def _tuple(values: list[float]) -> Components:
+    log_focal, k1, shift_x, shift_y = values
+    return log_focal, k1, shift_x, shift_y
