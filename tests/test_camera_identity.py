@@ -12,7 +12,7 @@ from PIL import Image
 
 from service.photos import images
 from service.photos.camera_identity import CameraIdentity, exif_focal_prior, identity_from_exif
-from service.photos.images import camera_identity
+from service.photos.images import open_photo
 
 MAKE, MODEL, ORIENTATION, LENS = 0x010F, 0x0110, 0x0112, 0xA434
 FOCAL, FOCAL_35, ZOOM, WIDTH, HEIGHT = 0x920A, 0xA405, 0xA404, 0xA002, 0xA003
@@ -49,7 +49,7 @@ def test_what_a_phone_writes_is_read_without_decoding(kind, monkeypatch):
     data = jpeg({MAKE: "Apple", MODEL: "iPhone 12", ORIENTATION: 6}, PHONE, kind=kind)
     monkeypatch.setattr(images, "_decode", None)
     monkeypatch.setattr(Image.Image, "load", None)
-    assert camera_identity(data) == CameraIdentity(
+    assert open_photo(data).camera == CameraIdentity(
         width=80,
         height=60,
         orientation=6,
@@ -65,12 +65,12 @@ def test_what_a_phone_writes_is_read_without_decoding(kind, monkeypatch):
 
 
 def test_a_heic_is_read_as_it_is_decoded():
-    found = camera_identity((Path(__file__).parent / "data" / "rotated.heic").read_bytes())
+    found = open_photo((Path(__file__).parent / "data" / "rotated.heic").read_bytes()).camera
     assert (found.width, found.height, found.orientation, found.focal_35mm) == (96, 128, 1, 26.0)
 
 
 def test_without_exif_there_is_only_a_size():
-    found = camera_identity(jpeg())
+    found = open_photo(jpeg()).camera
     assert found == CameraIdentity(80, 60)
     assert not found.is_named
     assert not found.is_cropped
@@ -114,7 +114,7 @@ def test_numbers_out_of_range_and_long_texts_are_left_out():
 def test_a_make_of_any_type_is_a_short_text_or_none(entry, make):
     stream = BytesIO()
     Image.new("RGB", (80, 60)).save(stream, "JPEG", exif=tiff([entry]))
-    assert camera_identity(stream.getvalue()).make == make
+    assert open_photo(stream.getvalue()).camera.make == make
 
 
 @pytest.mark.parametrize("size", [(4032, 3024), (3024, 4032), (1000, 750), (640, 480)])

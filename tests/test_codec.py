@@ -12,7 +12,7 @@ from service.errors import Failure
 from service.jobs.codec import VERSION, decode, encode
 from service.jobs.model import JobRecord, JobSpec, SequenceFrame
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
-from service.types import BoxPrior, Camera, GaussianPosePrior, Intrinsics, Pose
+from service.types import BoxPrior, Camera, GaussianPosePrior, Intrinsics, LensPrior, Pose
 
 IDENTITY = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 LENS = Intrinsics(4, 3, 5.0, 6.0, 2.0, 1.5, "RADIAL", (0.1, 0.2), "approximate")
@@ -59,6 +59,19 @@ STORED_SPEC = {
     "version": 1,
     "value": {
         **{"estimator": "view_index", "scene": ["a", "b"], "options": {"candidates": 3}, "intrinsics": None},
+        "camera_id": "mine",
+        "lens": {
+            "owner": "key:a",
+            "recalled": {
+                "id": "0123456789abcdef",
+                "intrinsics": {
+                    **{"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 2.0, "cy": 1.5, "model": "SIMPLE_RADIAL"},
+                    **{"distortion": [0.1], "trust": "approximate"},
+                },
+                "prior": {"log_focal_scale": 0.01, "k1_sigma": 0.004, "principal_point_scale": 0.006},
+                "photos": 3,
+            },
+        },
         **{
             "prior": {"world_from_camera": IDENTITY},
             "region": {"lower_in_world": [0, 0, 0], "upper_in_world": [1, 2, 3]},
@@ -89,7 +102,16 @@ def test_a_stored_spec_is_read():
     assert (spec.scene, spec.options, spec.times_s, spec.seed) == (("a", "b"), {"candidates": 3}, (0.5, 1.0), 7)
     assert isinstance(spec.region, BoxPrior)
     assert spec.region.upper_in_world.tolist() == [1, 2, 3]
+    assert spec.lens
+    assert spec.lens.recalled
+    assert spec.lens.recalled.prior == LensPrior(0.01, 0.004, 0.006)
     assert json.loads(encode(spec)) == STORED_SPEC
+
+
+def test_a_spec_of_before_lenses_were_remembered_is_read():
+    value = {name: item for name, item in STORED_SPEC["value"].items() if name not in ("camera_id", "lens")}
+    spec = decode(JobSpec, json.dumps({"version": 1, "value": value}))
+    assert (spec.camera_id, spec.lens, spec.seed) == (None, None, 7)
 
 
 def test_numbers_survive_exactly():

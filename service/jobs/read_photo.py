@@ -67,14 +67,9 @@ def read_photo(
     no intrinsics; without it, what the spec holds of an earlier answer counts. Raises BadInput.
     """
     wall, cpu = time.perf_counter(), time.thread_time()
-    if recall is None:
-        recalled_before = spec.lens and spec.lens.recalled
-
-        def recall(_: CameraIdentity) -> RecalledLens | None:
-            return recalled_before
-
+    known = spec.lens and spec.lens.recalled
     read = _read_sequence if is_sequence(data) else _read_single
-    found = read(data, spec, background_rgb, max_frames, recall)
+    found = read(data, spec, background_rgb, max_frames, recall or (lambda _: known))
     return replace(found, decode=StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu))
 
 

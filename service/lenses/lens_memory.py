@@ -19,6 +19,8 @@ _INVERSE = {6: 8, 8: 6}
 """EXIF orientations that aren't undone by themselves."""
 _MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 """Camera models that an estimate can hold."""
+UNKNOWN_SHIFT = LensPrior(1.0).principal_point_scale
+"""A principal point that nothing was learnt of is as of any camera."""
 _LEAST_INFORMATION = 0.5
 """Share of the posterior's information that must be the photo's own: the difference to the prior's is uncertain."""
 
@@ -49,11 +51,12 @@ class LensMemory:
         lens = self.store.find(key.id) if key else None
         if lens is None:
             return None
-        _, k1_sigma, *shifts = lens.estimate.prior_sigma()
-        shift_sigma = max(shifts)
+        focal_sigma, k1_sigma, *shift_sigmas = lens.estimate.prior_sigma()
+        shift_sigma = max(shift_sigmas)
         if _is_turned_unknown(camera):
+            # The centre is assumed, from which the principal point lies in an unknown direction.
             shift_sigma = float(np.hypot(shift_sigma, np.hypot(*lens.estimate.mean[2:])))
-        prior = LensPrior(lens.estimate.prior_sigma()[0], k1_sigma, shift_sigma)
+        prior = LensPrior(focal_sigma, k1_sigma, min(shift_sigma, UNKNOWN_SHIFT))
         return RecalledLens(lens.key.id, _intrinsics(lens.estimate, camera), prior, lens.estimate.photos)
 
     def learn(
@@ -88,25 +91,32 @@ def measured(
     sure = verdict.status is Status.LOCALIZED and verdict.score >= LENS_MEMORY.min_score
     if not sure or not verdict.focal_sigma or intrinsics.model not in _MODELS:
         return None
+    value = _stored_values(intrinsics, camera)
     # 0: not estimated.
-    sigmas = verdict.focal_sigma, verdict.k1_sigma or math.inf
-    value, sigma = _stored_values(intrinsics, camera), [*sigmas, math.inf, math.inf]
+    sigma = [verdict.focal_sigma, verdict.k1_sigma or math.inf, *2 * (verdict.principal_point_sigma or math.inf,)]
     if recalled is not None:
-        before = _stored_values(recalled.intrinsics, camera)
-        priors = recalled.prior.log_focal_scale, recalled.prior.k1_sigma
-        for i, (after_sigma, prior_sigma) in enumerate(zip(sigmas, priors, strict=True)):
-            value[i], sigma[i] = _without(value[i], after_sigma, before[i], prior_sigma)
+        value, sigma = _without_prior(value, sigma, _stored_values(recalled.intrinsics, camera), recalled.prior)
+    if _is_turned_unknown(camera):
+        value[2:], sigma[2:] = (0.0, 0.0), (math.inf, math.inf)
     if sigma[0] > LENS_MEMORY.max_focal_sigma:
         return None
-    return LensMeasurement(_tuple(value), _tuple(sigma), _viewpoint(answer))
+    return LensMeasurement(_components(value), _components(sigma), _viewpoint(answer))
 
 
-def _without(value: float, sigma: float, prior: float, prior_sigma: float) -> tuple[float, float]:
-    """Return mean and sigma of the evidence that turned a prior into a posterior; its sigma is infinite without any."""
-    information = sigma**-2 - prior_sigma**-2 if math.isfinite(sigma) else 0.0
-    if information < _LEAST_INFORMATION * sigma**-2:
-        return value, math.inf
-    return (value * sigma**-2 - prior * prior_sigma**-2) / information, information**-0.5
+def _without_prior(
+    value: list[float], sigma: list[float], assumed: list[float], prior: LensPrior
+) -> tuple[list[float], list[float]]:
+    """Return the evidence that turned a prior about the assumed values into a posterior; infinite sigmas: none."""
+    posterior, centre = np.array(value), np.array(assumed)
+    scale = np.array([prior.log_focal_scale, prior.k1_sigma, *2 * (prior.principal_point_scale,)])
+    # A prior with heavy tails holds back the less the farther off the posterior is.
+    distance = (posterior - centre) * [1, 0, 1, 1]
+    whole, of_prior = np.array(sigma) ** -2, 1 / (scale**2 + distance**2)
+    own = whole - of_prior
+    with np.errstate(divide="ignore", invalid="ignore"):
+        evidence = (whole * posterior - of_prior * centre) / own
+        told = own >= _LEAST_INFORMATION * whole
+        return np.where(told, evidence, posterior).tolist(), np.where(told, own**-0.5, np.inf).tolist()
 
 
 def _viewpoint(answer: PoseEstimate) -> Viewpoint:
@@ -153,6 +163,6 @@ def _intrinsics(lens: LensEstimate, camera: CameraIdentity) -> Intrinsics:
     return oriented(stored, *ORIENTATIONS[camera.orientation])
 
 
-def _tuple(values: list[float]) -> Components:
+def _components(values: list[float]) -> Components:
     log_focal, k1, shift_x, shift_y = values
     return log_focal, k1, shift_x, shift_y

@@ -24,42 +24,11 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from service.errors import InvalidImage
 from service.photos.camera_identity import CameraIdentity, exif_focal_prior, identity_from_exif
+from service.photos.decode_config import DEFAULTS
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
 from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
-
-
-@dataclass(frozen=True, slots=True)
-class DecodeConfig:
-    """Limits against hostile files, and the size and focal length that a photo is given."""
-
-    max_pixels: int = 64 * 1024 * 1024
-    """A phone's 64 megapixels are 9248 x 6936: more than 64 million, less than this."""
-    max_pixels_webp: int = 25 * 1024 * 1024
-    """WebP can't be decoded at a reduced size, and 64 megapixels, which 120 kB may hold, would take 1.9 GB."""
-    max_scans: int = 24
-    """Of a progressive JPEG. Each is a pass over all pixels and takes 100 bytes of a hostile file; encoders make 10."""
-    max_heic_s: float = 30.0
-    """Wall time of the HEIC decoder; 64 megapixels take two seconds."""
-    band_pixels: int = 1 << 21
-    """Converted to RGB at once: the whole photo is in memory once as it was decoded, and once as RGB."""
-    long_side_px: int = 1000
-    """Of `Query.rgb`. Features are extracted at 800 pixels at most; a JPEG of 12 megapixels is decoded at a quarter
-    of its size."""
-    oversize: float = 1.3
-    """Ratio of long sides up to which a decoded photo is kept as it is: resampling would cost more than it saves."""
-    min_side_px: int = 32
-    """Of `Query.rgb`; the features need more anyway."""
-    opaque: int = 128
-    """Alpha, of 255, from which on a pixel is valid."""
-    default_focal: float = 0.78
-    """In long sides; see the module's docstring."""
-    cropped_principal_point_scale: float = 0.1
-    """Scale of the principal point's prior, in long sides, of a photo that has another shape than its camera's."""
-
-
-DEFAULTS = DecodeConfig()
 
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before the size
 # is checked.
@@ -90,16 +59,50 @@ def read_query(
     cut-out object has the same edges as in a render. `long_side` is the target in pixels, exceeded by
     `DecodeConfig.oversize` at most.
     """
-    name, photo = _open(data)
-    decoded = _decode(photo, name, background_rgb, long_side)
-    query = _query(decoded, _identity(photo), intrinsics, prior)
-    return query if lens_prior is None else replace(query, intrinsics_source="memory", lens_prior=lens_prior)
+    return open_photo(data).query(
+        intrinsics=intrinsics,
+        lens_prior=lens_prior,
+        prior=prior,
+        background_rgb=background_rgb,
+        long_side=long_side,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedPhoto:
+    """A photo of which only the header was read."""
+
+    name: str
+    """Of its format."""
+    image: Image.Image
+    camera: CameraIdentity
+    """What the header tells of its camera."""
+
+    def query(
+        self,
+        *,
+        intrinsics: Intrinsics | None = None,
+        lens_prior: LensPrior | None = None,
+        prior: Pose | None = None,
+        background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        long_side: int = DEFAULTS.long_side_px,
+    ) -> Query:
+        """Decode the pixels, as `read_query` does, once. Raises InvalidImage, InvalidIntrinsics."""
+        decoded = _decode(self.image, self.name, background_rgb, long_side)
+        return _query(decoded, self.camera, intrinsics, lens_prior, prior)
+
+
+def open_photo(data: bytes) -> OpenedPhoto:
+    """Read a photo's header; a HEIC is decoded already. Raises InvalidImage."""
+    name, image = _open(data)
+    return OpenedPhoto(name, image, _identity(image))
 
 
 def query_of(
     rgb: UInt8[np.ndarray, "h w 3"],
     *,
     intrinsics: Intrinsics | None = None,
+    lens_prior: LensPrior | None = None,
     prior: Pose | None = None,
     long_side: int = DEFAULTS.long_side_px,
 ) -> Query:
@@ -111,17 +114,21 @@ def query_of(
     else:
         rgb = np.asarray(cv2.resize(rgb, target, interpolation=cv2.INTER_AREA))
     scale = (target[0] / width, target[1] / height)
-    return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, prior)
+    return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, lens_prior, prior)
 
 
 def _query(
-    decoded: _Decoded, identity: CameraIdentity | None, intrinsics: Intrinsics | None, prior: Pose | None
+    decoded: _Decoded,
+    identity: CameraIdentity | None,
+    intrinsics: Intrinsics | None,
+    lens_prior: LensPrior | None,
+    prior: Pose | None,
 ) -> Query:
     """Choose the intrinsics (given, EXIF, default), scale them to the decoded image, and undistort it."""
-    source: IntrinsicsSource = "given"
-    warnings, lens_prior = list(decoded.warnings), None
+    warnings = list(decoded.warnings)
     if intrinsics is not None:
         require_size(intrinsics, decoded.width, decoded.height, decoded.upright_from_stored)
+        source: IntrinsicsSource = "memory" if lens_prior else "given"
     else:
         intrinsics, source, lens_prior = _assumed_intrinsics((decoded.width, decoded.height), identity)
         if source == "guessed":
@@ -201,11 +208,6 @@ def photo_size(data: bytes) -> tuple[int, int]:
     _, photo = _open(data, header_only=True)
     transpose, _, _ = ORIENTATIONS[_orientation(photo)]
     return (photo.height, photo.width) if transpose else photo.size
-
-
-def camera_identity(data: bytes) -> CameraIdentity:
-    """Return what the photo's header tells of its camera; no pixels are decoded. Raises InvalidImage."""
-    return _identity(_open(data, header_only=True)[1])
 
 
 @dataclass(frozen=True, slots=True)

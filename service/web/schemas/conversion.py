@@ -9,6 +9,7 @@ import numpy as np
 
 from service.geometry import quat_from_rotation
 from service.jobs.model import JobResult, SequenceFrame
+from service.lenses.lens_memory import RecalledLens
 from service.lenses.lens_store import StoredLens
 from service.results import HINTS, IterationRecord, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
@@ -24,6 +25,7 @@ from service.web.schemas.job_results import (
     SceneRef,
     Timing,
 )
+from service.web.schemas.jobs import JobLensOut
 from service.web.schemas.lenses import LensOut
 from service.web.schemas.poses import (
     Axes,
@@ -195,6 +197,18 @@ def lens_out(lens: StoredLens) -> LensOut:
         viewpoints=estimate.viewpoints,
         tested=estimate.is_tested(),
         updated=datetime.fromtimestamp(lens.updated, UTC),
+    )
+
+
+def job_lens_out(recalled: RecalledLens) -> JobLensOut:
+    """Convert what was known of a photo's lens."""
+    return JobLensOut(
+        id=recalled.id,
+        intrinsics=intrinsics_out(recalled.intrinsics),
+        focal_sigma=recalled.prior.log_focal_scale,
+        k1_sigma=recalled.prior.k1_sigma,
+        principal_point_sigma=recalled.prior.principal_point_scale,
+        photos=recalled.photos,
     )
 
 

@@ -63,6 +63,22 @@ class JobSummary(Model):
     links: JobLinks
 
 
+class JobLensOut(Model):
+    """What earlier photos told of a job's lens, as it was when the job was accepted."""
+
+    id: str
+    """Of the lens in `/lenses`."""
+    intrinsics: IntrinsicsOut
+    """Of the upright photo; the search begins with them."""
+    focal_sigma: float
+    """Relative; the scale of a distribution with heavy tails."""
+    k1_sigma: float
+    principal_point_sigma: float
+    """In long sides of the photo."""
+    photos: int
+    """How many photos it was learnt from."""
+
+
 class JobOut(JobSummary):
     """A job with its result (state `succeeded`), or with the error of a job that has none (`failed`,
     `interrupted`)."""
@@ -74,6 +90,11 @@ class JobOut(JobSummary):
     deadline: datetime | None
     """`deadline_s` of the request as a point in time."""
     options: dict[str, Any]
+    camera_id: str | None = None
+    """`camera_id` of the request."""
+    lens: JobLensOut | None = None
+    """Prior of the intrinsics by earlier photos of the same camera; null if there were none, or the request had
+    intrinsics."""
     prior: PoseOut | None
     """The approximate pose of the request, or the mean of its Gaussian."""
     prior_region: RegionOut | None

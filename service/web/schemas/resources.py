@@ -17,6 +17,7 @@ from service.scene_manager.status import SceneContents, SceneStatus
 from service.web.problems import problem_of_failure
 from service.web.schemas.conversion import (
     intrinsics_out,
+    job_lens_out,
     named_camera_out,
     pose_out,
     record_out,
@@ -45,6 +46,8 @@ def job_out(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
         budget_s=spec.budget_s,
         deadline=_time(job.deadline) if job.deadline else None,
         options=dict(spec.options),
+        camera_id=spec.camera_id,
+        lens=spec.lens and spec.lens.recalled and job_lens_out(spec.lens.recalled),
         prior=spec.prior and pose_out(spec.prior),
         prior_region=spec.region and region_out(spec.region),
         truth=spec.truth and pose_out(spec.truth),

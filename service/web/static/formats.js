@@ -48,6 +48,7 @@ export function fieldsOf(job) {
   if (job.budget_s) fields.budget_s = String(job.budget_s);
   if (job.prior) fields.prior = JSON.stringify({ world_from_camera: job.prior.world_from_camera.matrix });
   if (job.truth) fields.truth = JSON.stringify({ world_from_camera: job.truth.world_from_camera.matrix });
+  if (job.camera_id) fields.camera_id = job.camera_id;
   const { result } = job;
   if (result?.intrinsics_source === "given") fields.intrinsics = JSON.stringify(result.intrinsics);
   return fields;

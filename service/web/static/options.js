@@ -15,6 +15,7 @@ export class OptionsForm {
     this.budget = input({ type: "number", min: 0, step: "any", placeholder: "none" });
     this.keep = h("input", { type: "checkbox" });
     this.numbers = Object.fromEntries(NUMBERS.map(name => [name, input({ type: "number", step: "any" })]));
+    this.camera = input({ placeholder: "none" });
     this.approximate = h("input", { type: "checkbox" });
     this.model = input({ placeholder: "PINHOLE" });
     this.distortion = input({ placeholder: "k1, k2, …" });
@@ -28,7 +29,8 @@ export class OptionsForm {
       group("Intrinsics of the upright photo, in pixels",
         h("div", { class: "grid narrow" }, NUMBERS.map(name => field(name, this.numbers[name]))),
         h("div", { class: "grid" }, field("Camera model, by COLMAP's name", this.model), field("Distortion", this.distortion),
-          field("Approximate", this.approximate, "The focal length is where the search begins.")),
+          field("Approximate", this.approximate, "The focal length is where the search begins."),
+          field("Camera's name", this.camera, "Without intrinsics: its earlier photos tell them.")),
         h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data or guessed, then estimated with the pose.")),
       group("Prior pose, a guess to start from", this.poses.prior.element),
       group("True pose, to measure errors against: the search does not see it", this.poses.truth.element));
@@ -45,6 +47,7 @@ export class OptionsForm {
     if (chosen && !chosen.default) fields.estimator = chosen.name;
     const options = Object.fromEntries(this.readers.map(read => read()).filter(Boolean));
     if (Object.keys(options).length) fields.options = JSON.stringify(options);
+    if (this.camera.value.trim()) fields.camera_id = this.camera.value.trim();
     if (this.seed.value) fields.seed = this.seed.value;
     if (this.budget.value) fields.budget_s = this.budget.value;
     if (this.keep.checked) fields.keep_photo = "true";

@@ -88,7 +88,7 @@ function numbers(job, scene) {
 }
 
 function lens({ intrinsics, intrinsics_source: source }) {
-  const from = source === "exif" ? "from EXIF" : source;
+  const from = { exif: "from EXIF", memory: "from earlier photos of the camera" }[source] ?? source;
   return intrinsics.trust === "approximate" ? `${from}, then estimated with the pose` : from;
 }
 
