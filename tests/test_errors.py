@@ -159,15 +159,18 @@ def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> ht
         patch.setattr(service.jobs.photo_store, "write_durably", full)
         patch.setattr(service.scene_manager.scene_store.os, "fsync", full)
         patch.setattr(service.scene_manager.scene_store.shutil, "rmtree", undeletable)
-        writer = s.app.state.app_state.jobs._store._database._writer
-        (pages,) = writer.execute("PRAGMA page_count").fetchone()
-        writer.execute(f"PRAGMA max_page_count = {pages}")
-        writer.execute("PRAGMA query_only = 1")
+        app_state = s.app.state.app_state
+        writers = [store._database._writer for store in (app_state.jobs._store, app_state.lenses)]
+        for writer in writers:
+            (pages,) = writer.execute("PRAGMA page_count").fetchone()
+            writer.execute(f"PRAGMA max_page_count = {pages}")
+            writer.execute("PRAGMA query_only = 1")
         try:
             return send()
         finally:
-            writer.execute("PRAGMA query_only = 0")
-            writer.execute("PRAGMA max_page_count = 1000000")
+            for writer in writers:
+                writer.execute("PRAGMA query_only = 0")
+                writer.execute("PRAGMA max_page_count = 1000000")
 
 
 def uploaded(s: SimpleNamespace) -> str:
@@ -276,6 +279,9 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ),
     ("render_scene", "invalid_intrinsics"): lambda s: render(s, intrinsics={}),
     ("render_scene", "invalid_prior"): lambda s: render(s, pose={}),
+    ("delete_lens", "lens_not_found"): lambda s: s.client.delete("/lenses/0123456789abcdef"),
+    ("delete_lens", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses/0")),
+    ("delete_lenses", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses")),
     ("make_token", "no_keys"): lambda s: s.client.post("/tokens"),
 }
 for _code, _scene in SCENES.items():
@@ -334,7 +340,12 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
     **dict.fromkeys(("job_not_ready", "no_pose", "no_geo_anchor"), "export_pose"),
     **{"photo_gone": "job_photo", "record_not_found": "job_render", "job_not_found": "get_job"},
     **{"scene_not_found": "get_scene", "bad_input": "unload_scene", "scene_in_use": "delete_scene"},
-    **{"scene_exists": "upload_scene", "no_keys": "make_token", "interrupted": "see test_durable"},
+    **{
+        "scene_exists": "upload_scene",
+        "no_keys": "make_token",
+        "lens_not_found": "delete_lens",
+        "interrupted": "see test_durable",
+    },
 }
 
 LIKE_ALL = ("unauthorized", "forbidden", "internal_error", "content_too_large", "rate_limited", "queue_full")
