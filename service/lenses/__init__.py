@@ -4,5 +4,5 @@
     sure answer -> measurement without what the prior said -> estimate updated, or widened where they contradict
 
 `lens_key` says which photos have one lens, `lens_estimate` how an estimate is updated, `lens_store` where estimates
-are.
+are; `lens_memory` puts these together.
 """
