@@ -47,10 +47,14 @@ def answer(
     score: float = 0.99,
     sigmas: tuple[float, float, float] = (0.003, 0.004, 0.002),
 ) -> PoseEstimate:
-    focal_sigma, k1_sigma, shift_sigma = sigmas
     covariance, signals = np.eye(6) * 1e-6, {"sigma_share": np.sqrt(3e-6) / 4.0}
     verdict = Verdict(
-        status, Reason.VERIFIED, score, 200, 0.9, 1.0, covariance, focal_sigma, signals, k1_sigma, shift_sigma
+        status,
+        Reason.VERIFIED,
+        score,
+        *(200, 0.9, 1.0, covariance),
+        correction_sigma=(*sigmas, sigmas[2]),
+        signals=signals,
     )
     pose = viewpoint(angle_deg).pose
     return PoseEstimate(

@@ -89,6 +89,7 @@ def test_an_ended_job_is_described_as_before(taken_over, name):
     # Its records are gone; everything else is there, with the same numbers.
     assert (new.pop("records"), new.pop("stage")) == (0, None)
     del old["records"], old["stage"]
+    assert [new.pop(added) for added in ("camera_id", "lens")] == [None, None]
     if new["result"]:
         # The release knew neither.
         assert [new["result"].pop(added) for added in ("fitting_intrinsics", "covariance_given_lens")] == [None, None]

@@ -92,8 +92,7 @@ def measured(
     if not sure or not verdict.focal_sigma or intrinsics.model not in _MODELS:
         return None
     value = _stored_values(intrinsics, camera)
-    # 0: not estimated.
-    sigma = [verdict.focal_sigma, verdict.k1_sigma or math.inf, *2 * (verdict.principal_point_sigma or math.inf,)]
+    sigma = list(verdict.correction_sigma)
     if recalled is not None:
         value, sigma = _without_prior(value, sigma, _stored_values(recalled.intrinsics, camera), recalled.prior)
     if _is_turned_unknown(camera):

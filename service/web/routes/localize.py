@@ -122,8 +122,10 @@ async def create_job(
 
     def accept() -> StoredJob:
         sha256 = hashlib.sha256(body.photo).hexdigest()
-        # Of the validated fields: the same request as form and as JSON is the same job.
-        digest = hashlib.sha256((fields.model_dump_json() + sha256).encode()).hexdigest()
+        # Of the validated fields: the same request as form and as JSON is the same job. Requests of before there was a
+        # `camera_id` keep their digest.
+        absent = None if fields.camera_id else {"camera_id"}
+        digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
         owner = lens_owner(request, app_state)
         order = JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest, owner)
