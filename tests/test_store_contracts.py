@@ -79,7 +79,17 @@ def record(stage: str, index: int = 0) -> JobRecord:
 
 
 def result(status: Status = Status.LOCALIZED) -> JobResult:
-    verdict = Verdict(status, Reason.VERIFIED, 0.75, 100, 0.5, 0.25, np.eye(6) / 3, 0.01, signals={"inliers": 100.0})
+    verdict = Verdict(
+        status,
+        Reason.VERIFIED,
+        0.75,
+        100,
+        0.5,
+        0.25,
+        np.eye(6) / 3,
+        (0.01, 0.02, 0.03, 0.04),
+        signals={"inliers": 100.0},
+    )
     pose = Pose(np.array([[0.0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]))
     estimate = PoseEstimate(
         pose=pose,

@@ -92,7 +92,9 @@ def measured(
     if not sure or not verdict.focal_sigma or intrinsics.model not in _MODELS:
         return None
     value = _stored_values(intrinsics, camera)
-    sigma = list(verdict.correction_sigma)
+    focal_sigma, k1_sigma, *shift_sigmas = verdict.correction_sigma
+    # The larger one, for whichever way the photo is turned.
+    sigma = [focal_sigma, k1_sigma, *2 * (max(shift_sigmas),)]
     if recalled is not None:
         value, sigma = _without_prior(value, sigma, _stored_values(recalled.intrinsics, camera), recalled.prior)
     if _is_turned_unknown(camera):
