@@ -94,6 +94,18 @@ class TestLenses:
         aspect = photo.intrinsics.width / photo.intrinsics.height
         assert aspect == pytest.approx(LENS.width / LENS.height, rel=0.02)
 
+    @pytest.mark.parametrize("spec", ["jpeg=95", "scale=0.5", "crop=0.8", "letterbox=0.2", "blur=0.1"])
+    def test_what_follows_leaves_the_distortion(self, spec):
+        """Once more OpenCV's projection, of a photo that was changed after it was distorted."""
+        photo = modify(map_photo(), ["k1=-0.1", spec], RNG)
+        lens, (x, y) = photo.intrinsics, source_of(photo).T
+        rays = np.stack([(x - LENS.cx) / LENS.fx, (y - LENS.cy) / LENS.fy, np.ones_like(x)], 1)[:, None]
+        projected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix(lens), np.array([-0.1, 0, 0, 0]))
+        error = np.abs(projected[:, 0] - pixels_of(lens)).max(1)[photo.rgb[..., 1].ravel() > 0]
+        assert (lens.model, lens.distortion) == ("SIMPLE_RADIAL", (-0.1,))
+        assert np.median(error) < 1.0  # JPEG rounds colours to a pixel here
+        assert np.quantile(error, 0.9) < 2.5
+
     def test_a_pincushion_needs_no_cut(self):
         camera = modify(map_photo(), ["k1=0.1"], RNG).intrinsics
         assert (camera.width, camera.height, camera.cx, camera.cy) == (240, 180, LENS.cx, LENS.cy)

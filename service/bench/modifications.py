@@ -101,8 +101,12 @@ def _blur(photo: Photo, sigma: float, rng: np.random.Generator) -> Photo:
 
 
 def _jpeg(photo: Photo, quality: float, rng: np.random.Generator) -> Photo:
-    query = read_query(encode_image(photo.rgb, quality=round(quality)), intrinsics=photo.intrinsics)
-    return replace(photo, rgb=query.rgb.astype(np.float32) / 255, intrinsics=query.intrinsics)
+    lens = photo.intrinsics
+    # As a pinhole's, for reading would undistort the photo.
+    pinhole = replace(lens, model="PINHOLE", distortion=())
+    query = read_query(encode_image(photo.rgb, quality=round(quality)), intrinsics=pinhole)
+    camera = replace(query.intrinsics, model=lens.model, distortion=lens.distortion)
+    return replace(photo, rgb=query.rgb.astype(np.float32) / 255, intrinsics=camera)
 
 
 def _occlusion(photo: Photo, share: float, rng: np.random.Generator) -> Photo:
