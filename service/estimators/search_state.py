@@ -204,8 +204,9 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
-    # Of a small copy a doubt may vanish in the full size.
-    conclusive = verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative
+    # Of a small copy a doubt may vanish in the full size; intrinsics are tested at one size, whatever led to the pose.
+    contradicted = verdict.reason is Reason.INTRINSICS_CONTRADICTED
+    conclusive = contradicted or (verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative)
     state.finished = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64
 
-from service.geometry import se3_exp, transformed
+from service.geometry import se3_exp, se3_log, transformed
 from service.photos.intrinsics import undistorted_points
 from service.pose.absolute_pose.lens_prior import correction_vector, prior_cost, prior_precision, stepped
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
@@ -151,6 +151,47 @@ def refine_with_lens(
             if settled:
                 break
     return AbsolutePose(now.pose, now.error_px < max_error_px, now.correction)
+
+
+@dataclass(frozen=True, slots=True)
+class LensEvidence:
+    """What correspondences say against intrinsics that were given as exact."""
+
+    cost_drop: float
+    """By how much free intrinsics lower the robust cost: the difference of two chi-squares, in units of the mean cost of
+    a correspondence where that is more than 1, as in scenes whose model is poor."""
+    correction: IntrinsicsCorrection
+    """That lowers it most."""
+    motion: Float64[np.ndarray, "6"]
+    """Right twist (rad, scene units) from the best pose with the given intrinsics to that with the corrected ones."""
+
+
+EXACT = LensPrior(1e-5, 1e-5, 1e-5)
+"""A prior that leaves nothing to estimate."""
+
+
+def evidence_against_lens(
+    photo_px: Float[np.ndarray, "m 2"],
+    points_in_world: Float[np.ndarray, "m 3"],
+    intrinsics: Intrinsics,
+    start: AbsolutePose,
+    prior: LensPrior,
+    max_error_px: float,
+    config: LensSearchConfig = LENS_SEARCH,
+) -> LensEvidence:
+    """Refine the pose with the given intrinsics and with free ones, and compare.
+
+    `prior` is that of the free intrinsics.
+    """
+    given = (photo_px, points_in_world, intrinsics)
+    exact = refine_with_lens(*given, start, EXACT, max_error_px, config)
+    free = refine_with_lens(*given, exact, prior, max_error_px, config)
+    problem = _Problem(*given, prior, config.noise * max_error_px)
+    scale = config.cauchy_scales[-1] / config.noise
+    before, after = (problem.linearized(one.pose, one.correction, scale).cost for one in (exact, free))
+    motion = se3_log(exact.pose.camera_from_world @ free.pose.world_from_camera)
+    drop = (before - after) / max(1.0, before / len(photo_px))
+    return LensEvidence(drop, free.correction, motion)
 
 
 @dataclass(frozen=True, slots=True)

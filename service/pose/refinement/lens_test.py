@@ -2,10 +2,10 @@
 
 Wrong intrinsics leave a pose that makes up for them as well as it can, and residuals that it can't: with another focal
 length, distortion or principal point, the photo fits better at another pose. The linearized normal equations predict
-where that would be; only where it is not near the answer are pose and intrinsics refined together. Whether the fit is
-better is judged by the mean absolute residual. (58 answers with exact intrinsics: 0.97 of it and more is left. 91 with
-intrinsics so wrong that the pose is, focal lengths 3 and 5 % off, k1 of 0.08, crops off centre by a tenth: 0.91 at
-most.)
+where that would be; where it is near the answer and the residuals are small, pose and intrinsics are not refined
+together. Whether the fit is better is judged by the mean absolute residual. (58 answers with exact intrinsics: 0.97 of
+it and more is left. 91 with intrinsics so wrong that the pose is, focal lengths 3 and 5 % off, k1 of 0.08, crops off
+centre by a tenth: 0.91 at most.)
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from service.pose.refinement.covariance import inverse_spd
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.pyramid_level import CORRECTION, TWIST, PyramidLevel, RefinementState
 from service.pose.refinement.refinement_config import RefinementConfig
-from service.types import NO_CORRECTION, IntrinsicsCorrection, LensPrior
+from service.types import NO_CORRECTION, IntrinsicsCorrection
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +55,17 @@ def fit_lens(
     given ones are the best.
     """
     test = config.lens_test
-    prior = LensPrior(test.log_focal_scale, test.k1_sigma, test.principal_point_scale)
+    prior = test.prior
     depth = float(np.median(level.points[2]))
     information = hessian.copy()
     # As in refinement: with L1 weights the hessian is about `loss` times the information.
     information[CORRECTION, CORRECTION] += np.diag(loss * prior_precision(prior, NO_CORRECTION))
     inverse = inverse_spd(information)
-    if inverse is None or not _moves((inverse @ scores)[TWIST], depth, test.suspicious_deg, test.suspicious_share):
+    if inverse is None:
+        return None
+    # Large residuals are beyond what the linearization predicts.
+    moves = moves_pose((inverse @ scores)[TWIST], depth, test.suspicious_deg, test.suspicious_share)
+    if not moves and loss < test.suspicious_loss:
         return None
     free = replace(state, prior=prior, photometric=state.photometric.copy())
     steps = replace(config, max_steps=test.max_steps)
@@ -70,13 +74,13 @@ def fit_lens(
         return None
     motion = se3_log(state.photo_from_render @ np.linalg.inv(free.photo_from_render))
     ratio = free_loss / max(loss, 1e-9)
-    moves = _moves(motion, depth, test.contradicting_deg, test.contradicting_share)
+    moves = moves_pose(motion, depth, test.contradicting_deg, test.contradicting_share)
     share = float(np.linalg.norm(motion[3:])) / depth
     untested = motion * min(0.5, test.max_untested_share / max(share, 1e-9))
     return LensFit(free.correction, motion, ratio, moves and ratio < test.max_loss_ratio, untested)
 
 
-def _moves(motion: Float64[np.ndarray, "6"], depth: float, degrees: float, share: float) -> bool:
+def moves_pose(motion: Float64[np.ndarray, "6"], depth: float, degrees: float, share: float) -> bool:
     """Return whether a twist is greater than this rotation, or this share of the depth."""
     rotation, translation = np.linalg.norm(motion[:3]), np.linalg.norm(motion[3:])
     return bool(np.degrees(rotation) > degrees or translation > share * depth)

@@ -22,7 +22,7 @@ from service.pose.refinement.pyramid_level import (
     RefinementState,
     linearized_levels,
 )
-from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
+from service.pose.refinement.refinement_config import REFINEMENT, LensErrorConfig, RefinementConfig
 from service.types import NO_CORRECTION, Camera, LensPrior
 
 FOCAL = CORRECTION.start
@@ -41,6 +41,8 @@ class PoseUncertainty:
     """By how much the logarithm of an approximate focal length would still change."""
     lens_fit: LensFit | None = None
     """Of exact intrinsics: others that fit the photo, where these would move the pose; None: there are none."""
+    loss: float = 0.0
+    """Mean absolute residual (0..1) at the answer."""
 
 
 def pose_uncertainty(
@@ -85,15 +87,16 @@ def pose_uncertainty(
         if lens_fit and not lens_fit.contradicts:
             # The pixels can't tell whether the given intrinsics are right.
             covariance = covariance + np.outer(lens_fit.untested, lens_fit.untested)
-        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit)
+        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit, loss=loss)
     # A prior is information: added before the photometric parameters are marginalized.
     information = hessian.copy()
     information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(lens_prior, correction))
     covariance = _covariance(information, scale)
     if covariance is None:
         return None
+    covariance = _with_lens_error(covariance, config.lens_error)
     given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
-    return PoseUncertainty(last_step, covariance, given_lens, _focal_step(hessian, score))
+    return PoseUncertainty(last_step, covariance, given_lens, _focal_step(hessian, score), loss=loss)
 
 
 def _scores(
@@ -117,6 +120,13 @@ def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray
     free = FOCAL + 2
     inverse = inverse_spd(hessian[:free, :free])
     return 0.0 if inverse is None else float((inverse @ score[:free])[FOCAL])
+
+
+def _with_lens_error(covariance: Float64[np.ndarray, "10 10"], error: LensErrorConfig) -> Float64[np.ndarray, "10 10"]:
+    """Return the covariance with independent errors of the intrinsics, which the pose follows as it says, added."""
+    by_lens = np.linalg.solve(covariance[6:, 6:], covariance[6:]).T
+    shift = error.principal_point
+    return covariance + by_lens * np.array([error.log_focal, error.k1, shift, shift]) ** 2 @ by_lens.T
 
 
 def _covariance(information: Float64[np.ndarray, "n n"], scale: float) -> Float64[np.ndarray, "k k"] | None:

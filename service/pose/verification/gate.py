@@ -16,18 +16,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.absolute_pose.prior_region import inside_prior
+from service.pose.absolute_pose.unknown_lens import evidence_against_lens
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import RenderedView
-from service.pose.matching.correspondences import correspondences
+from service.pose.matching.correspondences import Correspondences, correspondences
+from service.pose.refinement.lens_test import LensFit, moves_pose
 from service.pose.refinement.photometric import RefinementResult
 from service.pose.refinement.refinement_config import REFINEMENT, RefinementConfig
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import GLOBAL_SIGNALS, appearance, visible_alpha
 from service.pose.verification.gate_model import SHIPPED_MODEL, GateModel
-from service.pose.verification.signals import NO_MATCHES, geometry_signals, match_signals
+from service.pose.verification.signals import NO_MATCHES, SIGNALS, geometry_signals, match_signals
 from service.results import Reason, Status, Verdict
-from service.types import Camera, Pose
+from service.types import Camera, Intrinsics, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,8 @@ class VerificationConfig:
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
+    min_lens_matches: int = 50
+    """Matches with which exact intrinsics are tested: ten unknowns with ten times as many equations."""
     max_inlier_scale: float = 10.0
     """Inliers of a partly invalid photo are scaled up to those of a whole one, at most by this factor."""
 
@@ -83,7 +88,9 @@ def verify(
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification.
-    if pixels_may_decide and photometric_suffices(signals, config):
+    # Where the scene's model is poor, the pixels don't show wrong intrinsics, and matches do.
+    large_loss = uncertainty is None or uncertainty.loss > config.refinement.lens_test.suspicious_loss
+    if pixels_may_decide and not large_loss and photometric_suffices(signals, config):
         verdict = verdict_of(signals, uncertainty, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
@@ -93,6 +100,8 @@ def verify(
         return verdict_of(signals | NO_MATCHES, uncertainty, few, config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
+    if uncertainty and query.lens_prior is None:
+        uncertainty = _with_evidence_of_matches(uncertainty, found, query, size, pose, config)
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
@@ -117,6 +126,29 @@ def _photometric_signals(
             photo, frame, rendered.camera, answer, images.query.lens_prior, valid, refinement, config.refinement
         )
     return signals | geometry_signals(frame, size, uncertainty), uncertainty
+
+
+def _with_evidence_of_matches(
+    uncertainty: PoseUncertainty,
+    found: Correspondences,
+    query: Query,
+    size: Intrinsics,
+    pose: Pose,
+    config: VerificationConfig,
+) -> PoseUncertainty:
+    """Return the uncertainty with what the matches say against exact intrinsics, if these put the pose off."""
+    test = config.refinement.lens_test
+    if len(found.photo_px) < config.min_lens_matches or (uncertainty.lens_fit and uncertainty.lens_fit.contradicts):
+        return uncertainty
+    error_px = SIGNALS.max_error_px * query.intrinsics.long_side / size.long_side
+    start = AbsolutePose(pose, np.zeros(len(found.photo_px), bool))
+    given = (found.photo_px, found.points_in_world, query.intrinsics)
+    evidence = evidence_against_lens(*given, start, test.prior, error_px)
+    depth = float(np.median(np.linalg.norm(found.points_in_world - pose.position_in_world, axis=1)))
+    moves = moves_pose(evidence.motion, depth, test.contradicting_deg, test.contradicting_share)
+    if not moves or evidence.cost_drop < test.min_cost_drop:
+        return uncertainty
+    return replace(uncertainty, lens_fit=LensFit(evidence.correction, evidence.motion, 1.0, True, np.zeros(6)))
 
 
 def photometric_suffices(signals: Mapping[str, float], config: VerificationConfig = VERIFICATION) -> bool:
