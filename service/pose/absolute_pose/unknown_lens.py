@@ -158,8 +158,8 @@ class LensEvidence:
     """What correspondences say against intrinsics that were given as exact."""
 
     cost_drop: float
-    """By how much free intrinsics lower the robust cost: the difference of two chi-squares, in units of the mean cost of
-    a correspondence where that is more than 1, as in scenes whose model is poor."""
+    """By how much free intrinsics lower the robust cost: the difference of two chi-squares, in units of a
+    correspondence's mean cost where that is more than 1, as in scenes whose model is poor."""
     correction: IntrinsicsCorrection
     """That lowers it most."""
     motion: Float64[np.ndarray, "6"]

@@ -91,8 +91,8 @@ class LensTestConfig:
     settled_px: float = 0.02
     """Of that refinement."""
     min_cost_drop: float = 6.5
-    """Of matches (`LensEvidence`): from which on they contradict the intrinsics. Of 14 answers with the right ones it is
-    4.5 at most, of 41 with wrong ones that put the pose off by more than the limit of what is right, 7.5 at least."""
+    """Of matches (`LensEvidence`): from which on they contradict the intrinsics. Of 14 answers with the right ones it
+    is 4.5 at most, of 41 with wrong ones that put the pose off by more than the limit of what is right 7.5 at least."""
 
     @property
     def prior(self) -> LensPrior:

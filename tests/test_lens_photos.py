@@ -1,0 +1,146 @@
+"""Photos of the demo scene through other lenses, resampled by OpenCV, with or without what they say of themselves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from io import BytesIO
+
+import cv2
+import numpy as np
+import pytest
+from api_server import ROOT
+from PIL import Image
+
+from service.geometry import pose_distance, se3_log
+from service.localize import LoadedScene, localize
+from service.photos.images import read_query
+from service.photos.intrinsics import intrinsics_from
+from service.results import PoseEstimate, Reason, Status
+from service.types import Intrinsics, Pose
+
+STUDIO = ROOT / "scenes" / "studio"
+TRUTH = {entry["photo"]: entry for entry in json.loads((STUDIO / "truth.json").read_text())}
+NAMES = ("photo_00.jpg", "photo_05.jpg", "photo_10.jpg")
+RIGHT_UNITS = 0.05
+"""Of the studio, whose training cameras are 4 scene units from its focus."""
+
+
+@pytest.fixture(scope="module")
+def studio(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    loaded = LoadedScene.load(STUDIO, cache_dir=tmp_path_factory.mktemp("cache"))
+    loaded.prepare("view_index")
+    return loaded
+
+
+@cache
+def photo(name: str) -> tuple[np.ndarray, Intrinsics, Pose]:
+    entry = TRUTH[name]
+    rgb = cv2.cvtColor(cv2.imread(str(STUDIO / "photos" / name)), cv2.COLOR_BGR2RGB)
+    return rgb, intrinsics_from(entry["intrinsics"]), Pose(np.array(entry["world_from_camera"]))
+
+
+def through_lens(name: str, k1: float = 0.0, fisheye: bool = False) -> tuple[np.ndarray, Intrinsics]:
+    """The photo as a distorting lens takes it: the middle, in which every pixel is known; its true focal length."""
+    rgb, camera, _ = photo(name)
+    share = 0.65 if fisheye else 0.8
+    width, height = int(share * camera.width), int(share * camera.height)
+    taken = replace(camera, width=width, height=height, cx=width / 2, cy=height / 2)
+    row, column = np.mgrid[:height, :width] + 0.5
+    px = np.stack([column.ravel(), row.ravel()], 1)[:, None]
+    matrix = np.array([[taken.fx, 0, taken.cx], [0, taken.fy, taken.cy], [0, 0, 1.0]])
+    undistort = cv2.fisheye.undistortPoints if fisheye else cv2.undistortPoints
+    rays = undistort(px, matrix, np.array([k1, 0.0, 0.0, 0.0]))[:, 0]
+    at = rays * [camera.fx, camera.fy] + [camera.cx - 0.5, camera.cy - 0.5]
+    assert at.min() >= 0
+    assert (at.max(0) <= [camera.width - 1, camera.height - 1]).all()
+    x, y = at.T.reshape(2, height, width).astype(np.float32)
+    return np.asarray(cv2.remap(rgb, x, y, cv2.INTER_CUBIC)), taken
+
+
+def cropped(name: str, share: float) -> tuple[np.ndarray, Intrinsics]:
+    """The photo's lower right part, with the intrinsics of somebody who takes it for a whole one."""
+    rgb, camera, _ = photo(name)
+    width, height = int(share * camera.width), int(share * camera.height)
+    return rgb[-height:, -width:], replace(camera, width=width, height=height, cx=width / 2, cy=height / 2)
+
+
+def jpeg(rgb: np.ndarray, focal_35mm: float | None = None) -> bytes:
+    file, exif = BytesIO(), Image.Exif()
+    if focal_35mm:
+        exif.get_ifd(0x8769)[0xA405] = round(focal_35mm)
+    Image.fromarray(rgb).save(file, "jpeg", quality=92, exif=exif)
+    return file.getvalue()
+
+
+def equivalent_mm(camera: Intrinsics) -> float:
+    return 36.0 * camera.fx / camera.long_side
+
+
+def assert_right(found: PoseEstimate, name: str) -> None:
+    truth = photo(name)[2]
+    degrees, units = pose_distance(found.pose, truth)
+    assert found.verdict.status is Status.LOCALIZED, found.verdict.reason
+    assert degrees < 1.0
+    assert units < RIGHT_UNITS
+    assert found.verdict.covariance is not None
+    twist = se3_log(found.pose.camera_from_world @ truth.world_from_camera)
+    assert twist @ np.linalg.solve(found.verdict.covariance, twist) < 40  # chi-square of six: 22 at 99.9 %
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("k1", [-0.08, 0.08])
+def test_an_untold_distortion_is_estimated_with_the_pose(studio: LoadedScene, name: str, k1: float) -> None:
+    rgb, taken = through_lens(name, k1)
+    for data, source in ((jpeg(rgb), "guessed"), (jpeg(rgb, equivalent_mm(taken)), "exif")):
+        found = localize(read_query(data), studio)
+        assert_right(found, name)
+        assert found.intrinsics_source == source
+        assert found.intrinsics.model == "SIMPLE_RADIAL"
+        assert found.intrinsics.distortion[0] == pytest.approx(k1, abs=0.015)
+        assert found.intrinsics.fx == pytest.approx(taken.fx, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.67])
+def test_a_focal_length_in_exif_that_is_not_true_does_not_hide_the_place(studio: LoadedScene, factor: float) -> None:
+    rgb, camera, _ = photo(NAMES[0])
+    found = localize(read_query(jpeg(rgb, factor * equivalent_mm(camera))), studio)
+    assert_right(found, NAMES[0])
+    assert found.intrinsics_source == "exif"
+    assert found.intrinsics.fx == pytest.approx(camera.fx, rel=0.01)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exact_intrinsics_without_the_distortion_are_contradicted(studio: LoadedScene, name: str) -> None:
+    rgb, taken = through_lens(name, -0.08)
+    found = localize(read_query(jpeg(rgb), intrinsics=taken), studio)
+    assert found.verdict.reason is Reason.INTRINSICS_CONTRADICTED
+    assert found.verdict.fitting_correction is not None
+    assert found.verdict.fitting_correction.k1 == pytest.approx(-0.08, abs=0.02)
+    told = replace(taken, model="SIMPLE_RADIAL", distortion=(-0.08,))
+    assert_right(localize(read_query(jpeg(rgb), intrinsics=told), studio), name)
+
+
+@pytest.mark.parametrize("factor", [0.95, 1.03])
+@pytest.mark.parametrize("name", NAMES)
+def test_an_exact_focal_length_that_is_not_true_is_contradicted(studio: LoadedScene, name: str, factor: float) -> None:
+    rgb, camera, _ = photo(name)
+    wrong = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
+    found = localize(read_query(jpeg(rgb), intrinsics=wrong), studio)
+    assert found.verdict.reason is Reason.INTRINSICS_CONTRADICTED
+    assert found.verdict.fitting_correction is not None
+    assert found.verdict.fitting_correction.focal_factor == pytest.approx(1 / factor, abs=0.025)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_lens_that_a_pinhole_is_said_to_be_gives_a_confident_wrong_pose(studio: LoadedScene, name: str) -> None:
+    """A fisheye, and a crop off centre."""
+    for rgb, said in (through_lens(name, fisheye=True), cropped(name, 0.8)):
+        assert localize(read_query(jpeg(rgb), intrinsics=said), studio).verdict.status is not Status.LOCALIZED
+        assert_right_if_localized(localize(read_query(jpeg(rgb)), studio), name)
+
+
+def assert_right_if_localized(found: PoseEstimate, name: str) -> None:
+    degrees, units = pose_distance(found.pose, photo(name)[2])
+    assert found.verdict.status is not Status.LOCALIZED or (degrees < 5 and units < RIGHT_UNITS)
