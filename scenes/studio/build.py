@@ -102,8 +102,8 @@ def quiet() -> Iterator[None]:
         os.close(kept)
 
 
-def take(view: View, target: Path, camera: bpy.types.Object) -> None:
-    """Render one upright photo; the file appears only when it is complete."""
+def take(view: View, target: Path, camera: bpy.types.Object, samples: int) -> None:
+    """Render one upright photo with so many samples a pixel; the file appears only when it is complete."""
     scene = bpy.context.scene
     upright = view.height > view.width
     camera.data.sensor_fit = "VERTICAL" if upright else "HORIZONTAL"
@@ -112,7 +112,7 @@ def take(view: View, target: Path, camera: bpy.types.Object) -> None:
     camera.matrix_world = Matrix(view.pose.tolist())
     scene.render.resolution_x, scene.render.resolution_y = view.width, view.height
     scene.render.resolution_percentage = 100
-    scene.cycles.samples = SAMPLES[target.parent.name]
+    scene.cycles.samples = samples
     partial = target.with_name(f"_{target.name}")
     scene.render.filepath = str(partial)
     with quiet():
@@ -127,7 +127,7 @@ def take_all(jobs: list[tuple[View, Path]], camera: bpy.types.Object) -> None:
     start = time.monotonic()
     for k, (view, path) in enumerate(missing, 1):
         before = time.monotonic()
-        take(view, path, camera)
+        take(view, path, camera, SAMPLES[path.parent.name])
         now = time.monotonic()
         left = (now - start) / k * (len(missing) - k)
         print(

@@ -90,15 +90,28 @@ def occlude(photo: Array, which: int) -> tuple[Array, float]:
     return photo + (front - photo) * alpha[..., None], share
 
 
-def write_jpeg(photo: Array, view: View, orientation: int, path: Path) -> None:
-    """JPEG as a camera would store it: pixels rotated by `orientation`, focal length and orientation in EXIF."""
+def write_jpeg(
+    photo: Array,
+    view: View,
+    orientation: int,
+    path: Path,
+    quality: int = QUALITY,
+    subsampling: int = 0,
+    device: str | None = None,
+) -> None:
+    """JPEG as a camera would store it: pixels rotated by `orientation`, focal length and orientation in EXIF.
+
+    `subsampling` of the chroma is Pillow's (0: none, 2: half the resolution), `device` the camera's model in EXIF.
+    """
     pixels = np.round(np.clip(photo, 0, 1) * 255).astype(np.uint8)
     stored = np.ascontiguousarray(np.rot90(pixels, ORIENTATIONS.get(orientation, 0)))
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
+    if device is not None:
+        exif[ExifTags.Base.Model] = device
     long_side = max(view.width, view.height)
     lens = exif.get_ifd(ExifTags.IFD.Exif)
     lens[ExifTags.Base.FocalLengthIn35mmFilm] = round(36 * view.focal / long_side)
     partial = path.with_name(f"_{path.name}")
-    Image.fromarray(stored).save(partial, quality=QUALITY, subsampling=0, exif=exif)
+    Image.fromarray(stored).save(partial, quality=quality, subsampling=subsampling, exif=exif)
     partial.replace(path)

@@ -244,10 +244,16 @@ def merge(spare: str) -> bpy.types.Object:
 
     A single mesh traces a good deal faster than hundreds of small ones whose bounds overlap.
     """
+    things = [o for o in bpy.context.scene.objects if o.type in {"MESH", "CURVE"} and o.name != spare]
+    return join(things, "studio")
+
+
+def join(things: Sequence[bpy.types.Object], name: str) -> bpy.types.Object:
+    """Replace objects by one mesh in world coordinates."""
     graph = bpy.context.evaluated_depsgraph_get()
     scene = bpy.context.scene
     pieces = []
-    for thing in [o for o in scene.objects if o.type in {"MESH", "CURVE"} and o.name != spare]:
+    for thing in things:
         mesh = bpy.data.meshes.new_from_object(thing.evaluated_get(graph))
         scale = mesh.materials[0].get("box_scale", 0.0)
         if scale:
@@ -258,11 +264,12 @@ def merge(spare: str) -> bpy.types.Object:
         mesh.transform(thing.matrix_world)
         pieces.append(bpy.data.objects.new(thing.name, mesh))
         bpy.data.objects.remove(thing)
+    bpy.ops.object.select_all(action="DESELECT")
     for piece in pieces:
         scene.collection.objects.link(piece)
         piece.select_set(True)
     whole = pieces[0]
     bpy.context.view_layer.objects.active = whole
     bpy.ops.object.join()
-    whole.name = "studio"
+    whole.name = name
     return whole
