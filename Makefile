@@ -49,7 +49,7 @@ studio: setup
 	$(STUDIO_PYTHON) -m venv scenes/studio/.venv
 	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
 	cd scenes/studio && .venv/bin/python build.py --out build
-	$(BIN)/python scenes/train.py scenes/studio/build --out scenes/studio/scene.compressed.ply
+	$(BIN)/python -m scenes.train scenes/studio/build --out scenes/studio/scene.compressed.ply
 	$(BIN)/python scenes/studio/assemble.py scenes/studio/build
 
 clean:

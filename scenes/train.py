@@ -1,10 +1,13 @@
 """Train a 3D Gaussian scene on the CPU with the gradients of splatfix's renderer.
 
-    python scenes/train.py FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 14000]
+    python -m scenes.train FOLDER --out scene.compressed.ply [--gaussians 240000] [--iterations 14000]
+                                  [--every 2] [--long-side 320] [--random] [--cameras]
 
 FOLDER holds `transforms.json` (nerfstudio layout; only `train_filenames` are used) and, if there is one, `points.npy`
-(float32 n x 6: position, sRGB colour) to start from. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed:
-those with little opacity are moved to those with the largest position gradients, which are split (after 3DGS-MCMC,
+(float32 n x 6: position, sRGB colour) to start from. Without it, or with `--random`, training starts from random points
+in the cameras' view. `--every` and `--long-side` train on fewer and smaller photos; `--cameras` writes those that were
+used beside the scene file. Loss: 0.8 L1 + 0.2 (1 - SSIM). The number of Gaussians is fixed: those with little opacity
+are moved to those with the largest position gradients, which are split (after 3DGS-MCMC,
 Kheradmand et al. 2024). Two photos a step, one on each of two threads.
 """
 
@@ -14,21 +17,20 @@ import argparse
 import json
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import gsply
 import numpy as np
-from PIL import Image
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from scenes.training_data import Photo, blur, extent_of, given_points, random_points, read_photos, write_cameras
 from service.interfaces import SceneGradients
 from service.jit import kernel
 from service.render.cpu import CpuRasterizer
 from service.render.pack import morton_order
 from service.scene_formats import load_scene
-from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
+from service.types import GaussianScene, SceneInfo
 
 SH_C0 = 0.28209479177387814
 SH_DEGREE = 2
@@ -43,34 +45,19 @@ MIN_OPACITY = 0.02
 SSIM_SHARE = 0.2
 OPACITY_DECAY = 1e-7
 """Gradient added to the opacity of every visible Gaussian, so that those the photos don't need can be relocated."""
-
-
-@dataclass(slots=True)
-class Photo:
-    """A photo with its camera."""
-
-    camera: Camera
-    rgb: np.ndarray
-    _blurred: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    def blurred(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the photo (0..1) with its local means and variances for SSIM; computed once."""
-        if self._blurred is None:
-            target = self.rgb.astype(np.float32) / np.float32(255)
-            means = blur(target)
-            self._blurred = target, means, blur(target * target) - means * means
-        return self._blurred
+RANDOM_OPACITY = 0.1
+"""Of random points to begin with: most of them are in free space."""
 
 
 class Model:
     """Parameters before activation, Adam's state, and activated arrays, of which a `GaussianScene` has views."""
 
-    def __init__(self, points: np.ndarray, colours: np.ndarray, spacing: np.ndarray) -> None:
-        n = len(points)
+    def __init__(self, points: np.ndarray, colours: np.ndarray, opacity: float = 0.5) -> None:
+        n, spacing = len(points), neighbour_distance(points)
         self.means = points.astype(np.float32)
         self.quats = np.tile(np.float32([1, 0, 0, 0]), (n, 1))
         self.log_scales = np.log(np.repeat(0.7 * spacing[:, None], 3, 1)).astype(np.float32)
-        self.logits = np.zeros(n, np.float32)
+        self.logits = np.full(n, np.log(opacity / (1 - opacity)), np.float32)
         self.sh = np.zeros((n, (SH_DEGREE + 1) ** 2, 3), np.float32)
         self.sh[:, 0] = (colours - 0.5) / SH_C0
         self.scales, self.opacities = np.empty_like(self.log_scales), np.empty_like(self.logits)
@@ -130,6 +117,14 @@ class Model:
         return len(low)
 
 
+def neighbour_distance(points: np.ndarray) -> np.ndarray:
+    """Return each point's distance to its three nearest neighbours, as the root of the mean of squares."""
+    points = np.ascontiguousarray(points, np.float32)
+    matcher = cv2.flann.Index(points, {"algorithm": 1, "trees": 4})
+    _, squared = matcher.knnSearch(points, 4, params={"checks": 64})
+    return np.sqrt(np.maximum(squared[:, 1:].mean(1), 1e-8))
+
+
 @kernel
 def adam_rows(index, gradients, values, moments, first, steps, rate):
     """Do one step of Adam on the rows `index`; the parameter's moments begin at column `first`."""
@@ -180,14 +175,6 @@ def step(model: Model, g: SceneGradients, means_rate: float, rate: float, degree
     model.opacities[i] = 1 / (1 + np.exp(-model.logits[i]))
 
 
-def blur(image: np.ndarray) -> np.ndarray:
-    """Return the image under SSIM's window (Wang et al. 2004): Gaussian, 11 pixels, sigma 1.5.
-
-    The filter is symmetric, so it is its own adjoint.
-    """
-    return cv2.GaussianBlur(image, (11, 11), 1.5, borderType=cv2.BORDER_CONSTANT)
-
-
 def loss_gradient(picture: np.ndarray, photo: Photo) -> tuple[float, np.ndarray]:
     """Return the loss 0.8 L1 + 0.2 (1 - SSIM) of a render, and its gradient with respect to the render."""
     d_mu, d_s11, d_s12, gradient = (np.empty_like(picture) for _ in range(4))
@@ -234,33 +221,6 @@ def _gather_gradient(picture, target, d_mu, d_s11, d_s12, share, gradient):
     return total / picture.shape[0]
 
 
-def read_photos(folder: Path, key: str) -> list[Photo]:
-    """Return the photos that `transforms.json` lists under the key."""
-    transforms = json.loads((folder / "transforms.json").read_text())
-    photos = []
-    for frame in transforms["frames"]:
-        if frame["file_path"] not in transforms[key]:
-            continue
-        pixels = Image.open(folder / frame["file_path"]).convert("RGB")
-        intrinsics = Intrinsics(*pixels.size, frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"])
-        opencv = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
-        photos.append(Photo(Camera(intrinsics, Pose(opencv)), np.asarray(pixels)))
-    return photos
-
-
-def starting_points(folder: Path, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return initial positions, colours, and distances to the nearest neighbours as sizes, from `points.npy`."""
-    given = np.load(folder / "points.npy", allow_pickle=False)
-    rows = given[rng.choice(len(given), count, replace=len(given) < count)]
-    points, colours = rows[:, :3].astype(np.float32), rows[:, 3:]
-    if len(given) < count:
-        # Points drawn twice are moved apart by a centimetre, else their Gaussians would stay identical.
-        points = points + rng.normal(size=points.shape).astype(np.float32) * 0.01
-    matcher = cv2.flann.Index(points, {"algorithm": 1, "trees": 4})
-    _, squared = matcher.knnSearch(points, 4, params={"checks": 64})
-    return points, colours, np.sqrt(np.maximum(squared[:, 1:].mean(1), 1e-8))
-
-
 def psnr(rasterizer: CpuRasterizer, photos: list[Photo]) -> float:
     """Return the mean PSNR of renders at the photos' cameras, in dB."""
     values = []
@@ -270,25 +230,20 @@ def psnr(rasterizer: CpuRasterizer, photos: list[Photo]) -> float:
     return float(np.mean(values))
 
 
-def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> GaussianScene:
-    """Return a scene trained on a folder's training photos; print the PSNR of the held-out ones at the end."""
-    rng = np.random.default_rng(seed)
-    photos, held_out = read_photos(folder, "train_filenames"), read_photos(folder, "test_filenames")
+def scene_info(folder: Path, photo: Photo) -> SceneInfo:
+    """Return what the file will not tell: the background, and the size and lens of the photos trained on."""
     background = tuple(json.loads((folder / "transforms.json").read_text()).get("background", (0, 0, 0)))
-    intrinsics = photos[0].camera.intrinsics
-    info = SceneInfo(
-        folder.name,
-        folder.name,
-        "",
-        "ply",
-        background,
-        training_focal_px=intrinsics.fx,
-        training_long_side_px=intrinsics.long_side,
-    )
-    model = Model(*starting_points(folder, gaussians, rng))
+    k = photo.camera.intrinsics
+    name = folder.name
+    return SceneInfo(name, name, "", "ply", background, training_focal_px=k.fx, training_long_side_px=k.long_side)
+
+
+def train(
+    model: Model, photos: list[Photo], info: SceneInfo, iterations: int, rng: np.random.Generator
+) -> GaussianScene:
+    """Return the scene that the model becomes by training on photos."""
     rasterizer = CpuRasterizer(model.scene(info))
-    places = np.array([p.camera.pose.position_in_world for p in photos])
-    extent = float(np.linalg.norm(places - places.mean(0), axis=1).max())
+    extent = extent_of(np.array([p.camera.pose.position_in_world for p in photos]))
 
     def gradients(photo: Photo) -> tuple[float, SceneGradients]:
         picture = rasterizer.render([photo.camera])[0].rgb
@@ -296,7 +251,7 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
         return loss, rasterizer.scene_gradients(photo.camera, d_rgb)
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    start, order, average = time.perf_counter(), [], 0.1
+    start, cpu_start, order, average = time.perf_counter(), time.process_time(), [], 0.1
     with Progress(*columns) as bar, ThreadPoolExecutor(2) as pool:
         task = bar.add_task("training", total=iterations)
         for iteration in range(0, iterations, 2):
@@ -317,7 +272,7 @@ def train(folder: Path, gaussians: int, iterations: int, seed: int = 0) -> Gauss
             else:
                 rasterizer.refresh()
             bar.update(task, advance=2, description=f"loss {average:.4f}")
-    print(f"trained in {time.perf_counter() - start:.0f} s; held-out PSNR {psnr(rasterizer, held_out):.2f} dB")
+    print(f"trained in {time.perf_counter() - start:.0f} s, {time.process_time() - cpu_start:.0f} s of CPU time")
     return model.scene(info)
 
 
@@ -340,16 +295,29 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--gaussians", type=int, default=240_000)
     parser.add_argument("--iterations", type=int, default=14_000)
+    parser.add_argument("--every", type=int, default=1, help="train on every second, third ... of the photos only")
+    parser.add_argument("--long-side", type=int, help="reduce the photos to so many pixels")
+    parser.add_argument("--random", action="store_true", help="start from random points, not from points.npy")
+    parser.add_argument("--cameras", action="store_true", help="write transforms.json and scene.json beside the scene")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    scene = train(arguments.folder, arguments.gaussians, arguments.iterations)
-    write(scene, arguments.out)
-    written = load_scene(arguments.out)
+    folder, out, rng = arguments.folder, arguments.out, np.random.default_rng(0)
+    photos = read_photos(folder, "train_filenames", arguments.every, arguments.long_side)
+    if arguments.random or not (folder / "points.npy").is_file():
+        model = Model(*random_points(photos, arguments.gaussians, rng), RANDOM_OPACITY)
+    else:
+        model = Model(*given_points(folder / "points.npy", arguments.gaussians, rng))
+    info = scene_info(folder, photos[0])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    write(train(model, photos, info, arguments.iterations, rng), out)
+    if arguments.cameras:
+        write_cameras(folder, out.parent, [photo.name for photo in photos], photos[0].camera.intrinsics)
+    written = load_scene(out)
     again = CpuRasterizer(
-        GaussianScene(written.means, written.quats, written.scales, written.opacities, written.sh, scene.info)
+        GaussianScene(written.means, written.quats, written.scales, written.opacities, written.sh, info)
     )
-    held_out = read_photos(arguments.folder, "test_filenames")
-    print(f"{arguments.out}: {written.count} Gaussians, held-out PSNR as written {psnr(again, held_out):.2f} dB")
+    held_out = read_photos(folder, "test_filenames", long_side=arguments.long_side)
+    print(f"{out}: {written.count} Gaussians from {len(photos)} photos, held-out PSNR {psnr(again, held_out):.2f} dB")
 
 
 if __name__ == "__main__":
