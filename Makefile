@@ -9,7 +9,7 @@ STUDIO_BIN := scenes/studio/.venv/bin
 # Files are shared out among the cores; a file's tests share their servers.
 PYTEST := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup demo test coverage newest lint check studio clean
+.PHONY: setup demo test coverage newest lint check studio another-day clean
 
 setup: .venv/ready
 
@@ -45,12 +45,19 @@ lint: setup
 	$(BIN)/ruff format .
 
 # Rebuilds the demo scene from nothing: some 45 minutes of path tracing and 15 of training on two cores.
-studio: setup
-	$(STUDIO_PYTHON) -m venv scenes/studio/.venv
-	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
+studio: setup scenes/studio/.venv/ready
 	cd scenes/studio && .venv/bin/python build.py --out build
 	$(BIN)/python -m scenes.train scenes/studio/build --out scenes/studio/scene.compressed.ply
 	$(BIN)/python scenes/studio/assemble.py scenes/studio/build
+
+# The same room in other light, with other furniture, people, a phone: some 20 minutes of path tracing.
+another-day: scenes/studio/.venv/ready
+	cd scenes/studio && .venv/bin/python another_day.py
+
+scenes/studio/.venv/ready: scenes/studio/requirements.txt
+	$(STUDIO_PYTHON) -m venv scenes/studio/.venv
+	$(STUDIO_BIN)/python -m pip install --quiet --requirement scenes/studio/requirements.txt
+	touch scenes/studio/.venv/ready
 
 clean:
 	rm -rf .venv scenes/studio/.venv

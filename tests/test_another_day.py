@@ -8,8 +8,16 @@ import pytest
 from api_server import ROOT
 
 from scenes.studio import phone
+from service.bench.bench_photos import BenchPhoto, find_photos
+from service.geometry import moved
+from service.photos.images import read_query
+from service.render.cpu import CpuRasterizer
+from service.scene_formats import load_scene
+from service.types import Camera
 
 STUDIO = ROOT / "scenes" / "studio"
+ANOTHER_DAY = ROOT / "scenes" / "studio_another_day"
+CONDITIONS = ("same_light", "evening", "night", "furniture", "people", "phone")
 
 
 def distorted_by_opencv(lens: phone.Lens, rays: np.ndarray) -> np.ndarray:
@@ -70,3 +78,56 @@ def test_noise_has_the_stated_variance():
 def test_srgb_is_the_standards():
     # IEC 61966-2-1: the middle of the 8-bit range is 0.2140 of linear light.
     assert phone.srgb(np.array([0.21404, 0.0031308, 1.5])) == pytest.approx([0.5, 0.04045, 1], abs=1e-4)
+
+
+class TestPhotos:
+    @pytest.mark.parametrize("condition", CONDITIONS)
+    def test_are_far_from_the_training_cameras(self, condition):
+        training = np.array(
+            [f["transform_matrix"] for f in json.loads((STUDIO / "transforms.json").read_text())["frames"]]
+        )
+        photos = find_photos(ANOTHER_DAY / condition)
+        truth = json.loads((ANOTHER_DAY / condition / "truth.json").read_text())
+        assert len(photos) == 24
+        for photo, entry in zip(photos, truth, strict=True):
+            far = np.linalg.norm(training[:, :3, 3] - photo.camera.pose.position_in_world, axis=1)
+            alike = training[:, :3, 2] @ photo.camera.pose.axis_in_world < -np.cos(np.radians(30))
+            assert far.min() == pytest.approx(entry["nearest_training_camera_m"], abs=6e-4)
+            assert far[alike].min() == pytest.approx(entry["nearest_alike_m"], abs=6e-4)
+            assert far.min() >= 0.35
+            assert far[alike].min() >= 0.8
+
+    def test_people_cover_a_part(self):
+        truth = json.loads((ANOTHER_DAY / "people" / "truth.json").read_text())
+        covered = [entry["covered"] for entry in truth]
+        assert min(covered) >= 0.14
+        assert max(covered) <= 0.40
+
+    def test_are_small(self):
+        assert sum(path.stat().st_size for path in ANOTHER_DAY.rglob("*.jpg")) < 4e6
+
+    @pytest.mark.parametrize("condition", CONDITIONS)
+    def test_the_truth_fits_the_pixels(self, condition, rasterizer):
+        """Edges of renders at the truth are more like the photo's than of renders that are turned by a degree."""
+        at_truth, turned = [], []
+        for photo in find_photos(ANOTHER_DAY / condition)[::6]:
+            at_truth.append(edge_correlation(rasterizer, photo, np.zeros(3)))
+            turned += [edge_correlation(rasterizer, photo, turn) for turn in np.radians(np.eye(3)[:2])]
+        assert np.median(at_truth) > 0.35
+        assert np.median(at_truth) > 1.5 * np.median(turned)
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> CpuRasterizer:
+    return CpuRasterizer(load_scene(STUDIO / "scene.compressed.ply"))
+
+
+def edge_correlation(rasterizer: CpuRasterizer, photo: BenchPhoto, turn: np.ndarray) -> float:
+    """Correlation of the Laplacians of a photo and of a render, at half the photo's size."""
+    query = read_query(photo.path.read_bytes(), intrinsics=photo.camera.intrinsics)
+    pose = moved(photo.camera.pose, np.concatenate([turn, np.zeros(3)]))
+    small = query.intrinsics.with_long_side(240)
+    render = rasterizer.render([Camera(small, pose)])[0].rgb
+    reduced = cv2.resize(query.rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    edges = [cv2.Laplacian(image.astype(np.float32).mean(2), cv2.CV_32F, ksize=3) for image in (render, reduced)]
+    return float(np.corrcoef(edges[0].ravel(), edges[1].ravel())[0, 1])

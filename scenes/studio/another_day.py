@@ -6,8 +6,8 @@ Writes `../studio_another_day/<condition>/`: photos, and a truth.json of their p
 upright image). The conditions:
 
     same_light   as in the training photos
-    evening      a low red sun
-    night        one lamp, noise
+    evening      a low red sun; exposed for it
+    night        one lamp; exposed for it, noise
     furniture    a third of the things moved, two new, one gone
     people       one to three people cover 14 to 40 % of the photo
     phone        a phone's lens, rolling shutter and processing (phone.py)
@@ -162,7 +162,7 @@ def developed(view: View, condition: str, linear: Array, rng: Rng) -> tuple[Arra
         return phone.develop(photo, rng), {"turn_deg": degrees}
     if condition == "night":
         return phone.develop_dark(linear, rng), {}
-    return phone.srgb(linear), {}
+    return phone.srgb(phone.metered(linear, 0.09) if condition == "evening" else linear), {}
 
 
 def intrinsics(view: View, condition: str) -> dict:

@@ -17,6 +17,7 @@ MARGIN = 1.16
 """Size of the pinhole image that is resampled, relative to the photo's: K1 and the shutter show more than that."""
 DENSITY = 4 / 3
 """Its pixels per pixel of the photo."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 READOUT = 0.030
 """Seconds from the first row's exposure to the last one's."""
 
@@ -101,6 +102,11 @@ def srgb(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
+def metered(linear: Array, level: float) -> Array:
+    """Return the image exposed so that the geometric mean of its luminance is `level`."""
+    return linear * (level / np.exp(np.mean(np.log(linear @ LUMINANCE + 1e-3))))
+
+
 def noisy(linear: Array, shot: float, read: float, rng: Rng) -> Array:
     """Add noise of variance `shot` x value + `read`^2."""
     return linear + rng.normal(size=linear.shape) * np.sqrt(shot * np.maximum(linear, 0) + read**2)
@@ -113,9 +119,8 @@ def develop(linear: Array, rng: Rng) -> Array:
     off_axis = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / (width**2 + height**2) * 4
     balance = np.exp(rng.normal(size=3) * 0.05)
     exposed = linear * balance * (1 - 0.3 * off_axis)[..., None]
-    exposed *= 0.16 / np.exp(np.mean(np.log(exposed @ (0.2126, 0.7152, 0.0722) + 1e-3))) * 2 ** rng.normal(0, 0.25)
-    exposed = noisy(exposed, 3e-4, 0.002, rng)
-    grey = (exposed @ (0.2126, 0.7152, 0.0722))[..., None]
+    exposed = noisy(metered(exposed, 0.16) * 2 ** rng.normal(0, 0.25), 3e-4, 0.002, rng)
+    grey = (exposed @ LUMINANCE)[..., None]
     rolled = 1 - np.exp(-1.4 * np.maximum(grey + 1.15 * (exposed - grey), 0))
     curve = srgb(rolled)
     curve = 0.6 * curve + 0.4 * curve**2 * (3 - 2 * curve)
@@ -130,8 +135,7 @@ def softened(image: Array) -> Array:
 
 
 def develop_dark(linear: Array, rng: Rng) -> Array:
-    """Return a photo (sRGB 0..1) of a dark room: exposed for its median, half of the lamp's colour removed, noise."""
+    """Return a photo (sRGB 0..1) of a dark room: half of the lamp's colour removed, much noise."""
     mean = linear.reshape(-1, 3).mean(0)
     balance = np.sqrt(mean[1] / mean)
-    exposed = linear * balance * (0.10 / max(float(np.median(linear @ (0.2126, 0.7152, 0.0722))), 1e-3))
-    return srgb(noisy(exposed, 2e-3, 0.004, rng))
+    return srgb(noisy(metered(linear * balance, 0.09), 2e-3, 0.004, rng))
