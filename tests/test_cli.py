@@ -298,7 +298,7 @@ def test_bench_field_runs_what_its_flags_say_and_prints_the_table(splatfix, monk
     line = {"scene": "s", "localized": True, "right": True, "reason": "verified", "below_floor": [], "cpu_ms": 1.0}
     line |= {"rotation_deg": 0.1, "translation_units": 0.01, "nees": 5.0, "focal_error": 0.0, "k1_error": 0.0}
     rows = [("lens/told", "lens"), ("photo/blur=4", "photo"), ("random/exif", "random")]
-    lines = [line | {"row": row, "pool": row, "group": group} for row, group in rows]
+    lines = [line | {"row": row, "pool": row, "group": group, "code": group[:1]} for row, group in rows]
     monkeypatch.setattr(field, "read_results", lambda asked: lines)
     scenes = [tmp_path / "room", f"{tmp_path / 'room'}={tmp_path / 'night'}"]
     code, told, _ = splatfix("bench", "field", *scenes, "--out", tmp_path, "--row", "lens/told", "--photos", "3")
@@ -311,6 +311,7 @@ def test_bench_field_runs_what_its_flags_say_and_prints_the_table(splatfix, monk
     assert (seen[1].rows, seen[1].random, "random/exif" in told, "lens/told" in told) == ([], 5, True, False)
     told = splatfix("bench", "field", *scenes, "--out", tmp_path, "--table-only")[1]
     assert (len(seen), "random/exif" in told, "blur" in told) == (2, True, True)
+    assert "several versions of the code: l, p, r" in told
     assert "lens/k1=-0.1/exif" in splatfix("bench", "field", "--list")[1].splitlines()
     assert splatfix("bench", "field", "--row", "lens/nothing", "--list")[0] == 2
 

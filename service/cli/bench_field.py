@@ -55,3 +55,6 @@ def bench_field(
     if rows or random:
         lines = [one for one in lines if one["row"] in names or (random and one["group"] == "random")]
     say(table(lines, by_scene))
+    # A run that was gone on with may mix them.
+    if len(versions := sorted({one["code"] for one in lines})) > 1:
+        say(f"made by several versions of the code: {', '.join(versions)}")
