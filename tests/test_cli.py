@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 import service
 import service.__main__
@@ -98,6 +98,22 @@ def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo,
     assert row["status"] == "localized"
     code, told, _ = splatfix("localize", photo, *given)
     assert told.startswith(f"{photo}: localized, score ")
+
+
+def test_photos_tell_the_lens_of_the_next_ones_where_that_is_asked_for(splatfix, room, photo, tmp_path):
+    exif = Image.Exif()
+    exif[ExifTags.Base.Model] = "phone"
+    photos = [tmp_path / f"{k}.png" for k in range(2)]
+    for path in photos:
+        Image.open(photo).save(path, exif=exif)
+    for asked, sources in (((), ["guessed", "guessed"]), (("--learn-lenses",), ["guessed", "memory"])):
+        code, told, _ = splatfix("localize", *photos, "--scene", room, "--json", *asked)
+        assert code == 0
+        results = json.loads(told)
+        assert [result["status"] for result in results] == ["localized", "localized"]
+        assert [result["intrinsics_source"] for result in results] == sources
+    code, _, told = splatfix("localize", *photos, "--sequence", "--scene", room, "--learn-lenses")
+    assert (code, "--learn-lenses" in told) == (2, True)
 
 
 def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):

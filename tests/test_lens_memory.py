@@ -233,6 +233,10 @@ def test_the_second_photo_of_a_phone_starts_from_the_first_ones_lens():
         other = post(client, photo(model="iPhone 13")).json()
         told = {"width": 80, "height": 60, "fx": 60, "fy": 60, "cx": 40, "cy": 30}
         given = post(client, photo(), camera_id="mine", intrinsics=told).json()
+        for bad in ("", "x" * 65, "a\nb", "ä"):
+            body = {"photo": "AAAA", "camera_id": bad}
+            assert_problem(client.post("/localize", json=body), 400, "invalid_request", "camera_id")
+    assert [job["camera_id"] for job in (first, other)] == ["mine", None]
     sources = [job["result"]["intrinsics_source"] for job in (first, second, third, other, given)]
     assert sources == ["exif", "memory", "memory", "exif", "given"]
     assert [job["lens"] and job["lens"]["photos"] for job in (first, second, third, other, given)] == [
@@ -259,15 +263,6 @@ def test_the_second_photo_of_a_phone_starts_from_the_first_ones_lens():
     assert lens["k1"] == pytest.approx(-0.06)
     assert lens["principal_point"] == pytest.approx([40 / 4032, -24 / 4032])
     assert (lens["aspect"], lens["focal_35mm"], lens["is_video"]) == (1.33, 26.0, False)
-
-
-def test_a_job_says_which_camera_it_was_sent_for():
-    with sure_service() as (client, _):
-        assert post(client, photo(), camera_id="rig-2: left").json()["camera_id"] == "rig-2: left"
-        assert post(client, photo()).json()["camera_id"] is None
-        for bad in ("", "x" * 65, "a\nb", "ä"):
-            body = {"photo": "AAAA", "camera_id": bad}
-            assert_problem(client.post("/localize", json=body), 400, "invalid_request", "camera_id")
 
 
 def test_nothing_is_remembered_where_that_is_turned_off(tmp_path):

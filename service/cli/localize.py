@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -57,6 +58,9 @@ def localize(
     times: Annotated[str, typer.Option(help="Of a sequence's photos: JSON list of seconds, or a file of it.")] = "",
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
     tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
+    learn_lenses: Annotated[
+        bool, typer.Option("--learn-lenses", help="Photos tell the lens of the same camera's next ones, by EXIF.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
 ) -> None:
     """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which."""
@@ -74,6 +78,8 @@ def localize(
     track_camera = sequence or any(is_sequence(data) for _, data in files)
     if not track_camera:
         _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times})
+    elif learn_lenses:
+        raise InvalidRequest("the photos of a sequence share a lens anyway.", where="--learn-lenses")
     paths = [path for given_path in scene for path in find_scenes(given_path)]
     if track_camera:
         _require_one_scene(paths)
@@ -83,7 +89,8 @@ def localize(
     if track_camera:
         _localize_sequence(body_of(files, {}), fields, loaded[0], output)
     else:
-        _localize_each([Body(data, name, {}) for name, data in files], fields, loaded, output)
+        bodies = [Body(data, name, {}) for name, data in files]
+        _localize_each(bodies, fields, loaded, output, learn_lenses=learn_lenses)
 
 
 def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
@@ -110,19 +117,27 @@ def _require_one_scene(paths: list[Path]) -> None:
         )
 
 
-def _localize_each(bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output) -> None:
+def _localize_each(
+    bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output, *, learn_lenses: bool
+) -> None:
     """Localize every photo by itself, in the one scene or in each of several."""
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
+    from service.lenses.lens_memory import LensMemory
+    from service.lenses.lens_store import MemoryLensStore
     from service.web.schemas.conversion import result_out
     from service.web.schemas.job_spec import job_spec
 
+    lenses = LensMemory(MemoryLensStore(len(bodies))) if learn_lenses else None
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         spec = job_spec(fields)
-        photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb)
+        recall = partial(lenses.recall, "", None) if lenses else None
+        photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb, recall=recall)
         result, _ = run_task(photo.task(spec), loaded)
+        if lenses:
+            lenses.learn("", None, photo.camera, photo.recalled, result.estimate)
         results.append((body.name, result_out(result)))
         if not output.as_json:
             # At once, not in the end: a photo may take seconds.
