@@ -274,7 +274,7 @@ def estimate_of(
         budget_exhausted=exhausted,
         renders=renders,
         timings=tuple(timings),
-        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded),
+        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded) + _untested(verdict),
         records=tuple(records),
     )
 
@@ -316,6 +316,15 @@ def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
     return (
         f"the size of the photos that the scene was trained with is unknown: {assumed} px is assumed, which can shift "
         'the pose a little; say "training_size" in scene.json.',
+    )
+
+
+def _untested(verdict: Verdict) -> tuple[str, ...]:
+    if not verdict.intrinsics_untested:
+        return ()
+    return (
+        "the photo can't confirm its intrinsics: a focal length that is 1 % off moves the camera by about 1 % of its "
+        "distance, which the covariance allows for.",
     )
 
 

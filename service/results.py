@@ -174,6 +174,8 @@ class Verdict:
     point (x, y) in long sides. 0 where they were given as exact."""
     covariance_given_lens: Float64[np.ndarray, "6 6"] | None = None
     """The covariance if the estimated intrinsics were the true ones; None where they were given as exact."""
+    intrinsics_untested: bool = False
+    """Whether exact intrinsics can't be confirmed by the photo: its covariance then allows for some error of them."""
     fitting_correction: IntrinsicsCorrection | None = None
     """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)

@@ -496,30 +496,6 @@ def test_pixels_are_enough_only_where_local_colours_agree_too() -> None:
     assert not photometric_suffices(signals | {"gradients": 0.5, "gradients_half": 0.7})
 
 
-def test_features_of_a_large_render_lie_where_they_are_in_it() -> None:
-    """Where the lens is free renders are large; their features are found in a smaller copy."""
-
-    class BrightBlock(KnownPoints):
-        def extract(self, rgb: np.ndarray, limit: int) -> Features:
-            assert max(rgb.shape) == PHOTO_PX
-            rows, columns = np.nonzero(rgb[..., 0] > 128)
-            point = np.array([[columns.mean() + 0.5, rows.mean() + 0.5]], np.float32)
-            return Features(point, np.ones(1, np.float32), np.eye(1, dtype=np.float32))
-
-    class Block(PaintedWalls):
-        def _render(self, camera: Camera) -> Frame:
-            frame = super()._render(camera)
-            rgb = np.zeros_like(frame.rgb)
-            rgb[100:120, 200:220] = 1.0
-            return Frame(rgb, np.ones_like(frame.alpha), frame.depth, np.full_like(frame.depth, 2.0))
-
-    lens = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, trust="approximate")
-    query = Query(np.zeros((480, 640, 3), np.uint8), lens, "given", lens)
-    view = ViewRenderer(Block()).at(query, true_pose()).view(BrightBlock())
-    assert view.camera.intrinsics.width == 640
-    assert view.features.points_px == pytest.approx(np.array([[210.0, 110.0]]), abs=0.5)
-
-
 @given(st.floats(-10, 1000), st.floats(-10, 1000))
 def test_scales_are_monotonous_and_meet_their_marks(a: float, b: float) -> None:
     for scale in (Scale(15.0, 400.0), Scale(15.0, 400.0, logarithmic=True)):

@@ -73,10 +73,15 @@ class SearchConfig:
     """Inliers, and their share of the matches, from which on a render at the pose is made: of 168 searches with fewer,
     119 of them for photos of other scenes, none led to an answer; with 12 to 30 those have a median share of 0.04 to
     0.05."""
-    rematch_below_inliers: int = 80
-    """With fewer inliers a pose is matched with a render before it is refined."""
+    rematch_below_inliers: int = 30
+    """With fewer inliers a pose is matched with a render before it is refined..."""
+    rematch_if_refused_below_inliers: int = 80
+    """...and with fewer than that if the gate refuses what refinement led to: a render and its features cost as much as
+    refinement, which mostly converges without."""
     photometric_min_inliers: float = MATCHING.sufficient_inliers
-    """Inliers with a view from which on the pixels alone may decide the verification."""
+    """Inliers with a view from which on the pixels alone may decide the verification..."""
+    photometric_min_inliers_free_lens: int = 100
+    """...and with estimated intrinsics, with which pixels agree more easily."""
     max_prior_loss: float = 0.1
     """Mean residual (0..1) of a refinement from a prior pose that led nowhere; right ones have 0.005 to 0.06."""
     sample_render_px: int = 256
@@ -104,6 +109,8 @@ class StageOutcome:
     """None: too few matches agreed, or refinement failed."""
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance: photos of other scenes never do."""
+    unmatched: AbsolutePose | None = None
+    """The pose of few matches that was refined without matching a render there first; None: there is none."""
 
 
 StageResult = Generator[IterationRecord, None, StageOutcome]
@@ -157,6 +164,8 @@ class SearchState:
     """Whether the latest stage ends the search: its pose is accepted, or a further search wouldn't remove the doubt."""
     recognised: bool = False
     """Whether any stage so far recognised something (`StageOutcome`)."""
+    unmatched: AbsolutePose | None = None
+    """That of the latest stage."""
 
     @classmethod
     def of(cls, query: Query, tools: Tools[ViewIndex], config: SearchConfig) -> SearchState:
@@ -190,22 +199,24 @@ class SearchState:
 def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, None, None]:
     """Yield a stage's records with the best answer so far, and verify what it led to.
 
-    Where the answer was expected, or many matches with a view led to it, the pixels alone may decide; not with an
-    estimated focal length, which makes pixels agree at wrong poses, too.
+    Where the answer was expected, or many matches with a view led to it, the pixels alone may decide.
     """
     outcome = yield from _changed(stage.records, state.with_answer)
     state.recognised |= outcome.recognised
+    state.unmatched = outcome.unmatched
     found = outcome.refined
     if found is None:
         return
-    many = (found.num_inliers or 0) >= state.config.photometric_min_inliers
-    pixels_may_decide = stage.expected or (many and not state.images.query.lens_prior)
+    config, free_lens = state.config, state.images.query.lens_prior is not None
+    least = config.photometric_min_inliers_free_lens if free_lens else config.photometric_min_inliers
+    pixels_may_decide = stage.expected or (found.num_inliers or 0) >= least
     verdict = state.verify(found, pixels_may_decide)
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
-    # Of a small copy a doubt may vanish in the full size; intrinsics are tested at one size, whatever led to the pose.
-    contradicted = verdict.reason is Reason.INTRINSICS_CONTRADICTED
+    # Of a small copy a doubt may vanish in the full size; intrinsics are tested at one size, whatever led to the pose,
+    # and wrongly where refinement from few matches hasn't arrived.
+    contradicted = verdict.reason is Reason.INTRINSICS_CONTRADICTED and outcome.unmatched is None
     conclusive = contradicted or (verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative)
     state.finished = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score

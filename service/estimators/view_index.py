@@ -1,7 +1,7 @@
 """The default estimator: retrieve views like the photo from an index, match, solve PnP, refine. Needs no prior.
 
     photo's features -> retrieval scores of rendered views -> matches with the best of them -> scene points -> PnP
-    -> while few agree: render there, match again, solve decoupled
+    -> while few agree, or the gate refuses what few led to: render there, match again, solve decoupled
     -> refine photometrically on a small render, then on larger ones
     -> verification gate -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
@@ -88,6 +88,8 @@ def run(
     # A generator: a later stage is prepared only if the earlier ones failed.
     for stage in _search_stages(state, options):
         yield from run_stage(state, stage)
+        if not state.finished and state.unmatched is not None:
+            yield from run_stage(state, replace(stage, records=_rematch(state.unmatched, state)))
         if state.finished:
             break
     mirrored = yield from check_mirror(state)
@@ -102,16 +104,16 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     has_cameras = bool(state.tools.scene.cameras)
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
     variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
-    small = retrieval.rotated_variant(variant.scaled(config.small_photo_factor))
+    small = variant.scaled(config.small_photo_factor)
+    if not retrieval.is_upright(small):
+        small = retrieval.rotated_variant(small)
     views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
     rotated = small.roll_steps_45deg != 0
     name = "retrieve_rotated" if rotated else "retrieve"
     # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
     yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small, tentative=True)
-    # A rotation that the small photo shows is the large one's, too.
-    variant = (
-        replace(variant, roll_steps_45deg=small.roll_steps_45deg) if rotated else retrieval.rotated_variant(variant)
-    )
+    # Anew: of a small copy the wrong rotation may have looked better.
+    variant = retrieval.rotated_variant(variant)
     views = top_indices(retrieval.scores(variant), options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
     yield Stage(_search_views(name, variant, deque(views), state), variant)
@@ -171,11 +173,19 @@ def _search_views(
         return StageOutcome(None, rounds > 0)
     outcome = yield from refine_stage(found, images, state.renderer, config.refinement)
     if outcome.restart is None:
-        return StageOutcome(outcome.refined, rounds > 0)
+        few = rounds == 0 and found.num_inliers < config.rematch_if_refused_below_inliers
+        return StageOutcome(outcome.refined, rounds > 0, found if few else None)
     again = yield from rematch_and_refine(
         outcome.restart, images, state.renderer, config.matching, config.refinement, outcome.refined
     )
     return StageOutcome(again.refined, rounds + again.rounds > 0)
+
+
+def _rematch(found: AbsolutePose, state: SearchState) -> StageResult:
+    """Match with a render at a pose whose refinement the gate refused, and refine again."""
+    config = state.config
+    again = yield from rematch_and_refine(found, state.images, state.renderer, config.matching, config.refinement)
+    return StageOutcome(again.refined, again.rounds > 0)
 
 
 def _sample_poses(variant: ImageVariant, state: SearchState) -> StageResult:

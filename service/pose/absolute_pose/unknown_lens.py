@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64
 
-from service.geometry import se3_exp, se3_log, transformed
+from service.geometry import se3_exp, se3_log
 from service.photos.intrinsics import undistorted_points
+from service.pose.absolute_pose.lens_kernels import linearize_projection
 from service.pose.absolute_pose.lens_prior import correction_vector, prior_cost, prior_precision, stepped
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.types import Intrinsics, IntrinsicsCorrection, LensPrior, Pose
@@ -258,26 +259,12 @@ def linearize_reprojection(
     The twist (rotation vector in rad, translation in scene units) acts on the right: world_from_camera @ exp(twist)
     moves the camera in its own frame.
     """
-    x, y, z = transformed(pose.camera_from_world, np.asarray(points_in_world, np.float64)).T
-    # Points behind the camera would project as if they were ahead, and pull on the pose.
-    ahead = z > 1e-9
-    z = np.where(ahead, z, 1.0)
-    u, v, zero = x / z, y / z, np.zeros(len(z))
-    camera, k1 = intrinsics.corrected(correction), correction.k1
-    square = u * u + v * v
-    radial = 1.0 + k1 * square
-    side = np.full(len(z), float(intrinsics.long_side))
-    # d distorted (u, v) / d (u, v): symmetric.
-    uu, uv, vv = radial + 2 * k1 * u * u, 2 * k1 * u * v, radial + 2 * k1 * v * v
-    du = np.stack([u * v, -(1 + u * u), v, -1 / z, zero, u / z], 1)
-    dv = np.stack([1 + v * v, -u * v, -u, zero, -1 / z, v / z], 1)
-    by_u = np.stack([camera.fx * u * radial, camera.fx * u * square, side, zero], 1)
-    by_v = np.stack([camera.fy * v * radial, camera.fy * v * square, zero, side], 1)
-    rows_u = np.concatenate([camera.fx * (uu[:, None] * du + uv[:, None] * dv), by_u], 1)
-    rows_v = np.concatenate([camera.fy * (uv[:, None] * du + vv[:, None] * dv), by_v], 1)
-    projected = np.stack([camera.fx * u * radial + camera.cx, camera.fy * v * radial + camera.cy], 1)
-    visible = ahead[:, None].astype(np.float64)
-    return np.stack([rows_u, rows_v], 1) * visible[:, None], (photo_px - projected) * visible, ahead
+    camera, inverse = intrinsics.corrected(correction), pose.camera_from_world
+    values = (camera.fx, camera.fy, camera.cx, camera.cy, correction.k1, float(intrinsics.long_side))
+    # One memory layout and type: one compilation.
+    points = np.ascontiguousarray(points_in_world, np.float64)
+    px = np.ascontiguousarray(photo_px, np.float64)
+    return linearize_projection(px, inverse[:3, :3].copy(), inverse[:3, 3].copy(), points, np.array(values))
 
 
 def without_distortion(

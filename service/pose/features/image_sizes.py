@@ -9,9 +9,6 @@ SIZE_MULTIPLE_PX = 32
 RENDER_PX = 416
 """Long side of the renders that are matched and refined with: the renderer's dilation is scaled, so a small render is
 not biased."""
-FREE_LENS_RENDER_PX = 640
-"""The same where the focal length is estimated: it is confounded with the distance and needs more pixels (58 photos:
-median error 0.14 % with 416, 0.08 % with 640)."""
 PHOTO_PX = 416
 """Long side at which the photo's features are extracted, and to which pixel thresholds of matching refer."""
 

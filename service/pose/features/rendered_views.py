@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -10,8 +10,8 @@ from jaxtyping import Float32, UInt8
 
 from service.geometry import reprojection_error_px, transformed, unproject
 from service.interfaces import Features, Frame, Matcher, Rasterizer
-from service.pose.features.image_sizes import FREE_LENS_RENDER_PX, RENDER_PX, sized
-from service.types import Camera, Intrinsics, Pose, Query, frozen
+from service.pose.features.image_sizes import RENDER_PX, sized
+from service.types import Camera, Pose, Query, frozen
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class RenderedView:
     def view(self, matcher: Matcher) -> View:
         """Return the render's features with their scene points, extracted once."""
         if self._view is None:
-            found = _features_of(self.frame, self.camera.intrinsics, matcher)
+            found = matcher.extract(to_uint8(self.frame.rgb), VIEWS.max_features)
             self._view = backprojected(found, self.frame, self.camera)
         return self._view
 
@@ -104,28 +104,13 @@ class ViewRenderer:
 
 def camera_of(query: Query, pose: Pose, long_side: int | None = None) -> Camera:
     """Return the query's camera at the pose, at the size for renders unless a long side (px) is given."""
-    long_side = long_side or (FREE_LENS_RENDER_PX if query.lens_prior else RENDER_PX)
-    return Camera(sized(query.intrinsics, long_side), pose)
+    return Camera(sized(query.intrinsics, long_side or RENDER_PX), pose)
 
 
 def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
     """Render, extract features at the render's own size, and backproject them."""
     (frame,) = rasterizer.render([camera])
     return backprojected(matcher.extract(to_uint8(frame.rgb), VIEWS.max_features), frame, camera)
-
-
-def _features_of(frame: Frame, size: Intrinsics, matcher: Matcher) -> Features:
-    """Return a render's features, extracted at RENDER_PX: from a larger one they would be finer than the photo's."""
-    # Learned features stand little change of scale, so both images are described at the same size.
-    rgb, small = to_uint8(frame.rgb), sized(size, RENDER_PX)
-    if small.width * small.height >= size.width * size.height:
-        return matcher.extract(rgb, VIEWS.max_features)
-    found = matcher.extract(
-        np.asarray(cv2.resize(rgb, (small.width, small.height), interpolation=cv2.INTER_AREA)), VIEWS.max_features
-    )
-    # Their places refer to the render as it is.
-    scale = np.array([size.width / small.width, size.height / small.height], np.float32)
-    return replace(found, points_px=found.points_px * scale)
 
 
 def backprojected(features: Features, frame: Frame, camera: Camera) -> View:

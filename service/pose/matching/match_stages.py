@@ -48,6 +48,8 @@ class MatchingConfig:
     """Reprojection error of an inlier with a render at the pose, at PHOTO_PX."""
     min_rematch_inliers: int = 15
     """Inliers with a render at the pose: fewer are chance, photos of other scenes have 6 to 12."""
+    conclusive_share: float = 0.7
+    """Share of the matches that agree from which on a rematch is the last, whatever its step."""
     max_rematches: int = 3
     """Renders that are matched, one after the other."""
     settled_deg: float = 0.3
@@ -129,7 +131,9 @@ def render_and_rematch(
         found = again
         record = record_of(view.camera, matches, found, found, "rematch")
         yield replace(record, step_deg=step_deg, step_units=step_units)
-        if step_deg < config.settled_deg and step_units < config.settled_share * distance:
+        settled = step_deg < config.settled_deg and step_units < config.settled_share * distance
+        # Where most matches agree refinement converges, whatever the last step was.
+        if settled or found.num_inliers > config.conclusive_share * len(found.inlier):
             return Rematch(found, rounds + 1)
     return Rematch(found, config.max_rematches)
 

@@ -36,9 +36,6 @@ class LensFit:
     """Mean absolute residual with these intrinsics over that with the given ones."""
     contradicts: bool
     """Whether pose and residual say that the given intrinsics are wrong."""
-    untested: Float64[np.ndarray, "6"]
-    """A standard deviation of the pose, as a twist, by intrinsics that the pixels don't determine: half of the motion,
-    and no more than `max_untested_share` of the depth, because most intrinsics that are said to be exact are."""
 
 
 def fit_lens(
@@ -67,17 +64,16 @@ def fit_lens(
     moves = moves_pose((inverse @ scores)[TWIST], depth, test.suspicious_deg, test.suspicious_share)
     if not moves and loss < test.suspicious_loss:
         return None
+    some = level.thinned(test.max_pixels)
     free = replace(state, prior=prior, photometric=state.photometric.copy())
-    steps = replace(config, max_steps=test.max_steps)
-    free_loss = minimize(level, free, test.settled_px, steps)
+    free_loss = minimize(some, free, test.settled_px, replace(config, max_steps=test.max_steps))
     if not np.isfinite(free_loss):
         return None
     motion = se3_log(state.photo_from_render @ np.linalg.inv(free.photo_from_render))
-    ratio = free_loss / max(loss, 1e-9)
+    # Of the same pixels.
+    ratio = free_loss / max(some.residuals(state, config)[2], 1e-9)
     moves = moves_pose(motion, depth, test.contradicting_deg, test.contradicting_share)
-    share = float(np.linalg.norm(motion[3:])) / depth
-    untested = motion * min(0.5, test.max_untested_share / max(share, 1e-9))
-    return LensFit(free.correction, motion, ratio, moves and ratio < test.max_loss_ratio, untested)
+    return LensFit(free.correction, motion, ratio, moves and ratio < test.max_loss_ratio)
 
 
 def moves_pose(motion: Float64[np.ndarray, "6"], depth: float, degrees: float, share: float) -> bool:

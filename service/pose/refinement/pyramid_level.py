@@ -53,6 +53,12 @@ class PyramidLevel:
     photo_intrinsics: Intrinsics
     """At this level, without the correction."""
 
+    def thinned(self, count: int) -> PyramidLevel:
+        """Return the level with every second, third... pixel: about `count` of them."""
+        step = max(1, len(self.pixels) // count)
+        parts = (np.ascontiguousarray(part[..., ::step]) for part in (self.pixels, self.points, self.jacobian))
+        return PyramidLevel(self.photo, *parts, self.photo_intrinsics)
+
     def residuals(
         self, state: RefinementState, config: RefinementConfig
     ) -> tuple[Float32[np.ndarray, "n"], Float32[np.ndarray, "n"], float]:

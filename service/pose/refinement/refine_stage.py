@@ -12,6 +12,7 @@ import numpy as np
 
 from service.geometry import pose_distance
 from service.pose.absolute_pose.pnp import AbsolutePose
+from service.pose.features.image_sizes import RENDER_PX
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, RenderedView, ViewRenderer, camera_of
 from service.pose.matching.match_stages import MATCHING, MatchingConfig, render_and_rematch
@@ -29,8 +30,11 @@ class RefineStageConfig:
     max_renders: int = 4
     """Renders that are refined on, one after the other; 0: the pose of the matches is the answer."""
     first_render_px: int | None = 256
-    """Long side of the first render, where the focal length is known: a small one brings the pose near as well. None:
-    as large as the others."""
+    """Long side of the first render: a small one brings the pose near as well. None: as large as the others."""
+    max_first_motion_px: float = 4.0
+    max_first_loss: float = 0.03
+    """With approximate intrinsics, image motion and mean residual of the first refinement from which on matches are
+    better: pose and intrinsics are then so far off that renders would follow one another without an end."""
     settled_px: float = 0.3
     """Where refinement moved the image by less, another render would be the same."""
     levels: int = 2
@@ -98,17 +102,18 @@ def refine_stage(
     renderer: ViewRenderer,
     config: RefineStageConfig = REFINE_STAGE,
     max_loss: float = np.inf,
+    is_rematched: bool = False,
 ) -> Generator[IterationRecord, None, RefineOutcome]:
     """Render, refine photometrically, render at the result, refine again, until a new render would be the same.
 
-    Ends early where the loss exceeds `max_loss`. Where the focal length is estimated and creeps along with the
-    distance for too long, the outcome says where to match again.
+    Ends early where the loss exceeds `max_loss`. Where the intrinsics are estimated and the pose moves far or for too
+    long, the outcome says where to match again; not so if it is of matches with a render at the pose (`is_rematched`).
     """
     if config.max_renders == 0:
         return RefineOutcome((yield from _as_matched(found, renderer)))
     # Many agreeing matches outweigh a refinement that leads far away from them.
     trusted, free_lens = found.num_inliers >= config.trusted_inliers, images.query.lens_prior is not None
-    small_px = None if free_lens else config.first_render_px
+    small_px = config.first_render_px
     now, refined, rendered = found, None, None
     for round_number in range(config.max_renders):
         following = _next_render(rendered, now, images, renderer, config, small_px)
@@ -126,6 +131,9 @@ def refine_stage(
             return RefineOutcome(refined, found if trusted and is_astray else None, is_astray)
         refined = RefinedPose(result.pose, result.correction, result.loss, found.num_inliers or None, rendered, result)
         yield _record_of(refined, now.pose)
+        is_first = free_lens and not round_number and not is_rematched
+        if is_first and result.loss > config.max_first_loss and _moved_far(rendered, refined, images, config):
+            return RefineOutcome(replace(refined, photometric=None), restart=found)
         now, small_px = replace(found, pose=result.pose, correction=result.correction), None
     if refined is None or not free_lens:
         return RefineOutcome(refined)
@@ -150,6 +158,14 @@ def _next_render(
     if last is None:
         return renderer.near(camera)
     return None if last.shows_the_same_as(camera, config.settled_px) else renderer.render(camera)
+
+
+def _moved_far(rendered: RenderedView, refined: RefinedPose, images: QueryImages, config: RefineStageConfig) -> bool:
+    """Return whether a refinement moved the image further than refinement is trusted to."""
+    size = rendered.camera.intrinsics
+    camera = camera_of(images.query.corrected(refined.correction), refined.pose, size.long_side)
+    tolerance_px = config.max_first_motion_px * size.long_side / RENDER_PX
+    return not rendered.shows_the_same_as(camera, tolerance_px)
 
 
 def _record_of(refined: RefinedPose, before: Pose) -> IterationRecord:
@@ -206,7 +222,7 @@ def rematch_and_refine(
     if rematch.found is None:
         # A pose that loses its matches after it had some is wrong.
         return RematchedPose(before if rematch.rounds == 0 else None, rematch.rounds)
-    outcome = yield from refine_stage(rematch.found, images, renderer, config)
+    outcome = yield from refine_stage(rematch.found, images, renderer, config, is_rematched=True)
     if not outcome.diverged or outcome.restart is None:
         return RematchedPose(outcome.refined, rematch.rounds)
     return RematchedPose((yield from _as_matched(outcome.restart, renderer)), rematch.rounds)

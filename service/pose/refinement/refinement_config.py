@@ -62,7 +62,7 @@ class LensErrorConfig:
 
     log_focal: float = 0.001
     k1: float = 0.002
-    principal_point: float = 0.002
+    principal_point: float = 0.001
     """In long sides. Forward-facing scenes turn 0.2 to 0.4 degrees with it."""
 
 
@@ -83,12 +83,16 @@ class LensTestConfig:
     contradicting_share: float = 0.0025
     """Motion of the pose beyond which wrong intrinsics matter: about half of what counts as right where the scene is
     two to three times as far away as its training cameras' focus."""
-    max_untested_share: float = 0.004
-    """Standard deviation of the position, as a share of the median depth, where the pixels can't tell."""
     max_loss_ratio: float = 0.96
     """Residual that is left, at most, if the given intrinsics are wrong."""
+    untestable_share: float = 0.005
+    """Standard deviation of the position with free intrinsics, as a share of the median depth, from which on the photo
+    doesn't tell whether the given ones are right..."""
+    untested: LensPrior = field(default_factory=lambda: LensPrior(0.01, 0.01, 0.005))
+    """...and how certain they are then."""
     max_steps: int = 24
-    settled_px: float = 0.02
+    settled_px: float = 0.1
+    max_pixels: int = 2000
     """Of that refinement."""
     min_cost_drop: float = 6.5
     """Of matches (`LensEvidence`): from which on they contradict the intrinsics. Of 14 answers with the right ones it
@@ -127,7 +131,7 @@ class RefinementConfig:
     """...but for the focal length."""
     min_pixels: int = 200
     """Fewest pixels, of a level and of its overlap with the photo, that are refined on."""
-    settled_px: float = 0.005
+    settled_px: float = 0.01
     """A step that moves the image by less (pixels of the level) is the last, on the finest level..."""
     settled_coarse_px: float = 0.05
     """...and on those that a finer one, or another refinement, follows."""

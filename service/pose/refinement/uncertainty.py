@@ -22,8 +22,13 @@ from service.pose.refinement.pyramid_level import (
     RefinementState,
     linearized_levels,
 )
-from service.pose.refinement.refinement_config import REFINEMENT, LensErrorConfig, RefinementConfig
-from service.types import NO_CORRECTION, Camera, LensPrior
+from service.pose.refinement.refinement_config import (
+    REFINEMENT,
+    LensErrorConfig,
+    LensTestConfig,
+    RefinementConfig,
+)
+from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior
 
 FOCAL = CORRECTION.start
 """Place of log focal in the vector of unknowns."""
@@ -41,6 +46,8 @@ class PoseUncertainty:
     """By how much the logarithm of an approximate focal length would still change."""
     lens_fit: LensFit | None = None
     """Of exact intrinsics: others that fit the photo, where these would move the pose; None: there are none."""
+    untested_lens: Float64[np.ndarray, "6 6"] | None = None
+    """Of exact intrinsics that the photo can't confirm: the covariance of the twist if they are a little off."""
     loss: float = 0.0
     """Mean absolute residual (0..1) at the answer."""
 
@@ -84,14 +91,10 @@ def pose_uncertainty(
         if covariance is None:
             return None
         lens_fit = fit_lens(level, state, score, hessian, loss, config)
-        if lens_fit and not lens_fit.contradicts:
-            # The pixels can't tell whether the given intrinsics are right.
-            covariance = covariance + np.outer(lens_fit.untested, lens_fit.untested)
-        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit, loss=loss)
+        untested = _covariance_of_untested_lens(level, hessian, scale, config.lens_test)
+        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit, untested_lens=untested, loss=loss)
     # A prior is information: added before the photometric parameters are marginalized.
-    information = hessian.copy()
-    information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(lens_prior, correction))
-    covariance = _covariance(information, scale)
+    covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction), scale)
     if covariance is None:
         return None
     covariance = _with_lens_error(covariance, config.lens_error)
@@ -120,6 +123,31 @@ def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray
     free = FOCAL + 2
     inverse = inverse_spd(hessian[:free, :free])
     return 0.0 if inverse is None else float((inverse @ score[:free])[FOCAL])
+
+
+def _covariance_of_untested_lens(
+    level: PyramidLevel, hessian: Float64[np.ndarray, "14 14"], scale: float, config: LensTestConfig
+) -> Float64[np.ndarray, "6 6"] | None:
+    """Return the covariance of the twist with the intrinsics as uncertain as `config.untested`.
+
+    None where free intrinsics hardly make the position less certain: then the photo tells them.
+    """
+    free = _with_prior(hessian, scale, config.prior, NO_CORRECTION)
+    covariance = _covariance(free, scale)
+    depth = float(np.median(level.points[2]))
+    if covariance is not None and np.sqrt(np.trace(covariance[3:6, 3:6])) < config.untestable_share * depth:
+        return None
+    covariance = _covariance(_with_prior(hessian, scale, config.untested, NO_CORRECTION), scale)
+    return None if covariance is None else covariance[:6, :6]
+
+
+def _with_prior(
+    hessian: Float64[np.ndarray, "14 14"], scale: float, prior: LensPrior, correction: IntrinsicsCorrection
+) -> Float64[np.ndarray, "14 14"]:
+    """Return the information of pixels and prior; `scale` is that of the pixels' variance."""
+    information = hessian.copy()
+    information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(prior, correction))
+    return information
 
 
 def _with_lens_error(covariance: Float64[np.ndarray, "10 10"], error: LensErrorConfig) -> Float64[np.ndarray, "10 10"]:

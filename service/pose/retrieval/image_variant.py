@@ -34,8 +34,8 @@ class RetrievalConfig:
     """A rotation must have more than 1 / this times the score of the upright photo: rotated photos have 1.3 to 6 times
     the others' with the right rotation, upright ones at least 0.83."""
     upright_score: float = 1.5
-    """Retrieval score of an upright photo from which on no rotation is compared: of six scenes' clean photos the best
-    view has 1.8 and more, of those rotated by 90 degrees 1.3 at most."""
+    """Retrieval score from which on a view is like the photo as it is: of six scenes' clean photos the best one has 1.8
+    and more, of those rotated by 90 degrees 1.3 at most."""
     oblique_shrink: float = 0.8
     """Size of a photo rotated by an odd multiple of 45 degrees, which needs twice the canvas."""
     views_outside_prior: int = 16
@@ -103,8 +103,6 @@ class Retrieval:
 
     def rotated_variant(self, upright: ImageVariant) -> ImageVariant:
         """Return the rotation that the photo's corners suggest, if its scores exceed those of the upright photo."""
-        if self.scores(upright).max() >= self.config.upright_score:
-            return upright
         suggested = rolls_to_upright(self.images.corners(), self.index.corners)
         best, most = upright, 0.0
         # Extracting the features of a rotation is costly, so only the likeliest are compared.
@@ -114,6 +112,10 @@ class Retrieval:
             if score > max(most, self.scores(upright).max()):
                 best, most = rotated, score
         return best
+
+    def is_upright(self, variant: ImageVariant) -> bool:
+        """Return whether some view is so much like the variant that no other rotation has to be compared."""
+        return bool(self.scores(variant).max() >= self.config.upright_score)
 
     def _demoted_outside_prior(self, scores: Float64[np.ndarray, "views"]) -> Float64[np.ndarray, "views"]:
         region = self.images.query.region
