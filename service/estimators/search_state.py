@@ -123,8 +123,6 @@ class Stage:
     records: StageResult
     variant: ImageVariant
     """Size and rotation in which the photo is compared."""
-    tentative: bool = False
-    """Whether a doubt about the answer is no reason to end the search."""
     expected: bool = False
     """Whether the pose is refined from a prior: then the pixels alone may decide."""
 
@@ -214,10 +212,8 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
-    # Of a small copy a doubt may vanish in the full size; intrinsics are tested at one size, whatever led to the pose,
-    # and wrongly where refinement from few matches hasn't arrived.
-    contradicted = verdict.reason is Reason.INTRINSICS_CONTRADICTED and outcome.unmatched is None
-    conclusive = contradicted or (verdict.reason in CONCLUSIVE_DOUBTS and not stage.tentative)
+    # Poses are verified in one size, whatever led to them; refinement from few matches may not have arrived.
+    conclusive = verdict.reason in CONCLUSIVE_DOUBTS and outcome.unmatched is None
     state.finished = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))

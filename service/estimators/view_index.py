@@ -106,12 +106,12 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
     small = variant.scaled(config.small_photo_factor)
     if not retrieval.is_upright(small):
-        small = retrieval.rotated_variant(small)
+        small = retrieval.rotated_variant(small, likeliest_only=True)
     views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
     rotated = small.roll_steps_45deg != 0
     name = "retrieve_rotated" if rotated else "retrieve"
     # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
-    yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small, tentative=True)
+    yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small)
     # Anew: of a small copy the wrong rotation may have looked better.
     variant = retrieval.rotated_variant(variant)
     views = top_indices(retrieval.scores(variant), options.candidates)

@@ -16,12 +16,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.geometry import se3_log
-from service.pose.absolute_pose.lens_prior import prior_precision
-from service.pose.refinement.covariance import inverse_spd
 from service.pose.refinement.gauss_newton import minimize
-from service.pose.refinement.pyramid_level import CORRECTION, TWIST, PyramidLevel, RefinementState
+from service.pose.refinement.pyramid_level import TWIST, PyramidLevel, RefinementState
 from service.pose.refinement.refinement_config import RefinementConfig
-from service.types import NO_CORRECTION, IntrinsicsCorrection
+from service.types import IntrinsicsCorrection
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,31 +39,23 @@ class LensFit:
 def fit_lens(
     level: PyramidLevel,
     state: RefinementState,
-    scores: Float64[np.ndarray, "14"],
-    hessian: Float64[np.ndarray, "14 14"],
+    predicted: Float64[np.ndarray, "14"],
     loss: float,
     config: RefinementConfig,
 ) -> LensFit | None:
     """Refine the intrinsics with the pose where that would move the pose; `state` is at the answer, and is kept.
 
-    `scores` and `hessian` are the normal equations there, of all unknowns. None: the intrinsics hardly matter, or the
+    `predicted` is the step of all unknowns there, by the normal equations. None: the intrinsics hardly matter, or the
     given ones are the best.
     """
     test = config.lens_test
-    prior = test.prior
     depth = float(np.median(level.points[2]))
-    information = hessian.copy()
-    # As in refinement: with L1 weights the hessian is about `loss` times the information.
-    information[CORRECTION, CORRECTION] += np.diag(loss * prior_precision(prior, NO_CORRECTION))
-    inverse = inverse_spd(information)
-    if inverse is None:
-        return None
     # Large residuals are beyond what the linearization predicts.
-    moves = moves_pose((inverse @ scores)[TWIST], depth, test.suspicious_deg, test.suspicious_share)
+    moves = moves_pose(predicted[TWIST], depth, test.suspicious_deg, test.suspicious_share)
     if not moves and loss < test.suspicious_loss:
         return None
     some = level.thinned(test.max_pixels)
-    free = replace(state, prior=prior, photometric=state.photometric.copy())
+    free = replace(state, prior=test.prior, photometric=state.photometric.copy())
     free_loss = minimize(some, free, test.settled_px, replace(config, max_steps=test.max_steps))
     if not np.isfinite(free_loss):
         return None

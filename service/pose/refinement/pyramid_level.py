@@ -56,8 +56,10 @@ class PyramidLevel:
     def thinned(self, count: int) -> PyramidLevel:
         """Return the level with every second, third... pixel: about `count` of them."""
         step = max(1, len(self.pixels) // count)
-        parts = (np.ascontiguousarray(part[..., ::step]) for part in (self.pixels, self.points, self.jacobian))
-        return PyramidLevel(self.photo, *parts, self.photo_intrinsics)
+        pixels, points, jacobian = (
+            np.ascontiguousarray(part[..., ::step]) for part in (self.pixels, self.points, self.jacobian)
+        )
+        return PyramidLevel(self.photo, pixels, points, jacobian, self.photo_intrinsics)
 
     def residuals(
         self, state: RefinementState, config: RefinementConfig
@@ -67,7 +69,8 @@ class PyramidLevel:
         The mean is infinite where fewer than `min_pixels` overlap.
         """
         residuals, weights = np.empty((2, len(self.pixels)), np.float32)
-        k = np.append(intrinsics_vector(self.photo_intrinsics.corrected(state.correction)), state.correction.k1)
+        camera = self.photo_intrinsics.corrected(state.correction)
+        k = np.array([camera.fx, camera.fy, camera.cx, camera.cy, state.correction.k1])
         total, count = fill_residuals(
             self.photo, self.points, self.jacobian[PHOTOMETRIC], state.photo_from_render, k,
             state.photometric, config.l1_floor, residuals, weights,

@@ -125,13 +125,13 @@ class RefinementConfig:
     """Whether gain, bias, gamma and blur are estimated with the pose."""
     max_steps: int = 12
     """Gauss-Newton steps on a level."""
-    max_pixels: int = 10_000
+    max_pixels: int = 8_000
     """A level with more uses every second, third...: 6000 were as exact as 30000 on the test scenes..."""
     max_pixels_intrinsics: int = 20_000
     """...but for the focal length."""
     min_pixels: int = 200
     """Fewest pixels, of a level and of its overlap with the photo, that are refined on."""
-    settled_px: float = 0.01
+    settled_px: float = 0.005
     """A step that moves the image by less (pixels of the level) is the last, on the finest level..."""
     settled_coarse_px: float = 0.05
     """...and on those that a finer one, or another refinement, follows."""

@@ -90,8 +90,9 @@ def pose_uncertainty(
         covariance = _covariance(hessian[:FOCAL, :FOCAL], scale)
         if covariance is None:
             return None
-        lens_fit = fit_lens(level, state, score, hessian, loss, config)
-        untested = _covariance_of_untested_lens(level, hessian, scale, config.lens_test)
+        free = inverse_spd(_with_prior(hessian, scale, config.lens_test.prior, NO_CORRECTION))
+        lens_fit = None if free is None else fit_lens(level, state, free @ score, loss, config)
+        untested = _covariance_of_untested_lens(level, hessian, scale, free, config.lens_test)
         return PoseUncertainty(last_step, covariance, lens_fit=lens_fit, untested_lens=untested, loss=loss)
     # A prior is information: added before the photometric parameters are marginalized.
     covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction), scale)
@@ -126,16 +127,19 @@ def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray
 
 
 def _covariance_of_untested_lens(
-    level: PyramidLevel, hessian: Float64[np.ndarray, "14 14"], scale: float, config: LensTestConfig
+    level: PyramidLevel,
+    hessian: Float64[np.ndarray, "14 14"],
+    scale: float,
+    free: Float64[np.ndarray, "14 14"] | None,
+    config: LensTestConfig,
 ) -> Float64[np.ndarray, "6 6"] | None:
     """Return the covariance of the twist with the intrinsics as uncertain as `config.untested`.
 
-    None where free intrinsics hardly make the position less certain: then the photo tells them.
+    `free` is the inverse hessian with free intrinsics. None where these hardly make the position less certain: then
+    the photo tells them.
     """
-    free = _with_prior(hessian, scale, config.prior, NO_CORRECTION)
-    covariance = _covariance(free, scale)
     depth = float(np.median(level.points[2]))
-    if covariance is not None and np.sqrt(np.trace(covariance[3:6, 3:6])) < config.untestable_share * depth:
+    if free is not None and np.sqrt(scale * np.trace(free[3:6, 3:6])) < config.untestable_share * depth:
         return None
     covariance = _covariance(_with_prior(hessian, scale, config.untested, NO_CORRECTION), scale)
     return None if covariance is None else covariance[:6, :6]

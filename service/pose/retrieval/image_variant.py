@@ -72,6 +72,8 @@ class Retrieval:
     index: ViewIndex
     config: RetrievalConfig = RETRIEVAL
     _scores: dict[ImageVariant, Float64[np.ndarray, "views"]] = field(default_factory=dict, repr=False)
+    _suggested: list[int] = field(default_factory=list, repr=False)
+    """Rotations that the photo's corners suggest, in steps of 45 degrees; empty: not yet known."""
 
     def features(self, variant: ImageVariant) -> Features:
         """Return the variant's features, in pixels of `Query.rgb`."""
@@ -101,9 +103,14 @@ class Retrieval:
             return ImageVariant(PHOTO_PX)
         return ImageVariant(int(np.clip(PHOTO_PX * factor, self.config.min_photo_px, self.config.max_photo_px)))
 
-    def rotated_variant(self, upright: ImageVariant) -> ImageVariant:
-        """Return the rotation that the photo's corners suggest, if its scores exceed those of the upright photo."""
-        suggested = rolls_to_upright(self.images.corners(), self.index.corners)
+    def rotated_variant(self, upright: ImageVariant, *, likeliest_only: bool = False) -> ImageVariant:
+        """Return the rotation that the photo's corners suggest, if its scores exceed those of the upright photo.
+
+        `likeliest_only`: the rotation that most corners suggest, and none if that is upright.
+        """
+        if not self._suggested:
+            self._suggested.extend(rolls_to_upright(self.images.corners(), self.index.corners))
+        suggested = self._suggested[:1] if likeliest_only else self._suggested
         best, most = upright, 0.0
         # Extracting the features of a rotation is costly, so only the likeliest are compared.
         for steps in [steps for steps in suggested if steps][: self.config.max_rotations]:
