@@ -17,6 +17,7 @@ from service.bench.pose_metrics import Units
 from service.errors import SceneNotFound
 from service.geometry import moved, pose_distance
 from service.localize import Cancelled, LoadedScene, Request, render_and_verify
+from service.photos.camera_identity import CameraIdentity
 from service.photos.images import encode_image, query_of, read_query
 from service.photos.sequence import SequencePhoto
 from service.results import Status
@@ -169,7 +170,8 @@ def test_photos_tell_their_lens_together(room):
 
 
 def test_a_sequence_ends_with_its_budget_and_on_cancelling(room):
-    photos = [SequencePhoto(f"{i}", i, query(room, pose, i)) for i, pose in enumerate(path(5))]
+    camera = CameraIdentity(LENS.width, LENS.height)
+    photos = [SequencePhoto(f"{i}", i, query(room, pose, i), camera) for i, pose in enumerate(path(5))]
     found = list(localize_sequence(photos, room, Request(budget_renders=1)))
     assert len(found) == 1
     assert found[0].exhausted

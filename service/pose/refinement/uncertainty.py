@@ -98,7 +98,7 @@ def pose_uncertainty(
     covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction), scale)
     if covariance is None:
         return None
-    covariance = _with_lens_error(covariance, config.lens_error)
+    covariance = _with_lens_error(covariance, config.lens_error, 1.0 / prior_precision(lens_prior, correction))
     given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
     return PoseUncertainty(last_step, covariance, given_lens, _focal_step(hessian, score), loss=loss)
 
@@ -154,11 +154,18 @@ def _with_prior(
     return information
 
 
-def _with_lens_error(covariance: Float64[np.ndarray, "10 10"], error: LensErrorConfig) -> Float64[np.ndarray, "10 10"]:
-    """Return the covariance with independent errors of the intrinsics, which the pose follows as it says, added."""
+def _with_lens_error(
+    covariance: Float64[np.ndarray, "10 10"], error: LensErrorConfig, prior_variance: Float64[np.ndarray, "4"]
+) -> Float64[np.ndarray, "10 10"]:
+    """Return the covariance with independent errors of the intrinsics, which the pose follows as it says, added.
+
+    No more than makes the intrinsics as uncertain as before: the prior from other photos includes their errors.
+    """
     by_lens = np.linalg.solve(covariance[6:, 6:], covariance[6:]).T
     shift = error.principal_point
-    return covariance + by_lens * np.array([error.log_focal, error.k1, shift, shift]) ** 2 @ by_lens.T
+    errors = np.array([error.log_focal, error.k1, shift, shift]) ** 2
+    left = np.maximum(prior_variance - covariance.diagonal()[6:], 0.0)
+    return covariance + by_lens * np.minimum(errors, left) @ by_lens.T
 
 
 def _covariance(information: Float64[np.ndarray, "n n"], scale: float) -> Float64[np.ndarray, "k k"] | None:
