@@ -53,8 +53,9 @@ class LensSearchConfig:
     cauchy_scales: tuple[float, ...] = (2.0, 0.5)
     """Scales of Cauchy's weights in a refinement, times the inlier threshold, one after the other: with the wider one
     correspondences count that a wrong focal length or distortion keeps away."""
-    settled_decrement: float = 0.01
-    """A refinement ends with a step of less than a tenth of a standard deviation, whose square this is."""
+    settled_decrements: tuple[float, ...] = (1.0, 0.01)
+    """At each scale, Newton's decrement of the last step: its square in standard deviations. The last scale ends with a
+    tenth of one."""
 
 
 LENS_SEARCH = LensSearchConfig()
@@ -136,7 +137,7 @@ def refine_with_lens(
     problem = _Problem(photo_px, points_in_world, intrinsics, prior, config.noise * max_error_px)
     scales = [scale / config.noise for scale in config.cauchy_scales]
     now = problem.linearized(start.pose, start.correction, scales[0])
-    for scale in scales:
+    for scale, settled_decrement in zip(scales, config.settled_decrements, strict=True):
         now = problem.linearized(now.pose, now.correction, scale)
         damping = 1e-4
         for _ in range(config.max_iterations):
@@ -147,7 +148,7 @@ def refine_with_lens(
             if after.cost > now.cost:
                 damping *= 10.0
                 continue
-            settled = float(step @ now.rhs) < config.settled_decrement
+            settled = float(step @ now.rhs) < settled_decrement
             now, damping = after, 0.1 * damping
             if settled:
                 break

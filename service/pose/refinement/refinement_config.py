@@ -127,7 +127,7 @@ class RefinementConfig:
     """Gauss-Newton steps on a level."""
     max_pixels: int = 8_000
     """A level with more uses every second, third...: 6000 were as exact as 30000 on the test scenes..."""
-    max_pixels_intrinsics: int = 20_000
+    max_pixels_intrinsics: int = 12_000
     """...but for the focal length."""
     min_pixels: int = 200
     """Fewest pixels, of a level and of its overlap with the photo, that are refined on."""
