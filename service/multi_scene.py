@@ -35,7 +35,7 @@ class SceneRankingConfig:
     """Of each scene, that the photo is matched with."""
     max_error_px: float = MATCH_ERROR_PX
     approximate_max_error_px: float = 12.0
-    """Reprojection error of an inlier at PHOTO_PX; the second with an approximate focal length."""
+    """Reprojection error of an inlier at PHOTO_PX; the second with approximate intrinsics."""
     trials: int = 300
     """Of RANSAC."""
     min_inliers: int = 15

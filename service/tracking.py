@@ -4,7 +4,7 @@
     -> photometric verification; in doubt the whole verification gate; if that refuses, too: `localize`, as a photo
 
 A photo costs one small render where the motion is smooth. Each is refined against the scene itself, so that errors
-don't accumulate. The photos share one camera: an approximate focal length becomes more certain with each.
+don't accumulate. The photos share one camera: approximate intrinsics become more certain with each.
 
     from service.tracking import Tracker
     tracker = Tracker(scene)
@@ -123,8 +123,8 @@ class Tracker:
     def track(self, query: Query, time_s: float | None = None) -> PoseEstimate:
         """Return where the next photo was taken; without times, photos come at equal intervals.
 
-        The photos' intrinsics are one camera's: what one of them adds to an approximate focal length holds for the
-        next. Raises what `localize` raises.
+        The photos' intrinsics are one camera's: what one of them adds to approximate ones holds for the next. Raises
+        what `localize` raises.
         """
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled

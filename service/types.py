@@ -76,7 +76,7 @@ class Intrinsics:
     distortion: tuple[float, ...] = ()
     """COLMAP's parameters after the focal lengths and the principal point."""
     trust: Literal["exact", "approximate"] = "exact"
-    """Approximate: the focal length is an initial value, and is estimated with the pose."""
+    """Approximate: focal length, radial distortion and principal point are estimated with the pose from here."""
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):

@@ -30,7 +30,7 @@ class AbsolutePose:
     inlier: Bool[np.ndarray, "m"]
     """Of the correspondences that the pose was estimated from."""
     correction: IntrinsicsCorrection = NO_CORRECTION
-    """Of the intrinsics that were given; estimated only where the focal length is approximate."""
+    """Of the intrinsics that were given; estimated only where they are approximate."""
 
     @property
     def num_inliers(self) -> int:

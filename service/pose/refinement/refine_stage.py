@@ -189,7 +189,7 @@ def _refined_on(
     coarse: bool,
     config: RefineStageConfig,
 ) -> RefinementResult:
-    """Refine the pose and, with an approximate focal length, the intrinsics on one render."""
+    """Refine the pose and, where they are approximate, the intrinsics on one render."""
     size = rendered.camera.intrinsics
     start = Camera(images.query.intrinsics.resized(size.width, size.height), now.pose)
     return refine_photometric(

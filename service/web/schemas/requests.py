@@ -74,8 +74,9 @@ class LocalizeFields(Model):
     """Options of the estimator, by their schema in `/capabilities`."""
     intrinsics: dict[str, Any] | None = None
     """Camera model of the upright photo: `width, height, fx, fy, cx, cy`, `model` and `distortion` as in COLMAP, and
-    `trust`: `exact` (the default), or `approximate`, so that the focal length is estimated with the pose. Default:
-    approximate intrinsics from the EXIF data, or a guess."""
+    `trust`: `exact` (the default), or `approximate`, so that focal length, radial distortion and principal point are
+    estimated with the pose. Default: approximate intrinsics from earlier photos of the camera, the EXIF data, or a
+    guess."""
     camera_id: str | None = Field(default=None, min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._:@ -]+$")
     """A name of yours for the camera: what its earlier photos told of the lens is the prior of this one's, even without
     EXIF data. Of a phone name the phone: its lenses are told apart by EXIF data; without these name the lens."""
