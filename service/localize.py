@@ -274,7 +274,7 @@ def estimate_of(
         budget_exhausted=exhausted,
         renders=renders,
         timings=tuple(timings),
-        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded) + _untested(verdict),
+        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded) + _cautions(verdict),
         records=tuple(records),
     )
 
@@ -319,13 +319,21 @@ def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
     )
 
 
-def _untested(verdict: Verdict) -> tuple[str, ...]:
-    if not verdict.intrinsics_untested:
-        return ()
-    return (
-        "the photo can't confirm its intrinsics: a focal length that is 1 % off moves the camera by about 1 % of its "
-        "distance, which the covariance allows for.",
-    )
+def _cautions(verdict: Verdict) -> tuple[str, ...]:
+    """Return warnings of what the photo shows of its camera."""
+    cautions = []
+    if verdict.intrinsics_untested:
+        cautions.append(
+            "the photo can't confirm its intrinsics: a focal length that is 1 % off moves the camera by about 1 % of "
+            "its distance, which the covariance allows for."
+        )
+    if verdict.shutter_motion:
+        shear, stretch = verdict.shutter_motion
+        cautions.append(
+            f"the camera turned while the photo was read row by row (rolling shutter: shear {shear:+.3f}, stretch "
+            f"{stretch:+.3f}), which moves the pose; the covariance allows for it. Hold the camera still."
+        )
+    return tuple(cautions)
 
 
 def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:

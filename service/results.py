@@ -176,6 +176,9 @@ class Verdict:
     """The covariance if the estimated intrinsics were the true ones; None where they were given as exact."""
     intrinsics_untested: bool = False
     """Whether exact intrinsics can't be confirmed by the photo: its covariance then allows for some error of them."""
+    shutter_motion: tuple[float, float] | None = None
+    """Of a photo taken while the camera turned, row by row: shear (sideways) and stretch (up or down), in normalized
+    units per normalized unit down. None: it shows none."""
     fitting_correction: IntrinsicsCorrection | None = None
     """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)

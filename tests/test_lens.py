@@ -10,6 +10,7 @@ import pytest
 
 from service.errors import InvalidIntrinsics
 from service.geometry import moved, pose_distance, project, se3_exp, se3_log, transformed
+from service.interfaces import Frame
 from service.photos.images import query_of
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.unknown_lens import absolute_pose_unknown_lens, linearize_reprojection
@@ -234,6 +235,47 @@ def test_intrinsics_that_the_pixels_contradict(lens: IntrinsicsCorrection, wrong
         assert fit.focal_factor == pytest.approx(lens.focal_factor, rel=0.01)
         assert fit.k1 == pytest.approx(lens.k1, abs=0.02)
         assert np.allclose([fit.shift_x, fit.shift_y], [lens.shift_x, lens.shift_y], atol=0.015)
+
+
+@pytest.mark.parametrize(("turning", "seen"), [((0.0, 0.0), None), ((0.02, 0.0), 0), ((0.0, 0.02), 1)])
+@pytest.mark.parametrize("prior", [None, LensPrior(0.15)])
+def test_a_turn_while_the_rows_are_read_is_seen(
+    turning: tuple[float, float], seen: int | None, prior: LensPrior | None
+) -> None:
+    """Each row is taken by a camera of its own, which has turned a little (rad per unit of normalized height)."""
+    truth = true_pose(1)
+    rgb = np.empty((LENS.height, LENS.width, 3), np.uint8)
+    bands = 24
+    for band in range(bands):
+        rows = slice(band * LENS.height // bands, (band + 1) * LENS.height // bands)
+        height = (0.5 * (rows.start + rows.stop) - LENS.cy) / LENS.fy
+        sideways, up = np.array(turning) * height
+        turned = moved(truth, np.array([up, -sideways, 0.0, 0.0, 0.0, 0.0]))
+        rgb[rows] = photo_from(turned).rgb[rows]
+    pose, correction = truth, NO_CORRECTION
+    for _ in range(3):
+        camera = Camera(LENS.corrected(correction), pose)
+        frame = PaintedWalls().render([camera])[0]
+        result = refine_photometric(rgb, frame, camera, Camera(LENS, pose), 3, correction, prior)
+        pose, correction = result.pose, result.correction
+    answer = Camera(LENS.corrected(correction), pose)
+    found = pose_uncertainty(rgb, frame, camera, answer, prior, result=result)
+    assert found is not None
+    if seen is None:
+        assert found.shutter is None
+        return
+    assert found.shutter is not None
+    values = found.shutter.shear, found.shutter.stretch
+    assert abs(values[seen]) > 2 * abs(values[1 - seen])
+    # One step sees a part of it, the rest is in the pose.
+    assert 0.005 < abs(values[seen]) < 0.03
+    still = pose_uncertainty(frame_photo(frame), frame, camera, answer, prior)
+    assert still is not None
+    assert np.trace(found.covariance[:6, :6]) > 2 * np.trace(still.covariance[:6, :6])
+
+
+def frame_photo(frame: Frame) -> np.ndarray:
+    return to_uint8(frame.rgb)
 
 
 def test_corrected_is_undone_by_nothing_but_its_opposite() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -28,6 +28,7 @@ from service.pose.refinement.refinement_config import (
     LensTestConfig,
     RefinementConfig,
 )
+from service.pose.refinement.rolling_shutter import ShutterMotion, shutter_motion, with_shutter_rows
 from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior
 
 FOCAL = CORRECTION.start
@@ -48,6 +49,8 @@ class PoseUncertainty:
     """Of exact intrinsics: others that fit the photo, where these would move the pose; None: there are none."""
     untested_lens: Float64[np.ndarray, "6 6"] | None = None
     """Of exact intrinsics that the photo can't confirm: the covariance of the twist if they are a little off."""
+    shutter: ShutterMotion | None = None
+    """Of a camera that turned while the photo was taken; the covariance includes it. None: it shows no such motion."""
     loss: float = 0.0
     """Mean absolute residual (0..1) at the answer."""
 
@@ -84,42 +87,91 @@ def pose_uncertainty(
     if not np.isfinite(loss):
         return None
     last_step = se3_log(before @ np.linalg.inv(state.photo_from_render))
-    scores, hessians, scale = _scores(level, state, frame, config)
-    hessian, score = hessians.sum(0), scores.sum(0)
+    score, hessian, scale = _normal_equations(level, state, frame, config)
     if lens_prior is None:
-        covariance = _covariance(hessian[:FOCAL, :FOCAL], scale)
-        if covariance is None:
-            return None
-        free = inverse_spd(_with_prior(hessian, scale, config.lens_test.prior, NO_CORRECTION))
-        lens_fit = None if free is None else fit_lens(level, state, free @ score, loss, config)
-        untested = _covariance_of_untested_lens(level, hessian, scale, free, config.lens_test)
-        return PoseUncertainty(last_step, covariance, lens_fit=lens_fit, untested_lens=untested, loss=loss)
+        found = _with_exact_lens(level, state, score, hessian, scale, loss, config)
+    else:
+        found = _with_estimated_lens(hessian, score, scale, lens_prior, correction, config)
+    if found is None:
+        return None
+    information = hessian if lens_prior is None else _with_prior(hessian, scale, lens_prior, correction)
+    shutter = shutter_motion(information, score, scale, lens_prior is not None, config.shutter)
+    found = replace(found, last_step=last_step, shutter=shutter, loss=loss)
+    return found if shutter is None else _with_shutter(found, config.shutter.uncertainty_factor * shutter.motion)
+
+
+def _with_exact_lens(
+    level: PyramidLevel,
+    state: RefinementState,
+    score: Float64[np.ndarray, "16"],
+    hessian: Float64[np.ndarray, "16 16"],
+    scale: float,
+    loss: float,
+    config: RefinementConfig,
+) -> PoseUncertainty | None:
+    covariance = _covariance(hessian[:FOCAL, :FOCAL], scale)
+    if covariance is None:
+        return None
+    of_lens = slice(0, CORRECTION.stop)
+    information = _with_prior(hessian, scale, config.lens_test.prior, NO_CORRECTION)[of_lens, of_lens]
+    free = inverse_spd(information)
+    lens_fit = None if free is None else fit_lens(level, state, free @ score[of_lens], loss, config)
+    untested = _covariance_of_untested_lens(level, hessian, scale, free, config.lens_test)
+    return PoseUncertainty(np.zeros(6), covariance, lens_fit=lens_fit, untested_lens=untested)
+
+
+def _with_estimated_lens(
+    hessian: Float64[np.ndarray, "16 16"],
+    score: Float64[np.ndarray, "16"],
+    scale: float,
+    lens_prior: LensPrior,
+    correction: IntrinsicsCorrection,
+    config: RefinementConfig,
+) -> PoseUncertainty | None:
+    of_lens = slice(0, CORRECTION.stop)
     # A prior is information: added before the photometric parameters are marginalized.
-    covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction), scale)
+    covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction)[of_lens, of_lens], scale)
     if covariance is None:
         return None
     covariance = _with_lens_error(covariance, config.lens_error, 1.0 / prior_precision(lens_prior, correction))
     given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
-    return PoseUncertainty(last_step, covariance, given_lens, _focal_step(hessian, score), loss=loss)
+    return PoseUncertainty(np.zeros(6), covariance, given_lens, _focal_step(hessian, score))
 
 
-def _scores(
+def _with_shutter(found: PoseUncertainty, motion: Float64[np.ndarray, "6"]) -> PoseUncertainty:
+    """Return the uncertainty with a standard deviation of the pose along this twist added."""
+    added = np.outer(motion, motion)
+    covariance = found.covariance.copy()
+    covariance[:6, :6] += added
+    known, untested = found.given_lens, found.untested_lens
+    return replace(
+        found,
+        covariance=covariance,
+        given_lens=None if known is None else known + added,
+        untested_lens=None if untested is None else untested + added,
+    )
+
+
+def _normal_equations(
     level: PyramidLevel, state: RefinementState, frame: Frame, config: RefinementConfig
-) -> tuple[Float64[np.ndarray, "cells 14"], Float64[np.ndarray, "cells 14 14"], float]:
-    """Return the cells' scores and hessians at the state, and the variance scale of the unknowns but the correction."""
+) -> tuple[Float64[np.ndarray, "16"], Float64[np.ndarray, "16 16"], float]:
+    """Return score and hessian at the state, with shear and stretch, and the variance scale.
+
+    The scale is that of twist and photometric parameters: with exact intrinsics the correction isn't an unknown.
+    """
     residuals, weights, _ = level.residuals(state, config)
-    jacobian = level.jacobian * state.factors[:, None].astype(np.float32)
+    jacobian = with_shutter_rows(level, level.jacobian * state.factors[:, None].astype(np.float32))
     inner = (frame.alpha.shape[0] - 2, frame.alpha.shape[1] - 2)
     uncertainty = config.uncertainty
     scores, hessians, places = scores_by_cell(
         jacobian, weights, residuals, level.pixels, inner, config.l1_floor, uncertainty.cell_px
     )
-    # Of twist and photometric parameters alone: with exact intrinsics the correction isn't an unknown.
     found = jackknife_variance_scale(scores[:, :FOCAL], hessians[:, :FOCAL, :FOCAL], places, uncertainty)
-    return scores, hessians, uncertainty.variance_share * max(found, uncertainty.min_variance_scale)
+    scale = uncertainty.variance_share * max(found, uncertainty.min_variance_scale)
+    return scores.sum(0), hessians.sum(0), scale
 
 
-def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray, "14"]) -> float:
+def _focal_step(hessian: Float64[np.ndarray, "16 16"], score: Float64[np.ndarray, "16"]) -> float:
     """Return the step of log focal, distortion and pose free; 0 where the pixels don't determine it."""
     free = FOCAL + 2
     inverse = inverse_spd(hessian[:free, :free])
@@ -128,7 +180,7 @@ def _focal_step(hessian: Float64[np.ndarray, "14 14"], score: Float64[np.ndarray
 
 def _covariance_of_untested_lens(
     level: PyramidLevel,
-    hessian: Float64[np.ndarray, "14 14"],
+    hessian: Float64[np.ndarray, "16 16"],
     scale: float,
     free: Float64[np.ndarray, "14 14"] | None,
     config: LensTestConfig,
@@ -141,13 +193,14 @@ def _covariance_of_untested_lens(
     depth = float(np.median(level.points[2]))
     if free is not None and np.sqrt(scale * np.trace(free[3:6, 3:6])) < config.untestable_share * depth:
         return None
-    covariance = _covariance(_with_prior(hessian, scale, config.untested, NO_CORRECTION), scale)
+    of_lens = slice(0, CORRECTION.stop)
+    covariance = _covariance(_with_prior(hessian, scale, config.untested, NO_CORRECTION)[of_lens, of_lens], scale)
     return None if covariance is None else covariance[:6, :6]
 
 
 def _with_prior(
-    hessian: Float64[np.ndarray, "14 14"], scale: float, prior: LensPrior, correction: IntrinsicsCorrection
-) -> Float64[np.ndarray, "14 14"]:
+    hessian: Float64[np.ndarray, "16 16"], scale: float, prior: LensPrior, correction: IntrinsicsCorrection
+) -> Float64[np.ndarray, "16 16"]:
     """Return the information of pixels and prior; `scale` is that of the pixels' variance."""
     information = hessian.copy()
     information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(prior, correction))

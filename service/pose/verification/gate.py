@@ -241,13 +241,14 @@ def _doubt_about_position(
 def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict:
     # What another step would still change is an error, too: it adds its square.
     step, given_lens = np.outer(uncertainty.last_step, uncertainty.last_step), uncertainty.given_lens
-    fit, untested = uncertainty.lens_fit, uncertainty.untested_lens
+    fit, untested, shutter = uncertainty.lens_fit, uncertainty.untested_lens, uncertainty.shutter
     # Exact intrinsics are no unknowns of the covariance.
     sigmas = np.sqrt(uncertainty.covariance.diagonal()[6:]).tolist() or [0.0] * 4
     return replace(
         verdict,
         covariance=(uncertainty.covariance[:6, :6] if untested is None else untested) + step,
         intrinsics_untested=untested is not None,
+        shutter_motion=shutter and (shutter.shear, shutter.stretch),
         covariance_given_lens=None if given_lens is None else given_lens + step,
         correction_sigma=(sigmas[0], sigmas[1], sigmas[2], sigmas[3]),
         fitting_correction=fit.correction if fit and fit.contradicts else None,
