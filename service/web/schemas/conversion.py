@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 
 import numpy as np
@@ -231,7 +231,10 @@ def result_out(result: JobResult) -> Result:
         geopose=anchor and geopose_out(anchor, estimate.pose),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
-        fitting_intrinsics=fitting and intrinsics_out(estimate.intrinsics.distorted(fitting)),
+        # Sent back, they are a start of an estimate, not a calibration.
+        fitting_intrinsics=(
+            fitting and intrinsics_out(replace(estimate.intrinsics.distorted(fitting), trust="approximate"))
+        ),
         focal_sigma_px=verdict.focal_sigma * estimate.intrinsics.fx if verdict.focal_sigma else None,
         inliers=verdict.inliers,
         gradient_correlation=verdict.gradient_correlation,
