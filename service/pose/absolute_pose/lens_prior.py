@@ -26,7 +26,7 @@ class CorrectionBounds:
 
     log_focal: float = 2.3
     k1: float = 0.4
-    shift: float = 0.35
+    shift: float = 0.6
 
     @property
     def vector(self) -> Float64[np.ndarray, "4"]:
