@@ -13,8 +13,9 @@ import pytest
 from api_server import ROOT
 from PIL import Image
 
+from service.estimators.search_state import SEARCH
 from service.geometry import pose_distance, se3_log
-from service.localize import LoadedScene, localize
+from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
 from service.results import PoseEstimate, Reason, Status
@@ -144,3 +145,17 @@ def test_no_lens_that_a_pinhole_is_said_to_be_gives_a_confident_wrong_pose(studi
 def assert_right_if_localized(found: PoseEstimate, name: str) -> None:
     degrees, units = pose_distance(found.pose, photo(name)[2])
     assert found.verdict.status is not Status.LOCALIZED or (degrees < 5 and units < RIGHT_UNITS)
+
+
+@pytest.mark.parametrize("goes_on", [True, False])
+def test_a_strip_is_refined_until_it_settles_or_refused(studio: LoadedScene, goes_on: bool) -> None:
+    """A narrow part of a photo, where distance, focal length and principal point move along together, 3 % a render."""
+    rgb, _, truth = photo("photo_04.jpg")
+    strip = cv2.resize(rgb[:, 280:360], None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    config = SEARCH if goes_on else replace(SEARCH, refinement=replace(SEARCH.refinement, max_renders_free_lens=4))
+    found = localize(read_query(jpeg(strip)), studio, Request(config=config))
+    if goes_on:
+        assert found.verdict.status is Status.LOCALIZED
+        assert pose_distance(found.pose, truth)[1] < 0.02
+    else:
+        assert found.verdict.reason is Reason.FOCAL_UNCERTAIN

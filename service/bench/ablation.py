@@ -68,7 +68,7 @@ def removals() -> dict[str, Removal]:
         "render and rematch": _searched_with(rematch_below_inliers=0),
         "photometric refinement": _searched_with(refinement=replace(refine, max_renders=0)),
         "second render of the refinement": _searched_with(
-            refinement=replace(refine, max_renders=1, first_render_px=None)
+            refinement=replace(refine, max_renders=1, max_renders_free_lens=1, first_render_px=None)
         ),
         "small first render": _searched_with(refinement=replace(refine, first_render_px=None)),
         "larger photo in the last retrieval": _searched_with(large_photo_factor=1.0),

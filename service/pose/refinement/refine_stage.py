@@ -29,6 +29,9 @@ class RefineStageConfig:
     photometric: RefinementConfig = REFINEMENT
     max_renders: int = 4
     """Renders that are refined on, one after the other; 0: the pose of the matches is the answer."""
+    max_renders_free_lens: int = 10
+    """As many, at least, with approximate intrinsics after matching with a render at the pose: there is nothing left to
+    do but to go on where distance and focal length still move along together, by a few percent a render."""
     first_render_px: int | None = 256
     """Long side of the first render: a small one brings the pose near as well. None: as large as the others."""
     max_first_motion_px: float = 4.0
@@ -115,7 +118,8 @@ def refine_stage(
     trusted, free_lens = found.num_inliers >= config.trusted_inliers, images.query.lens_prior is not None
     small_px = config.first_render_px
     now, refined, rendered = found, None, None
-    for round_number in range(config.max_renders):
+    max_renders = max(config.max_renders, config.max_renders_free_lens if free_lens and is_rematched else 0)
+    for round_number in range(max_renders):
         following = _next_render(rendered, now, images, renderer, config, small_px)
         if following is None:
             return RefineOutcome(refined)

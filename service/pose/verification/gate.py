@@ -61,6 +61,9 @@ class VerificationConfig:
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
+    max_drift_px_free_lens: float = 0.3
+    """By which another step would move the image, with approximate intrinsics: refinement settles at 0.3 px, and what
+    it has not settled may still be a tenth of the distance off, for distance and focal length move along together."""
     min_lens_matches: int = 50
     """Matches with which exact intrinsics are tested: ten unknowns with ten times as many equations."""
     max_inlier_scale: float = 10.0
@@ -183,7 +186,7 @@ def verdict_of(
     doubtful = config.model.below_floor(signals)
     score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
     little = signals["coverage"] < config.min_coverage
-    doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals["sigma_share"], uncertainty, config)
+    doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals, uncertainty, config)
     if score < config.min_localized:
         reason = Reason.FEW_FEATURES if few_features else _reason_of_refusal(signals, doubtful, config)
         if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_MISMATCH):
@@ -219,9 +222,10 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
 
 
 def _doubt_about_position(
-    sigma_share: float, uncertainty: PoseUncertainty | None, config: VerificationConfig
+    signals: Mapping[str, float], uncertainty: PoseUncertainty | None, config: VerificationConfig
 ) -> Reason | None:
     """Return why the position may be wrong at a pose where photo and render agree; None if there is no reason."""
+    sigma_share = signals["sigma_share"]
     if uncertainty is None:
         return Reason.POSITION_UNCERTAIN if sigma_share > config.max_sigma_share else None
     if uncertainty.lens_fit and uncertainty.lens_fit.contradicts:
@@ -229,7 +233,8 @@ def _doubt_about_position(
     if abs(uncertainty.focal_step) > config.max_focal_step:
         return Reason.FOCAL_UNCERTAIN
     if sigma_share <= config.max_sigma_share:
-        return None
+        is_settled = uncertainty.given_lens is None or signals["drift_px"] <= config.max_drift_px_free_lens
+        return None if is_settled else Reason.FOCAL_UNCERTAIN
     if uncertainty.given_lens is None:
         return Reason.POSITION_UNCERTAIN
     # With known intrinsics the position would be certain: then they are what is missing.
