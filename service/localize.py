@@ -27,6 +27,7 @@ from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import Answer, ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
+from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.verification.gate import VERIFICATION, downgraded, verify
@@ -342,9 +343,12 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
 
 
 def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verdict:
-    """Return the verdict with what a render doesn't show: a mirrored photo, other answers, too small a budget."""
+    """Return the verdict with what a render doesn't show: a mirrored photo, a lens beyond what is estimated, other
+    answers, too small a budget."""
     if last.mirrored:
         return replace(downgraded(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
+    if at_bounds(last.correction):
+        return downgraded(verdict, Reason.FOCAL_UNCERTAIN)
     share = 1.0 if last.alternatives is None else 1.0 - float(last.alternatives.scores.sum())
     if share < VERIFICATION.min_localized:
         return downgraded(verdict, Reason.AMBIGUOUS, share * verdict.score)

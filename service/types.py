@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from service.distortion import composed
 from service.errors import InvalidIntrinsics, InvalidPrior
 
 
@@ -126,18 +127,19 @@ class Intrinsics:
     def distorted(self, correction: IntrinsicsCorrection) -> Intrinsics:
         """Return the camera of the photo as it was taken: corrected, and with the distortion added to this camera's.
 
-        Added to the coefficient of the radius' third power, which is the sum of both to first order.
+        The sum of both distortions is fitted (`composed`).
         """
         camera = self.corrected(correction)
+        if self.distortion and (correction.k1 or correction.focal_factor != 1.0):
+            x, y = max(self.cx, self.width - self.cx), max(self.cy, self.height - self.cy)
+            corner = float(np.hypot(x / camera.fx, y / camera.fy))
+            model, distortion = composed(self.model, self.distortion, correction.focal_factor, correction.k1, corner)
+            return replace(camera, model=model, distortion=distortion)
         if not correction.k1:
             return camera
-        # A given distortion is a function of the radius over the given focal length.
-        k1 = correction.k1 + (self.distortion[0] * correction.focal_factor**2 if self.distortion else 0.0)
-        if self.distortion:
-            return replace(camera, distortion=(k1, *self.distortion[1:]))
         if self.fx == self.fy:
-            return replace(camera, model="SIMPLE_RADIAL", distortion=(k1,))
-        return replace(camera, model="OPENCV", distortion=(k1, 0.0, 0.0, 0.0))
+            return replace(camera, model="SIMPLE_RADIAL", distortion=(correction.k1,))
+        return replace(camera, model="OPENCV", distortion=(correction.k1, 0.0, 0.0, 0.0))
 
     def with_long_side(self, pixels: int) -> Intrinsics:
         """Return the camera for the image resampled so that its long side has `pixels`, never enlarged."""

@@ -20,7 +20,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Package -> its floors, bottom to top: a module imports from the floors below its own, and from itself.
 FLOORS = {
     "service": [
-        {"types", "results", "errors", "plugins", "logs", "versions"},
+        {"types", "results", "errors", "plugins", "logs", "versions", "distortion"},
         {"interfaces", "geometry", "jit", "photos"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators"},
@@ -50,7 +50,13 @@ FLOORS = {
 }
 # Within a floor: only these.
 SAME_FLOOR = {
-    "service": {("types", "errors"), ("results", "types"), ("plugins", "errors"), ("photos", "geometry")},
+    "service": {
+        ("types", "errors"),
+        ("types", "distortion"),
+        ("results", "types"),
+        ("plugins", "errors"),
+        ("photos", "geometry"),
+    },
     "service/pose": set(),
     "service/web": set(),
 }

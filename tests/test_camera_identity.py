@@ -186,3 +186,12 @@ def test_a_small_crop_was_rather_resized():
     square = np.log(26 / 36 * 4032 / 3024)
     assert abs(square - first.log_focal) < 1.5 * first.sigma
     assert any(abs(np.log(26 / 36 * 4032 / 1080) - mode.log_focal) < mode.sigma for mode in others)
+
+
+@pytest.mark.parametrize(("mm", "width"), [(26, 1_000_000), (2000, 9999)])
+def test_a_tag_and_sizes_that_are_of_no_lens_say_nothing(mm, width):
+    photo = open_photo(jpeg({}, {FOCAL_35: mm, WIDTH: width, HEIGHT: 700}, size=(400, 300)))
+    assert photo.camera.is_cropped
+    assert exif_focal_prior(photo.camera) == ()
+    # It is not refused for intrinsics that nobody sent.
+    assert photo.query().intrinsics_source == "guessed"

@@ -491,3 +491,11 @@ def test_broken_exif_is_no_error():
 def test_limits_are_what_the_messages_say():
     assert images.DEFAULTS.max_pixels >= 9248 * 6936
     assert images.DEFAULTS.max_pixels < 100e6
+
+
+def test_an_approximate_focal_length_leaves_room_for_its_estimate():
+    sizes = {"width": 64, "height": 48, "cx": 32, "cy": 24}
+    assert intrinsics_from({**sizes, "fx": 9e6, "fy": 9e6}).fx == 9e6
+    with pytest.raises(InvalidIntrinsics, match="at most 1e") as refused:
+        intrinsics_from({**sizes, "fx": 9e6, "fy": 9e6, "trust": "approximate"})
+    assert refused.value.where == "fx"

@@ -304,3 +304,39 @@ def test_only_approximate_intrinsics_leave_the_focal_length_open() -> None:
     assert given is not None
     assert guessed is not None
     assert 0 < given.log_focal_scale < guessed.log_focal_scale
+
+
+def _seen_by_opencv(camera: Intrinsics, rays: np.ndarray) -> np.ndarray:
+    """Pixels of rays (x, y) at z = 1."""
+    is_fisheye = "FISHEYE" in camera.model
+    coefficients = np.zeros(4 if is_fisheye else 8)
+    coefficients[: len(camera.distortion)] = camera.distortion
+    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+    points = np.column_stack([rays, np.ones(len(rays))])[:, None]
+    project = cv2.fisheye.projectPoints if is_fisheye else cv2.projectPoints
+    return project(points, np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "max_error_px"),
+    [
+        ("SIMPLE_RADIAL", (-0.05,), 1.0),
+        ("RADIAL", (-0.1, 0.02), 0.2),
+        ("OPENCV", (-0.12, 0.03, 0.002, -0.001), 0.2),
+        ("FULL_OPENCV", (-0.1, 0.02, 0.001, -0.001, 0.0, 0.02, 0.001, 0.0), 0.2),
+        ("SIMPLE_RADIAL_FISHEYE", (0.02,), 0.2),
+        ("OPENCV_FISHEYE", (0.02, -0.01, 0.003, 0.0), 0.2),
+    ],
+)
+@pytest.mark.parametrize(("focal_factor", "k1"), [(1.15, 0.0), (0.88, 0.0), (1.12, 0.03), (0.9, -0.02)])
+def test_corrected_intrinsics_with_a_distortion_are_those_of_the_photo(
+    model: str, distortion: tuple[float, ...], max_error_px: float, focal_factor: float, k1: float
+) -> None:
+    """Against OpenCV: the ray that corrected intrinsics see in the undistorted image, distorted as was given."""
+    given = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, model, distortion, "approximate")
+    rays = np.stack(np.meshgrid(np.linspace(-0.55, 0.55, 12), np.linspace(-0.42, 0.42, 9)), -1).reshape(-1, 2)
+    undistorted_rays = focal_factor * rays * (1 + k1 * (rays**2).sum(1, keepdims=True))
+    reported = given.distorted(IntrinsicsCorrection(focal_factor, k1=k1))
+    assert reported.fx == pytest.approx(500.0 * focal_factor)
+    error = np.linalg.norm(_seen_by_opencv(reported, rays) - _seen_by_opencv(given, undistorted_rays), axis=1)
+    assert error.max() < max_error_px

@@ -18,6 +18,7 @@ from service.geometry import pose_distance, se3_log
 from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
+from service.pose.absolute_pose import lens_prior
 from service.results import PoseEstimate, Reason, Status
 from service.types import Intrinsics, Pose
 
@@ -159,3 +160,13 @@ def test_a_strip_is_refined_until_it_settles_or_refused(studio: LoadedScene, goe
         assert pose_distance(found.pose, truth)[1] < 0.02
     else:
         assert found.verdict.reason is Reason.FOCAL_UNCERTAIN
+
+
+def test_a_lens_at_the_bound_of_what_is_estimated_is_no_sure_answer(
+    studio: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The true one may lie beyond, and the pose make up for the difference."""
+    monkeypatch.setattr(lens_prior, "BOUNDS", replace(lens_prior.BOUNDS, k1=1e-4))
+    found = localize(read_query(jpeg(photo("photo_00.jpg")[0])), studio)
+    assert abs(found.records[-1].correction.k1) == pytest.approx(1e-4)
+    assert found.verdict.reason is Reason.FOCAL_UNCERTAIN

@@ -113,6 +113,8 @@ class ExifFocalConfig:
     longer_log: float = 0.4
     longer_sigma: float = 0.3
     """A crop to half of the width is 0.69."""
+    max_focal: float = 100.0
+    """In long sides of the photo: no lens has more, 2000 mm are 56."""
 
 
 EXIF_FOCAL = ExifFocalConfig()
@@ -123,7 +125,7 @@ def exif_focal_prior(identity: CameraIdentity, config: ExifFocalConfig = EXIF_FO
 
     Makers define it by the width (36 mm) or the diagonal (43.27 mm) of the frame: the first mode lies between both,
     and its sigma spans them. Of a photo that was evidently cropped the tag is of the whole frame, whose size in pixels
-    EXIF has. Empty where there is no such tag.
+    EXIF has. Empty where there is no such tag, or it and the sizes together are of no lens.
     """
     if identity.focal_35mm is None:
         return ()
@@ -131,6 +133,8 @@ def exif_focal_prior(identity: CameraIdentity, config: ExifFocalConfig = EXIF_FO
     by_width = float(np.log(identity.focal_35mm / 36.0 * frame_long / long_side))
     diagonal = np.hypot(frame_long, frame_short) / frame_long
     half_gap = float(np.log(diagonal * 36.0 / np.hypot(36.0, 24.0))) / 2
+    if by_width > np.log(config.max_focal):
+        return ()
     middle, sigma = by_width + half_gap, float(np.hypot(config.tag_sigma, half_gap))
     others = [FocalMode(middle + config.longer_log, config.longer_sigma, config.longer_probability)]
     if identity.digital_zoom > 1.0:

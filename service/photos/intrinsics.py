@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from service.distortion import fisheye_radius, radial_radius
 from service.errors import InvalidIntrinsics
 from service.types import Intrinsics, IntrinsicsCorrection, Query
 
@@ -21,6 +22,10 @@ DISTORTION_COUNTS = {
 }  # fmt: skip
 """COLMAP's camera models -> number of parameters after focal lengths and principal point."""
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+
+
+MAX_APPROXIMATE_FOCAL_PX = 1e6
+"""Of a longest real lens it is some 1e5."""
 
 
 def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
@@ -55,13 +60,20 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
         )
     if model in ONE_FOCAL and values["fx"] != values["fy"]:
         raise InvalidIntrinsics(f"{model} has one focal length: fy must equal fx.", where="fy")
+    trust = mapping.get("trust", "exact")
+    # An estimate may be ten times as long, which has to be a focal length, too.
+    if trust == "approximate" and max(values["fx"], values["fy"]) > MAX_APPROXIMATE_FOCAL_PX:
+        raise InvalidIntrinsics(
+            f"must be at most {MAX_APPROXIMATE_FOCAL_PX:g} pixels where it is approximate, is {values['fx']:g}.",
+            where="fx",
+        )
     return Intrinsics(
         width=int(values["width"]),
         height=int(values["height"]),
         **{key: values[key] for key in required[2:]},
         model=model,
         distortion=tuple(_number(v, "distortion") for v in distortion),
-        trust=mapping.get("trust", "exact"),
+        trust=trust,
     )
 
 
@@ -255,21 +267,9 @@ def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye
     y = (np.arange(pinhole.height) + 0.5 - pinhole.cy) / pinhole.fy
     radius = np.linspace(0.0, np.hypot(np.abs(x).max(), np.abs(y).max()), 1025)
     # Sampled, not solved: a thousandth of the image's diagonal is exact enough for a mask.
-    turns = np.flatnonzero(np.diff((_fisheye if fisheye else _radial)(radius, coefficients)) <= 0)
+    turns = np.flatnonzero(np.diff((fisheye_radius if fisheye else radial_radius)(radius, coefficients)) <= 0)
     reach = radius[turns[0]] if len(turns) else np.inf
     return x[None] ** 2 + y[:, None] ** 2 > reach**2
-
-
-def _radial(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "8"]) -> Float64[np.ndarray, "n"]:
-    """Return the distorted radius of the rational model (COLMAP's FULL_OPENCV) without its tangential terms."""
-    r2 = r * r
-    return r * (1 + r2 * (k[0] + r2 * (k[1] + r2 * k[4]))) / (1 + r2 * (k[5] + r2 * (k[6] + r2 * k[7])))
-
-
-def _fisheye(r: Float64[np.ndarray, "n"], k: Float64[np.ndarray, "4"]) -> Float64[np.ndarray, "n"]:
-    theta = np.arctan(r)
-    t2 = theta * theta
-    return theta * (1 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
 
 
 def _number(value: Any, where: str) -> float:

@@ -48,6 +48,11 @@ def correction_of(vector: Float64[np.ndarray, "4"]) -> IntrinsicsCorrection:
     return IntrinsicsCorrection(float(np.exp(log_focal)), shift_x, shift_y, k1)
 
 
+def at_bounds(correction: IntrinsicsCorrection) -> bool:
+    """Return whether a component was clipped, so that the true one may lie beyond."""
+    return bool((np.abs(correction_vector(correction)) > 0.999 * BOUNDS.vector).any())
+
+
 def stepped(correction: IntrinsicsCorrection, step: Float64[np.ndarray, "4"]) -> IntrinsicsCorrection:
     """Return the correction after a step of its `correction_vector`."""
     return correction_of(correction_vector(correction) + step)
