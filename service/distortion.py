@@ -33,31 +33,33 @@ def composed(
     """Return model and parameters of the distortion r -> D(s r (1 + k1 r^2)) / s, where D is the given one.
 
     That is what a photo has, in units of its corrected focal length, if pixels from which D was removed have the focal
-    length corrected by the factor s and the distortion `k1`. A fisheye's parameters, and the first two of other
-    models, are fitted by least squares up to the radius of the image's corner, `corner_radius`; any fisheye becomes an
-    OPENCV_FISHEYE, for with another focal length it is no longer one of fewer parameters.
+    length corrected by the factor s and the distortion `k1`. A fisheye's parameters, and the first two of models that
+    have them, are fitted by least squares up to the radius of the image's corner, `corner_radius`; the one of a
+    SIMPLE_RADIAL is right to first order. Any fisheye becomes an OPENCV_FISHEYE, for with another focal length it is no
+    longer one of fewer parameters.
     """
     is_fisheye = "FISHEYE" in model
+    if len(distortion) == 1 and not is_fisheye:
+        return model, (distortion[0] * focal_factor**2 + k1,)
     given = np.zeros(4 if is_fisheye else 8)
     given[: len(distortion)] = distortion
     r = np.linspace(0.0, _REACH * corner_radius, _SAMPLES + 1)[1:]
     inner = focal_factor * r * (1 + k1 * r * r)
     with np.errstate(all="ignore"):
         target = (fisheye_radius if is_fisheye else radial_radius)(inner, given) / focal_factor
-    # Beyond the radius at which it stops growing the image isn't used.
-    usable = np.isfinite(target) & (np.diff(target, prepend=0.0) > 0) & (np.diff(inner, prepend=0.0) > 0)
+        # Beyond the radius at which it stops growing the image isn't used.
+        usable = np.isfinite(target) & (np.diff(target, prepend=0.0) > 0) & (np.diff(inner, prepend=0.0) > 0)
     usable = np.logical_and.accumulate(usable)
     r, target = r[usable], target[usable]
     if is_fisheye:
         theta = np.arctan(r)
-        return "OPENCV_FISHEYE", tuple(_fitted(theta, target - theta, 4))
+        return "OPENCV_FISHEYE", tuple(_fitted(theta, target - theta, 4).tolist())
     scaled = given * focal_factor ** np.array([2, 4, 1, 1, 6, 2, 4, 6])
-    fitted = min(len(distortion), 2)
     held = scaled.copy()
-    held[:fitted] = 0.0
+    held[:2] = 0.0
     r2 = r * r
     denominator = 1 + r2 * (scaled[5] + r2 * (scaled[6] + r2 * scaled[7]))
-    scaled[:fitted] = _fitted(r, (target - radial_radius(r, held)) * denominator, fitted)
+    scaled[:2] = _fitted(r, (target - radial_radius(r, held)) * denominator, 2)
     return model, tuple(scaled[: len(distortion)].tolist())
 
 

@@ -340,3 +340,17 @@ def test_corrected_intrinsics_with_a_distortion_are_those_of_the_photo(
     assert reported.fx == pytest.approx(500.0 * focal_factor)
     error = np.linalg.norm(_seen_by_opencv(reported, rays) - _seen_by_opencv(given, undistorted_rays), axis=1)
     assert error.max() < max_error_px
+
+
+@pytest.mark.parametrize("focal_factor", [0.5, 1.0, 2.0])
+def test_one_radial_parameter_is_right_near_the_centre_however_the_rest_folds(focal_factor: float) -> None:
+    """k1 = -0.5 folds within the image: a fit over all of it would be wrong where the image is used."""
+    given = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, "SIMPLE_RADIAL", (-0.5,), "approximate")
+    reported = given.distorted(IntrinsicsCorrection(focal_factor, k1=0.35))
+    assert reported.distortion == pytest.approx((-0.5 * focal_factor**2 + 0.35,))
+
+
+@pytest.mark.parametrize(("model", "count"), [("OPENCV", 4), ("FULL_OPENCV", 8), ("OPENCV_FISHEYE", 4)])
+def test_absurd_distortions_are_corrected_without_a_warning(model: str, count: int) -> None:
+    given = Intrinsics(640, 480, 1.0, 1.0, 320.0, 240.0, model, (9e200,) * count, "approximate")
+    assert len(given.distorted(IntrinsicsCorrection(1.2, k1=0.1)).distortion) == count
