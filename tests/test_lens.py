@@ -348,9 +348,3 @@ def test_one_radial_parameter_is_right_near_the_centre_however_the_rest_folds(fo
     given = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, "SIMPLE_RADIAL", (-0.5,), "approximate")
     reported = given.distorted(IntrinsicsCorrection(focal_factor, k1=0.35))
     assert reported.distortion == pytest.approx((-0.5 * focal_factor**2 + 0.35,))
-
-
-@pytest.mark.parametrize(("model", "count"), [("OPENCV", 4), ("FULL_OPENCV", 8), ("OPENCV_FISHEYE", 4)])
-def test_absurd_distortions_are_corrected_without_a_warning(model: str, count: int) -> None:
-    given = Intrinsics(640, 480, 1.0, 1.0, 320.0, 240.0, model, (9e200,) * count, "approximate")
-    assert len(given.distorted(IntrinsicsCorrection(1.2, k1=0.1)).distortion) == count
