@@ -42,6 +42,9 @@ class RefineStageConfig:
     """Where refinement moved the image by less, another render would be the same."""
     levels: int = 2
     """Levels of the image pyramid."""
+    later_levels: int = 1
+    """Levels after the first render, where many matches led to the pose and the intrinsics are exact: less than a pixel
+    is left to refine."""
     first_levels: int = 4
     """Levels on the first render if the pose has fewer than `trusted_inliers`, since it may be far off."""
     trusted_inliers: int = MATCHING.sufficient_inliers
@@ -125,7 +128,9 @@ def refine_stage(
             return RefineOutcome(refined)
         rendered = following
         # From nearby the coarse levels change nothing.
-        levels = config.levels if round_number or trusted else config.first_levels
+        first_levels = config.levels if trusted else config.first_levels
+        later_levels = config.later_levels if trusted and not free_lens else config.levels
+        levels = later_levels if round_number else first_levels
         result = _refined_on(rendered, now, images, levels, bool(small_px), config)
         diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
         if diverged or result.loss > max_loss or not np.isfinite(result.loss):
