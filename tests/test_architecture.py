@@ -186,7 +186,7 @@ def test_contributing_shows_the_same_floors(package):
 def test_jobs_know_scenes_through_the_engine_and_databases_through_the_store():
     for path in SOURCES:
         place, modules = path.relative_to(ROOT), set(imported(path))
-        assert "sqlite3" not in modules or place == Path("service/jobs/database.py"), place
+        assert "sqlite3" not in modules or place == Path("service/jobs/sqlite_database.py"), place
         if place.is_relative_to("service/jobs") and place.name != "embedded_engine.py":
             scenes = {module for module in modules if module.startswith("service.scene_manager")}
             assert scenes <= {"service.scene_manager.status"}, place

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from service.jobs.codec import decode, encode
-from service.jobs.database import Connection, Database
+from service.jobs.sqlite_database import Connection, Database
 from service.lenses.lens_estimate import LensEstimate
 from service.lenses.lens_key import LensKey
 from service.lenses.lens_store import StoredLens

@@ -16,7 +16,6 @@ from typing import Any
 
 from service.errors import Failure, IdempotencyConflict, JobNotFound
 from service.jobs.codec import decode, encode
-from service.jobs.database import Connection, Database
 from service.jobs.migrate_0_1 import old_failure, old_photo, old_result, old_spec
 from service.jobs.model import (
     ENDED,
@@ -32,6 +31,7 @@ from service.jobs.model import (
     Retention,
     StoredJob,
 )
+from service.jobs.sqlite_database import Connection, Database
 from service.results import Status
 
 _VERSION_1 = """

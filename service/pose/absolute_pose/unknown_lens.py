@@ -89,6 +89,7 @@ def absolute_pose_unknown_lens(
             found = refine_with_lens(photo_px, points_in_world, intrinsics, found, prior, max_error_px, config)
             if found.num_inliers >= sufficient:
                 return _with_crop(found, photo_px, points_in_world, intrinsics, prior, max_error_px, config)
+        # At none of the focal lengths did enough agree: the caller may have other matches to add.
         if best is None or found.num_inliers > best.num_inliers:
             best = found
     return best
@@ -115,6 +116,7 @@ def _with_crop(
     config: LensSearchConfig,
 ) -> AbsolutePose:
     """Return the pose of a photo cropped off centre if many more correspondences agree with that, else `found`."""
+    # From the centre: the tails of the usual prior would let the principal point go, but its slope there holds it.
     cropped = replace(prior, principal_point_scale=max(prior.principal_point_scale, config.crop_scale))
     other = refine_with_lens(photo_px, points_in_world, intrinsics, found, cropped, max_error_px, config)
     return other if other.num_inliers > config.crop_gain * found.num_inliers else found
@@ -146,6 +148,7 @@ def refine_with_lens(
                 Pose(now.pose.world_from_camera @ se3_exp(step[:6])), stepped(now.correction, step[6:]), now.scale
             )
             if after.cost > now.cost:
+                # The linearization doesn't reach that far: a shorter step, nearer to the gradient's direction.
                 damping *= 10.0
                 continue
             settled = float(step @ now.rhs) < settled_decrement
@@ -186,6 +189,7 @@ def evidence_against_lens(
     `prior` is that of the free intrinsics.
     """
     given = (photo_px, points_in_world, intrinsics)
+    # The answer is the best pose of the pixels, not of these matches: both are fitted, so that like is compared.
     exact = refine_with_lens(*given, start, EXACT, max_error_px, config)
     free = refine_with_lens(*given, exact, prior, max_error_px, config)
     problem = _Problem(*given, prior, config.noise * max_error_px)

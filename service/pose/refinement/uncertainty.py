@@ -95,6 +95,7 @@ def pose_uncertainty(
     if found is None:
         return None
     information = hessian if lens_prior is None else _with_prior(hessian, scale, lens_prior, correction)
+    # After the lens: where that is estimated it takes up a part of the motion.
     shutter = shutter_motion(information, score, scale, lens_prior is not None, config.shutter)
     found = replace(found, last_step=last_step, shutter=shutter, loss=loss)
     return found if shutter is None else _with_shutter(found, config.shutter.uncertainty_factor * shutter.motion)
@@ -116,6 +117,7 @@ def _with_exact_lens(
     information = _with_prior(hessian, scale, config.lens_test.prior, NO_CORRECTION)[of_lens, of_lens]
     free = inverse_spd(information)
     lens_fit = None if free is None else fit_lens(level, state, free @ score[of_lens], loss, config)
+    # Beside the covariance, not in it: the gate trusts exact intrinsics, whoever uses the pose should know of the rest.
     untested = _covariance_of_untested_lens(level, hessian, scale, free, config.lens_test)
     return PoseUncertainty(np.zeros(6), covariance, lens_fit=lens_fit, untested_lens=untested)
 

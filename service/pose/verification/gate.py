@@ -90,8 +90,7 @@ def verify(
     """
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
-    # Fresh matches cost most of a verification.
-    # Where the scene's model is poor, the pixels don't show wrong intrinsics, and matches do.
+    # Fresh matches cost most of a verification, but where the scene's model is poor only they show wrong intrinsics.
     large_loss = uncertainty is None or uncertainty.loss > config.refinement.lens_test.suspicious_loss
     if pixels_may_decide and not large_loss and photometric_suffices(signals, config):
         verdict = verdict_of(signals, uncertainty, config=config)
