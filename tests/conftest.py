@@ -2,6 +2,7 @@
 
 import os
 import sys
+import tempfile
 from collections.abc import Iterator
 
 # As on the command line: threads of a library that wait for one another burn the cores that other tests need. Too late
@@ -13,6 +14,10 @@ os.environ |= dict.fromkeys(
 import pytest
 import shape_checks
 from hypothesis import settings
+
+# Whoever runs the tests may have keys and settings of their own; the service looks for them when it is imported.
+_CONFIG = tempfile.TemporaryDirectory(prefix="splatfix-config-")
+os.environ["XDG_CONFIG_HOME"] = _CONFIG.name
 
 shape_checks.install(("service", "viewer"))
 
