@@ -24,7 +24,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from service.cli.server import run
-from service.errors import InvalidRequest, QueueFull
+from service.errors import InvalidRequest, QueueFull, StorageFailed
 from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
 from service.web.metrics import Metrics
 from service.web.middleware.limits import Limits
@@ -203,6 +203,37 @@ def test_tokens_end(tmp_path):
     assert KeyRing(tmp_path / "keys.json").bearer(ring.token(Caller("a", "admin"), 60)) is None  # another process
     for garbage in ("", ".", "a.b", "é.ü"):
         assert ring.bearer(garbage) is None
+
+
+def test_sessions_outlive_a_restart_and_end_with_their_key(tmp_path):
+    keys, secret = tmp_path / "keys.json", tmp_path / "sessions.key"
+    add_key(keys, "a", "read")
+    before, after = KeyRing(keys), KeyRing(keys)
+    for ring in (before, after):
+        ring.keep_sessions(secret)
+    token = before.token(Caller("a", "read"), 60)
+    assert stat.S_IMODE(os.stat(secret).st_mode) == 0o600
+    assert after.bearer(token) == Caller("a", "read")
+    remove_key(keys, "a")
+    add_key(keys, "a", "read")  # somebody else's, of the same name
+    later = KeyRing(keys)
+    later.keep_sessions(secret)
+    assert later.bearer(token) is None
+    secret.write_bytes(b"half")
+    later.keep_sessions(secret)
+    assert later.bearer(later.token(Caller("a", "read"), 60))
+    assert len(secret.read_bytes()) == 32
+    with pytest.raises(StorageFailed, match="secret"):
+        later.keep_sessions(tmp_path)
+
+
+def test_a_session_goes_on_after_a_restart_of_the_service(stepping, ring, tmp_path):
+    kept = settings(keys_file=tmp_path / "keys.json", data_dir=tmp_path / "data")
+    with serving(create_app(kept, {"room": make_scene()})) as client:
+        entered = client.get("/", params={"key": ring["read"]})
+        cookie = {"Cookie": entered.headers["set-cookie"].split(";")[0]}
+    with serving(create_app(kept, {"room": make_scene()})) as client:
+        assert client.get("/jobs", headers=cookie).status_code == 200
 
 
 def test_other_sites_pages_may_not_act(shared):

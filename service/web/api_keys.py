@@ -17,13 +17,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from service.errors import InvalidRequest
+from service.errors import InvalidRequest, StorageFailed
 
 Role = Literal["read", "localize", "admin"]
 ROLES: tuple[Role, ...] = get_args(Role)
 """In ascending order; each role includes those before it."""
 _PREFIX = "sfx_"
 """Marks a key for people and for secret scanners."""
+_SECRET_BYTES = 32
 _RECHECK_S = 1.0
 """Time between two checks of the file."""
 
@@ -57,8 +58,8 @@ class KeyRing:
         """Read the keys; none if there is no file. Raises InvalidRequest if the file is damaged."""
         self._path = path
         self._temporary: list[StoredKey] = []
-        # New in each process: tokens end with it, and need no storage.
-        self._secret = secrets.token_bytes(32)
+        # Until `keep_sessions`: tokens end with the process.
+        self._secret = secrets.token_bytes(_SECRET_BYTES)
         self._read_at, self._stamp = 0.0, (0, 0)
         self._stored: list[StoredKey] = []
         self._refresh()
@@ -67,6 +68,20 @@ class KeyRing:
         """Return whether a client needs a key: whether there is any but the viewer's own."""
         self._refresh()
         return bool(self._stored) or any(key.name != "viewer" for key in self._temporary)
+
+    def keep_sessions(self, path: Path) -> None:
+        """Sign tokens with the secret in a file, made if it isn't there, so that they outlive a restart.
+
+        Raises StorageFailed.
+        """
+        try:
+            secret = path.read_bytes() if path.exists() else b""
+            if len(secret) != _SECRET_BYTES:
+                secret = secrets.token_bytes(_SECRET_BYTES)
+                _write_private(path, secret)
+        except OSError as error:
+            raise StorageFailed(f"the secret of sessions can't be kept: {error.strerror}.", where=path.name) from error
+        self._secret = secret
 
     def make_temporary(self, name: str, role: Role) -> str:
         """Make a key that is valid until the process ends; return it."""
@@ -87,12 +102,13 @@ class KeyRing:
     def key_id(self, caller: Caller) -> str:
         """Return what tells a key from an earlier one of the same name: digits of its hash; empty if it was removed."""
         self._refresh()
-        digests = [key.sha256 for key in (*self._stored, *self._temporary) if key.name == caller.name]
-        return digests[0][:16] if digests else ""
+        ids = [_key_id(key) for key in (*self._stored, *self._temporary) if key.name == caller.name]
+        return ids[0] if ids else ""
 
     def token(self, caller: Caller, seconds: float) -> str:
-        """Return a signed token that is valid for that time, but no longer than the process and the caller's key."""
-        claim = json.dumps({"name": caller.name, "role": caller.role, "until": time.time() + seconds})
+        """Return a signed token that is valid for that time, but no longer than the caller's key."""
+        key = self.key_id(caller)
+        claim = json.dumps({"name": caller.name, "role": caller.role, "key": key, "until": time.time() + seconds})
         text = base64.urlsafe_b64encode(claim.encode()).decode()
         return f"{text}.{self._signature(text)}"
 
@@ -104,9 +120,11 @@ class KeyRing:
         claim = json.loads(base64.urlsafe_b64decode(text))
         caller = Caller(claim["name"], claim["role"])
         self._refresh()
-        # The signature proves who made the token, not that the key still exists with that role.
-        living = {(key.name, key.role) for key in (*self._stored, *self._temporary)}
-        return caller if claim["until"] > time.time() and (caller.name, caller.role) in living else None
+        # The signature proves who made the token, not that the key still exists with that role. Its hash counts, too:
+        # a key of the same name that was added later is another one.
+        living = {(key.name, key.role, _key_id(key)) for key in (*self._stored, *self._temporary)}
+        named = caller.name, caller.role, claim["key"]
+        return caller if claim["until"] > time.time() and named in living else None
 
     def _signature(self, text: str) -> str:
         return hmac.new(self._secret, text.encode(), "sha256").hexdigest()
@@ -159,16 +177,24 @@ def remove_key(path: Path, name: str) -> None:
 
 def _write(path: Path, keys: list[StoredKey]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
+    _write_private(path, json.dumps([asdict(key) for key in keys], indent=1).encode())
+
+
+def _write_private(path: Path, content: bytes) -> None:
     # Replaced at once: a running service must never read half a file.
     draft = path.with_name(f"{path.name}.{os.getpid()}")
     try:
         # Mode 600 from the start: a chmod afterwards would leave the file readable for a moment.
-        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-            json.dump([asdict(key) for key in keys], file, indent=1)
+        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
+            file.write(content)
         draft.replace(path)
     finally:
         with suppress(FileNotFoundError):
             draft.unlink()
+
+
+def _key_id(key: StoredKey) -> str:
+    return key.sha256[:16]
 
 
 def _digest(key: str) -> str:

@@ -118,6 +118,7 @@ async def _start(
 ) -> AppState:
     """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
     folder = stack.enter_context(data_folder(settings.data_dir))
+    keys.keep_sessions(folder / "sessions.key")
     scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
     for scene in scene_store.scenes():
         if scene.uploaded:
