@@ -1,6 +1,6 @@
 """A service for the viewer's tests: scripted jobs, answered with the API's own models; no renderer.
 
-`FakeService.transport` goes into `viewer.service_client.Service`. A job's events stay open until `finish`, so a test
+`FakeService.transport` goes into `service.client.Client`. A job's events stay open until `finish`, so a test
 decides what has happened when.
 """
 

@@ -20,7 +20,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Package -> its floors, bottom to top: a module imports from the floors below its own, and from itself.
 FLOORS = {
     "service": [
-        {"types", "results", "errors", "plugins", "logs", "versions", "distortion"},
+        {"types", "results", "errors", "plugins", "logs", "versions", "distortion", "client"},
         {"interfaces", "geometry", "jit", "photos"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators"},
@@ -96,7 +96,7 @@ WRAPPED = {
     "pyproj": {"service/web/schemas/geodesy.py"},
     "yaml": {"service/web/openapi.py"},
     "websockets": {"service/web/viewer_relay.py"},
-    "httpx": {"service/web/viewer_relay.py", "viewer/service_client.py"},
+    "httpx": {"service/web/viewer_relay.py", "service/client.py"},
     "uvicorn": {"service/cli/server.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
     "typer": {"service/cli"},
@@ -144,7 +144,7 @@ def _may_import(place: Path, module: str) -> bool:
     if module == "service.__version__":
         return True
     if place.parts[0] == "viewer":
-        return module.split(".")[1] in ("types", "results")
+        return module.split(".")[1] in ("types", "results", "client")
     if len(place.parts) == 2 and place.stem == "__init__":
         return False  # `import service` stays light
     return all(_floors_allow(package, place, Path(*module.split("."))) for package in FLOORS)

@@ -17,9 +17,9 @@ from fastapi.staticfiles import StaticFiles
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
+from service.client import Client
 from service.web.pages import PAGES
 from service.web.viewer_relay import Relay
-from viewer.service_client import ServiceClient
 from viewer.viewer_server import Viewer
 
 pytestmark = NEEDS_CHROMIUM
@@ -39,7 +39,7 @@ def fake() -> FakeService:
 @pytest.fixture
 def url(fake: FakeService) -> Iterator[str]:
     """A service that has nothing but the relay to a viewer of the fake service."""
-    viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
     relay = Relay(SimpleNamespace(port=viewer.server.get_port()))
     relay_only = FastAPI()
     relay_only.include_router(relay.router)

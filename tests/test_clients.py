@@ -53,28 +53,61 @@ def blocks(language: str) -> str:
     return "\n".join(re.findall(rf"```{language}\n(.*?)```", DOCUMENT, re.DOTALL))
 
 
-def environment(client: httpx.Client, key: str) -> dict[str, str]:
-    return os.environ | {"URL": str(client.base_url).rstrip("/"), "KEY": key, "NO_PROXY": "*"}
+@pytest.fixture(scope="module")
+def keyless(place) -> Iterator[httpx.Client]:
+    """A service without keys on the same room."""
+    _, _, folder = place
+    changes = {"estimator": "view_index", "scenes": [folder / "room"], "cache_dir": folder / "cache"}
+    with serving(create_app(settings(**changes))) as client:
+        until_ready(client)
+        yield client
 
 
-def test_the_python_client_works_as_written(place):
+def environment(client: httpx.Client, key: str, scene: str = "room") -> dict[str, str]:
+    told = {"URL": str(client.base_url).rstrip("/"), "KEY": key, "SCENE": scene, "NO_PROXY": "*", "PYTHONPATH": ""}
+    return os.environ | told
+
+
+def python_client(folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    """Run the documented client as an application would: beside a copy of the file, and nothing else of ours."""
+    (folder / "app").mkdir(exist_ok=True)
+    shutil.copy(ROOT / "service" / "client.py", folder / "app" / "splatfix_client.py")
+    (folder / "app" / "main.py").write_text(blocks("python"))
+    command = [sys.executable, "app/main.py", "photo.jpg"]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=90)
+
+
+def test_the_python_client_works_as_written(place, keyless):
     client, key, folder = place
-    command = [sys.executable, "-c", blocks("python"), "photo.jpg"]
-    told = subprocess.run(command, cwd=folder, env=environment(client, key), capture_output=True, text=True, timeout=90)
-    assert told.returncode == 0, told.stderr
-    # Without intrinsics the lens is guessed, hence at best uncertain; the answer's form is what is tested.
-    assert re.match(r"(localized|uncertain|not_localized) [\d.]+ \[\[", told.stdout)
-    lines = [line for line in blocks("python").splitlines() if line.strip()]
-    assert len(lines) <= 25
+    for service, given in ((client, key), (keyless, "")):
+        told = python_client(folder, environment(service, given))
+        assert told.returncode == 0, told.stderr
+        # Without intrinsics the lens is guessed, hence at best uncertain; the answer's form is what is tested.
+        assert re.match(r"(localized|uncertain|not_localized) [\d.]+ \[\[", told.stdout)
+        assert re.search(r"^[\d.]+ s: \w+$", told.stderr, re.M)
+    assert len([line for line in blocks("python").splitlines() if line.strip()]) <= 25
+
+
+def test_the_python_client_tells_errors_in_one_line(place):
+    client, key, folder = place
+    for given, code in (
+        (environment(client, key, "attic"), "scene_not_found"),
+        (environment(client, ""), "unauthorized"),
+    ):
+        told = python_client(folder, given)
+        assert told.returncode == 1
+        assert told.stderr.startswith(f"{code}: ")
+        assert "Traceback" not in told.stderr
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl")
-def test_the_curl_lines_work_as_written(place):
+@pytest.mark.parametrize("keys", [True, False])
+def test_the_curl_lines_work_as_written(place, keyless, keys):
     client, key, folder = place
+    service = client if keys else keyless
     script = "set -eu\n" + blocks("sh").replace("photo=@photo.jpg", f"photo=@photo.jpg -F intrinsics={_quoted()}")
-    told = subprocess.run(
-        ["bash", "-c", script], cwd=folder, env=environment(client, key), capture_output=True, text=True, timeout=100
-    )
+    given = environment(service, key if keys else "")
+    told = subprocess.run(["bash", "-c", script], cwd=folder, env=given, capture_output=True, text=True, timeout=100)
     assert told.returncode == 0, (told.stderr, told.stdout)
     assert json.loads((folder / "job.json").read_text())["links"]["events"]
     assert "event: result" in (folder / "events.txt").read_text()
@@ -85,7 +118,7 @@ def test_the_curl_lines_work_as_written(place):
     assert np.load(folder / "depth.npy", allow_pickle=False).shape == (HEIGHT, WIDTH)
     for name in ("render.jpg", "upright.jpg"):
         assert (folder / name).read_bytes().startswith(b"\xff\xd8\xff")
-    assert client.get("/scenes/attic").status_code == 404
+    assert service.get("/scenes/attic").status_code == 404
 
 
 def _quoted() -> str:

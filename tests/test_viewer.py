@@ -17,6 +17,7 @@ from fake_service import PHOTO, FakeService, orbit, records, render_rgb, threads
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.client import Client, Event, EventParser, ServiceError, parse_record
 from service.geometry import look_at, project, transformed
 from service.results import IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.splat_sample import importance, packed_splats
@@ -28,8 +29,8 @@ from viewer.job_stream import JobStream
 from viewer.layers.splat_layer import full_covariances
 from viewer.panel_html import headline_html, record_html, scene_html
 from viewer.playback import Playback
-from viewer.service_client import Job, JobOutcome, ServiceClient, ServiceError, parse_record, parse_splats, sse_events
 from viewer.service_lists import ServiceLists
+from viewer.service_values import Job, JobOutcome, parse_splats, record_of
 from viewer.shared_data import SharedData
 
 # ---------------------------------------------------------------- what the service says
@@ -37,7 +38,7 @@ from viewer.shared_data import SharedData
 
 @pytest.mark.parametrize("record", [*records(2), replace(records(1)[0], matches=None, candidates=None, loss=None)])
 def test_records_survive_the_wire(record: IterationRecord) -> None:
-    back = parse_record(record_out(record).model_dump(mode="json"))
+    back = record_of(parse_record(record_out(record).model_dump(mode="json"), 1))
     np.testing.assert_array_equal(back.pose.world_from_camera, record.pose.world_from_camera)
     for name in ("stage", "index", "elapsed_s", "loss", "num_matches", "num_inliers", "step_deg", "step_units"):
         assert getattr(back, name) == getattr(record, name)
@@ -70,21 +71,21 @@ def test_splats_are_read_as_the_service_packs_them() -> None:
 def test_server_sent_events() -> None:
     # Comments, several data lines, an event without data (dropped) and one without a name: as the standard has it.
     text = ": ping\n\nevent: record\nid: 0\ndata: one\ndata: two\n\nevent: empty\n\ndata:  spaced\n\n"
-    assert list(sse_events(iter(text.split("\n")))) == [
-        ("", "", ""),
-        ("record", "0", "one\ntwo"),
-        ("message", "", " spaced"),
+    assert list(filter(None, map(EventParser().line, text.split("\n")))) == [
+        Event(""),
+        Event("record", "0", "one\ntwo"),
+        Event("message", "", " spaced"),
     ]
 
 
 def test_errors_name_the_path_and_the_status() -> None:
-    service = ServiceClient("http://fake", FakeService().transport)
-    with pytest.raises(ServiceError, match=r"^/jobs/nope: HTTP 404$") as raised:
+    service = Client("http://fake", transport=FakeService().transport)
+    with pytest.raises(ServiceError, match=r"^/jobs/nope answered HTTP 404.$") as raised:
         service.job("nope")
     assert raised.value.status == 404
     refused = httpx.MockTransport(lambda request: (_ for _ in ()).throw(httpx.ConnectError("refused")))
     with pytest.raises(ServiceError, match="refused") as raised:
-        ServiceClient("http://fake", refused).jobs()
+        Client("http://fake", transport=refused).jobs()
     assert raised.value.status is None
 
 
@@ -427,7 +428,7 @@ def test_a_click_takes_the_nearest_frustum_on_its_ray() -> None:
 def test_a_stream_begins_anew_when_the_job_is_tried_again() -> None:
     fake = FakeService()
     job = fake.job("a", steps=3)
-    stream = JobStream(ServiceClient("http://fake", fake.transport), "a")
+    stream = JobStream(Client("http://fake", transport=fake.transport), "a")
     stream.start()
     until(lambda: len(stream.records) == 3, "the first attempt")
     first = stream.records
@@ -444,7 +445,7 @@ def test_a_stream_begins_anew_when_the_job_is_tried_again() -> None:
 def test_a_stream_follows_a_job_to_its_end() -> None:
     fake = FakeService()
     job = fake.job("a", 2)
-    stream = JobStream(ServiceClient("http://fake", fake.transport), "a")
+    stream = JobStream(Client("http://fake", transport=fake.transport), "a")
     stream.start()
     until(lambda: len(stream.records) == 2, "what there was before")
     job.add(records(3)[2])
@@ -472,7 +473,7 @@ def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.M
             yield chunk
 
     monkeypatch.setattr(job, "events", events)
-    stream = JobStream(ServiceClient("http://fake", fake.transport), "b")
+    stream = JobStream(Client("http://fake", transport=fake.transport), "b")
     errors: list[str] = []
     stream.listeners.add(lambda: errors.append(stream.error))
     stream.start()
@@ -485,7 +486,7 @@ def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.M
 
 def test_a_job_that_is_gone_is_reported_and_not_requested_again() -> None:
     fake = FakeService()
-    stream = JobStream(ServiceClient("http://fake", fake.transport), "gone")
+    stream = JobStream(Client("http://fake", transport=fake.transport), "gone")
     stream.start()
     until(lambda: stream.error and not threads("job-gone"), "the thread's end")
     assert "no job gone" in stream.error
@@ -504,7 +505,7 @@ def test_between_polls_and_between_retries_there_is_a_pause(lists: bool, monkeyp
             asked.append(time.monotonic())
         return httpx.Response(200, json={"jobs": [], "scenes": []}) if lists else httpx.Response(503)
 
-    client = ServiceClient("http://fake", httpx.MockTransport(answer))
+    client = Client("http://fake", transport=httpx.MockTransport(answer))
     polled, stream = ServiceLists(client), JobStream(client, "d")
     polled.add_listener(lambda: None)
     (polled if lists else stream).start()
@@ -517,7 +518,7 @@ def test_between_polls_and_between_retries_there_is_a_pause(lists: bool, monkeyp
 def test_a_stream_is_shared_and_ends_with_its_last_listener() -> None:
     fake = FakeService()
     fake.job("c", 1)
-    shared = SharedData(ServiceClient("http://fake", fake.transport))
+    shared = SharedData(Client("http://fake", transport=fake.transport))
 
     def one() -> None: ...
     def two() -> None: ...
@@ -535,7 +536,7 @@ def test_a_stream_is_shared_and_ends_with_its_last_listener() -> None:
 def test_pictures_and_scenes_are_fetched_once() -> None:
     fake = FakeService()
     fake.job("d", 3)
-    shared = SharedData(ServiceClient("http://fake", fake.transport))
+    shared = SharedData(Client("http://fake", transport=fake.transport))
     assert shared.scenes.get("ball") is shared.scenes.get("ball")
     stream = JobStream(shared.client, "d")
     pose, matched = stream.render(1, matched=False), stream.render(1, matched=True)

@@ -25,6 +25,7 @@ import zstandard
 from fake_browser import CAMERA, FakeBrowser
 from fake_service import EXACT_RGB, FakeService, records, render_rgb, threads, until
 
+from service.client import Client, ServiceError
 from service.geometry import transformed
 from service.results import Reason, Status
 from service.types import IntrinsicsCorrection
@@ -33,7 +34,6 @@ from viewer import comparison_images as images
 from viewer.job_stream import JobStream
 from viewer.replay import replay_html
 from viewer.scene_cache import SceneCache
-from viewer.service_client import ServiceClient, ServiceError
 from viewer.viewer_server import Viewer, job_id_in_path
 
 LAST_NODES = {"/splats/splats", "/candidates/cloud", "/match vectors/points"}
@@ -47,7 +47,7 @@ def fake() -> FakeService:
 
 @pytest.fixture
 def viewer(fake: FakeService) -> Iterator[Viewer]:
-    viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
     yield viewer
     viewer.stop()
 
@@ -487,7 +487,7 @@ def test_of_several_photos_only_the_step_whose_photo_is_kept_is_compared_with_it
 
 def test_a_replay_has_the_splats_and_every_step(fake: FakeService) -> None:
     fake.job("saved", 3, finished=True)
-    service = ServiceClient("http://fake", fake.transport)
+    service = Client("http://fake", transport=fake.transport)
     stream = JobStream(service, "saved")
     stream.start()
     until(lambda: stream.complete, "the job")
@@ -537,7 +537,7 @@ def test_no_browser_can_open_a_public_tunnel(
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: asked.set())
     if not forbidden:  # shows that the message is the right one: without the ban it has its effect
         monkeypatch.setattr(viewer_server, "disable_public_tunnels", lambda server: None)
-    viewer = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
     try:
         with _browser(viewer) as browser:
             browser.send(type="ShareUrlRequest")
@@ -558,7 +558,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
 
 def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     with pytest.raises(OSError, match="is taken"):
-        Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", viewer.server.get_port())
+        Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", viewer.server.get_port())
 
 
 @pytest.mark.parametrize(
@@ -580,14 +580,14 @@ def test_a_missing_image_is_reported_and_the_rest_is_shown(
     fake.job("j", 3, finished=True)
     monkeypatch.setattr(JobStream, "render", _refused)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: "no picture of this step: /render: HTTP 503" in browser.text(), "the message")
+        browser.wait(lambda: "no picture of this step: The scene is loading." in browser.text(), "the message")
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "the numbers")
         assert "verified" in browser.text()
 
 
 def _refused(*_: object, **__: object) -> np.ndarray:
-    raise ServiceError("/render", "", 503)
+    raise ServiceError("scene_not_ready", "The scene is loading.", status=503)
 
 
 def test_the_program_serves_until_sigterm(fake: FakeService) -> None:

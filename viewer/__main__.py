@@ -10,7 +10,7 @@ import signal
 import threading
 from contextlib import redirect_stdout
 
-from viewer.service_client import ServiceClient
+from service.client import Client
 from viewer.viewer_server import Viewer
 
 log = logging.getLogger("viewer")
@@ -33,7 +33,9 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
     # By the environment, since any user of the machine can read the command line.
-    service = ServiceClient(arguments.service, key=os.environ.get("SPLATFIX_VIEWER_KEY", ""))
+    key = os.environ.get("SPLATFIX_VIEWER_KEY", "")
+    # No proxy from the environment, since the service is on loopback; a render takes seconds on a busy machine.
+    service = Client(arguments.service, key, timeout_s=30.0, use_proxy=False)
     with redirect_stdout(io.StringIO()):  # viser prints its address, which only the relay uses
         viewer = Viewer(service, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())

@@ -17,9 +17,10 @@ import viser
 import viser.transforms as vt
 from jaxtyping import UInt8
 
+from service.client import Client, ServiceError
 from service.types import Camera, Intrinsics, Pose
 from viewer.comparison_images import decode
-from viewer.service_client import ServiceClient, ServiceError
+from viewer.service_values import api_camera
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +35,7 @@ ShowImage = Callable[[UInt8[np.ndarray, "h w 3"] | None], None]
 class BackgroundRender:
     """Belongs to one browser. Its thread sleeps until the view has moved; `close` ends it."""
 
-    def __init__(self, client: viser.ClientHandle, service: ServiceClient, show: ShowImage) -> None:
+    def __init__(self, client: viser.ClientHandle, service: Client, show: ShowImage) -> None:
         """`show` draws an image instead of the browser's splats; `show(None)` draws the splats again."""
         self._client, self._service, self._show = client, service, show
         self._scene_id: str | None = None
@@ -118,7 +119,7 @@ class BackgroundRender:
         # At full size whatever the size of this render: only then it compares equal to the browser's next report.
         self._view = self._camera()
         try:
-            image = decode(self._service.picture(scene_id, self._camera(long_side_px)))
+            image = decode(self._service.render(scene_id, *api_camera(self._camera(long_side_px))))
         except (ServiceError, ValueError) as error:
             log.warning("no exact render: %s", error)
             return

@@ -16,6 +16,7 @@ import numpy as np
 import viser
 from jaxtyping import UInt8
 
+from service.client import ServiceError
 from viewer.action_queue import Action, ActionQueue
 from viewer.background_render import BackgroundRender
 from viewer.comparison_images import Mode
@@ -26,7 +27,6 @@ from viewer.panel_html import headline_html
 from viewer.replay_download import ReplayDownload
 from viewer.scene_3d import Scene3D
 from viewer.scene_display import SceneDisplay
-from viewer.service_client import ServiceError
 from viewer.shared_data import SharedData
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from viewer.match_geometry import MatchView
-from viewer.service_client import JobOutcome
+from viewer.service_values import JobOutcome
 
 RGB = tuple[int, int, int]
 ColourBy = Literal["inlier", "residual"]

@@ -10,10 +10,12 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import UInt8
 
+from service import client as api
+from service.client import Client, ServiceError
 from service.results import IterationRecord
 from viewer.comparison_images import decode
 from viewer.match_geometry import BackprojectedMatches, backproject_matches
-from viewer.service_client import Job, ServiceClient, ServiceError
+from viewer.service_values import Job, api_camera, job_of, record_of
 
 log = logging.getLogger(__name__)
 
@@ -31,7 +33,7 @@ class JobStream:
     the service; it may be read from any thread. Listeners are called on the background thread after each change.
     """
 
-    def __init__(self, client: ServiceClient, job_id: str) -> None:
+    def __init__(self, client: Client, job_id: str) -> None:
         self.id = job_id
         self.attempt = 0
         """The attempt whose records these are; 0 before the first record."""
@@ -86,7 +88,7 @@ class JobStream:
                 self._renders.move_to_end(key)
                 return self._renders[key]
         # Outside the lock: a request takes long, and two of the same image do no harm.
-        image = decode(self._client.render(self.id, index, matched=matched))
+        image = decode(self._client.step_render(self.id, index, camera="matches" if matched else "pose"))
         with self._lock:
             self._renders[key] = image
             if len(self._renders) > _IMAGES_KEPT:
@@ -104,7 +106,7 @@ class JobStream:
         with self._lock:
             if record.index in self._backprojected:
                 return self._backprojected[record.index]
-        depth = self._client.depth(self.job.scene, record.matches.render_camera)
+        depth = self._client.depth(self.job.scene, *api_camera(record.matches.render_camera))
         found = backproject_matches(record.matches, depth, record.index)
         with self._lock:
             self._backprojected[record.index] = found
@@ -115,10 +117,12 @@ class JobStream:
     def _follow(self) -> None:
         while not self._stop.is_set() and not self.complete:
             try:
-                self.job, self.error = self._client.job(self.id), ""
+                self.job, self.error = job_of(self._client.job(self.id)), ""
                 self._notify()
-                for event in self._client.events(self.id, self._stop):
-                    self._append(event)
+                for event in self._client.events(self.id):
+                    if self._stop.is_set():
+                        return
+                    self._append(event.value())
             except (ServiceError, ValueError, KeyError) as error:
                 gone = isinstance(error, ServiceError) and error.status == 404
                 log.warning("job %s: %s", self.id, error)
@@ -128,15 +132,17 @@ class JobStream:
                     return
                 self._stop.wait(_RETRY_S)
 
-    def _append(self, event: tuple[int, IterationRecord] | Job) -> None:
-        if isinstance(event, Job):
-            self.job, self.complete = event, True
-            if event.photo_step is not None:
+    def _append(self, said: api.Record | api.Job | None) -> None:
+        if said is None:  # a ping, or the end of an attempt
+            return
+        if isinstance(said, api.Job):
+            self.job, self.complete = job_of(said), True
+            if self.job.photo_step is not None:
                 self._photo_requested = False  # while the job ran, the service returned the photo of another step
         else:
-            attempt, record = event
-            if attempt != self.attempt:
-                self._restart(attempt)
+            record = record_of(said)
+            if said.attempt != self.attempt:
+                self._restart(said.attempt)
             if record.index != len(self.records):  # a stream that was resumed repeats the records from the first on
                 return
             self.records.append(record)
@@ -158,7 +164,7 @@ class JobStream:
 class JobStreams:
     """The streams of all jobs that some browser shows: one stream a job, which ends with its last listener."""
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: Client) -> None:
         self._client = client
         self._streams: dict[str, JobStream] = {}
         self._lock = threading.Lock()

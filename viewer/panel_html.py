@@ -26,7 +26,7 @@ from viewer.colours import (
 )
 from viewer.comparison_images import Mode
 from viewer.match_geometry import MatchView, pose_error
-from viewer.service_client import Job, JobOutcome, ListedJob
+from viewer.service_values import Job, JobOutcome, ListedJob
 
 
 def job_label(job: ListedJob) -> str:

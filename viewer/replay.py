@@ -15,7 +15,7 @@ from viewer.job_stream import JobStream
 from viewer.match_geometry import matches_at_pose
 from viewer.scene_3d import Scene3D
 from viewer.scene_cache import SceneContent
-from viewer.service_client import Job, Splats
+from viewer.service_values import Job, Splats
 from viewer.viser_internals import disable_public_tunnels
 
 MAX_SPLATS = 120_000

@@ -6,8 +6,9 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass
 
+from service.client import Client
 from viewer.camera_views import SceneExtent, scene_extent
-from viewer.service_client import SceneDescription, ServiceClient, Splats
+from viewer.service_values import SceneDescription, Splats, description_of, parse_splats
 
 MAX_SPLATS = 400_000
 """Splats drawn of a scene: 13 MB for each browser, fluent on an integrated GPU."""
@@ -26,7 +27,7 @@ class SceneContent:
 class SceneCache:
     """The scenes that were shown last. Safe to use from several threads."""
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: Client) -> None:
         self._client = client
         self._scenes: OrderedDict[str, SceneContent] = OrderedDict()
         self._lock = threading.Lock()
@@ -38,8 +39,8 @@ class SceneCache:
                 self._scenes.move_to_end(scene_id)
                 return self._scenes[scene_id]
         # Outside the lock, as the requests may take seconds.
-        description = self._client.scene(scene_id)
-        splats = self._client.splats(scene_id, MAX_SPLATS)
+        description = description_of(self._client.scene(scene_id))
+        splats = parse_splats(self._client.splats(scene_id, MAX_SPLATS))
         cameras = [named.camera for named in description.cameras]
         content = SceneContent(description, splats, scene_extent(splats.centres, cameras, description.up_in_world))
         with self._lock:

@@ -6,11 +6,13 @@ import logging
 import threading
 from collections.abc import Callable
 
-from viewer.service_client import ListedJob, ServiceClient, ServiceError
+from service.client import Client, ServiceError
+from viewer.service_values import ListedJob, listed_job_of
 
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.5
+_JOBS_LISTED = 50
 
 Listener = Callable[[], None]
 
@@ -18,7 +20,7 @@ Listener = Callable[[], None]
 class ServiceLists:
     """Polls on one background thread, never in viser's pool of callbacks, which long requests would exhaust."""
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: Client) -> None:
         self.jobs: tuple[ListedJob, ...] | None = None
         """Newest first; up to date while there are listeners; None before the first answer."""
         self.scenes: tuple[str, ...] = ()
@@ -51,12 +53,16 @@ class ServiceLists:
             if not self._listeners:
                 self._has_listeners.clear()
 
+    def _lists(self) -> tuple[tuple[ListedJob, ...], tuple[str, ...]]:
+        jobs = tuple(map(listed_job_of, self._client.jobs(limit=_JOBS_LISTED)))
+        return jobs, tuple(scene.id for scene in self._client.scenes() if scene.gaussians is not None)
+
     def _poll(self) -> None:
         logged = ""
         # Without browsers the service gets no requests.
         while self._has_listeners.wait() and not self._closed.is_set():
             try:
-                lists = tuple(self._client.jobs()), tuple(self._client.scenes())
+                lists = self._lists()
                 logged = ""
             except (ServiceError, ValueError, KeyError) as error:
                 if str(error) != logged:  # once, not at every poll

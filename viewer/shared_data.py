@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from service.client import Client
 from viewer.job_stream import JobStreams
 from viewer.scene_cache import SceneCache
-from viewer.service_client import ServiceClient
 from viewer.service_lists import ServiceLists
 
 
 class SharedData:
     """The service's client, and everything that is requested once for all browsers."""
 
-    def __init__(self, client: ServiceClient) -> None:
+    def __init__(self, client: Client) -> None:
         self.client = client
         self.lists = ServiceLists(client)
         self.streams = JobStreams(client)

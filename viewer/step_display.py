@@ -13,6 +13,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
+from service.client import ServiceError
 from service.results import IterationRecord
 from viewer.charts import curves_html, stages_html
 from viewer.colours import match_colours
@@ -23,7 +24,6 @@ from viewer.job_stream import JobStream
 from viewer.match_geometry import MatchView, matches_at_pose
 from viewer.panel_html import record_html, small_html
 from viewer.scene_3d import Scene3D
-from viewer.service_client import ServiceError
 
 _FRUSTUM_IMAGE_PX = 512
 _MESSAGE_GAP_S = 0.02

@@ -9,8 +9,8 @@ import time
 
 import viser
 
+from service.client import Client
 from viewer.browser_session import BrowserSession
-from viewer.service_client import ServiceClient
 from viewer.shared_data import SharedData
 from viewer.viser_internals import disable_public_tunnels, disconnect_all, requested_path
 
@@ -22,7 +22,7 @@ _JOB_PATH = re.compile(r"/jobs/([A-Za-z0-9_-]{1,64})/?")
 class Viewer:
     """Serves browsers from construction until `stop`."""
 
-    def __init__(self, client: ServiceClient, host: str, port: int) -> None:
+    def __init__(self, client: Client, host: str, port: int) -> None:
         """Listen on `port`, 0 for any free one. Raises OSError if the port is taken."""
         self._shared = SharedData(client)
         self._sessions: dict[int, BrowserSession] = {}

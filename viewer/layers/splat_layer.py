@@ -7,7 +7,7 @@ from jaxtyping import Float32, UInt8
 
 from viewer.layers.layer import Canvas, Layer
 from viewer.scene_cache import SceneContent
-from viewer.service_client import Splats
+from viewer.service_values import Splats
 
 _MAX_COVARIANCE = 200.0**2
 """After scaling; float16 reaches 65504."""

@@ -13,7 +13,7 @@ from service.types import Camera, Pose
 from viewer.colours import CURRENT_COLOUR, INITIAL_COLOUR, TRUTH_COLOUR, outcome_colour
 from viewer.frusta import frustum_edges, hit_frustum, stack_poses, viser_frustum
 from viewer.layers.layer import Canvas, Layer, quaternion_wxyz
-from viewer.service_client import Job
+from viewer.service_values import Job
 
 
 class TrajectoryLayer(Layer):

@@ -1,0 +1,243 @@
+"""service/client.py: against a running service with scripted estimators, and against broken connections."""
+
+from __future__ import annotations
+
+import ast
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+from api_server import ROOT, create_app, fake_estimators, photo, serving, settings, until_ready
+from fake_service import FakeService, records
+from stand_ins import make_scene
+
+from service import client as client_module
+from service.client import AsyncClient, Client, Intrinsics, Job, Pose, Prior, Record, ServiceError
+from service.web.api_keys import add_key
+
+SOURCE = Path(client_module.__file__).read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory):
+    """(address, key) of a service with keys."""
+    file = tmp_path_factory.mktemp("keys") / "keys.json"
+    key = add_key(file, "tester", "admin")
+    with fake_estimators(), serving(create_app(settings(keys_file=file), {"room": make_scene()})) as http:
+        until_ready(http)
+        yield str(http.base_url), key
+
+
+def test_it_is_one_file_for_python_3_10():
+    tree = ast.parse(SOURCE, feature_version=(3, 10))
+    imported = {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
+    named = {(n.module, a.name) for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+    modules = imported | {str(module) for module, _ in named}
+    assert {m.split(".")[0] for m in modules} <= {"httpx", "numpy", *sys.stdlib_module_names}
+    # What the standard library has only since 3.11.
+    newer = {"tomllib", "StrEnum", "Self", "UTC", "assert_never", "TaskGroup", "ExceptionGroup", "timeout", "batched"}
+    assert not newer & ({name for _, name in named} | modules)
+    assert not newer & {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
+    # And numpy since 1.22, which Ubuntu 22.04 has beside Python 3.10.
+    assert {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and ast.unparse(n.value) == "np"} <= {
+        *("array", "asarray", "diag", "eye", "float64", "load", "ndarray"),
+    }
+
+
+def test_a_photo_is_localized_with_a_key(keyed):
+    url, key = keyed
+    steps: list[Record] = []
+    with Client(url, key + "\n", use_proxy=False) as service:  # a file's last line break
+        result = service.localize(photo(), scene="room", seed=3, on_record=steps.append)
+        assert result.pose.world_from_camera.shape == (4, 4)
+        assert [step.index for step in steps] == list(range(len(steps)))
+        assert np.allclose(steps[-1].pose.world_from_camera, result.pose.world_from_camera)
+        newest = service.jobs(limit=1)[0]
+        assert (newest.state, newest.result) == ("succeeded", None)
+        assert service.job(newest.id).answer().raw == result.raw
+        assert service.job(newest.id).raw["seed"] == 3
+        with pytest.raises(ServiceError) as raised:  # a photo of noise
+            service.export(newest.id, "tum")
+        assert (raised.value.code, raised.value.status) == ("no_pose", 409)
+        assert service.scene("room").raw["training_cameras"] is not None
+        assert [scene.id for scene in service.scenes()] == ["room"]
+
+
+def test_without_a_key_every_error_has_its_code(keyed):
+    url, key = keyed
+    for none in (None, "", " "):
+        with Client(url, none, use_proxy=False) as service, pytest.raises(ServiceError) as raised:
+            service.scenes()
+        assert (raised.value.code, raised.value.status) == ("unauthorized", 401)
+    with Client(url, key, use_proxy=False) as service:
+        for call, code, status in (
+            (lambda: service.localize(photo(), scene="nowhere"), "scene_not_found", 404),
+            (lambda: service.job("nothing"), "job_not_found", 404),
+            (lambda: list(service.follow("nothing")), "job_not_found", 404),
+            (lambda: service.submit(b"no photo", scene="room"), "invalid_image", 422),
+        ):
+            with pytest.raises(ServiceError) as raised:
+                call()
+            assert (raised.value.code, raised.value.status) == (code, status)
+            assert str(raised.value)
+    with pytest.raises(ValueError, match="printable ASCII"):
+        Client(url, "schlüssel")
+
+
+def test_a_service_without_keys_needs_none(shared):
+    with Client(str(shared.base_url), use_proxy=False) as service:
+        frames = service.localize([photo(), photo(), photo()], scene="room", times_s=[0, 0.5, 1]).frames
+        assert [frame.time_s for frame in frames] == [0, 0.5, 1]
+        assert frames[2].pose.world_from_camera.shape == (4, 4)
+
+
+def test_fields_are_sent_as_the_service_reads_them(shared):
+    camera = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
+    prior = Prior(Pose(np.eye(4)), sigma_deg=5, sigma_units=0.5)
+    with Client(str(shared.base_url), use_proxy=False) as service:
+        job = service.submit(photo(), scene="room", intrinsics=camera, prior=prior, truth=Pose(np.eye(4)))
+        raw = service.wait(job.id).raw
+    told = raw["prior_region"]["covariance"]["matrix"]
+    assert np.allclose(np.diag(told), [np.radians(5) ** 2] * 3 + [0.25] * 3)
+    assert np.array_equal(raw["truth"]["world_from_camera"]["matrix"], np.eye(4))
+    assert Intrinsics.parse(raw["photo"]["intrinsics"]) == camera
+
+
+def test_the_coroutines_do_the_same(shared):
+    async def run() -> None:
+        async with AsyncClient(str(shared.base_url), use_proxy=False) as service:
+            steps: list[Record] = []
+            result = await service.localize(photo(), scene="room", on_record=steps.append)
+            assert steps
+            assert np.allclose(steps[-1].pose.world_from_camera, result.pose.world_from_camera)
+            job = await service.submit(photo(), scene="room")
+            assert (await service.wait(job.id)).ended
+            with pytest.raises(ServiceError) as raised:
+                await service.scene("nowhere")
+            assert raised.value.code == "scene_not_found"
+
+    asyncio.run(run())
+
+
+def test_both_clients_have_the_same_methods():
+    public = [{name for name in vars(kind) if not name.startswith("_")} for kind in (Client, AsyncClient)]
+    assert public[0] == public[1]
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(client_module, "_RECONNECT_S", 0.01)
+
+
+def cut_once(fake: FakeService, job, after: int) -> list[str]:
+    """Make the first stream of a job's events end early; return the list of what later ones resume after."""
+    whole, resumed = job.events, []
+
+    def events():
+        resumed.append("")
+        for count, chunk in enumerate(whole()):
+            if len(resumed) == 1 and count == after:
+                raise httpx.ReadError("cut")
+            yield chunk
+
+    job.events = events
+    return resumed
+
+
+def test_a_lost_connection_is_taken_up_again(quick):
+    fake = FakeService()
+    job = fake.job("b", 4, finished=True)
+    streams = cut_once(fake, job, 2)
+    with Client("http://fake", transport=fake.transport) as service:
+        *steps, last = service.follow("b")
+    assert len(streams) == 2
+    assert {step.index for step in steps if isinstance(step, Record)} == {0, 1, 2, 3}
+    assert isinstance(last, Job)
+    assert last.answer().localized
+
+
+def test_a_resumed_stream_tells_the_last_event_that_came(quick):
+    asked: list[str] = []
+    fake = FakeService()
+    job = fake.job("b", 2, finished=True)
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        asked.append(request.headers.get("last-event-id", ""))
+        chunks = list(job.events())
+        return httpx.Response(200, content=b"".join(chunks[:2] if len(asked) == 1 else chunks[2:]))
+
+    with Client("http://fake", transport=httpx.MockTransport(answer)) as service:
+        *steps, last = service.follow("b")
+    assert asked == ["", "1.0"]
+    assert [step.index for step in steps if isinstance(step, Record)] == [0, 1]
+    assert isinstance(last, Job)
+
+
+def test_a_full_queue_is_tried_again_as_the_same_request(quick):
+    keys: list[str] = []
+    accepted = FakeService().job("a", 1).out().model_dump(mode="json")
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        keys.append(request.headers["idempotency-key"])
+        if len(keys) < 3:
+            problem = {"code": "queue_full", "detail": "full.", "where": "", "hint": ""}
+            return httpx.Response(503, json=problem, headers={"Retry-After": "0"})
+        return httpx.Response(202, json=accepted)
+
+    with Client("http://fake", transport=httpx.MockTransport(answer)) as service:
+        assert service.submit(b"x", timeout_s=5).id == "a"
+        assert len(set(keys)) == 1
+        keys.clear()
+        with pytest.raises(ServiceError, match="full") as raised:
+            service.submit(b"x", timeout_s=-1)
+    assert (raised.value.code, raised.value.retry_after_s) == ("queue_full", 0)
+
+
+def test_what_is_no_service_is_told(quick):
+    page = httpx.MockTransport(lambda request: httpx.Response(200, text="<html>"))
+    with pytest.raises(ServiceError, match="address of a splatfix service") as raised:
+        Client("http://fake", transport=page).scenes()
+    assert raised.value.code == "http_error"
+    down = httpx.MockTransport(lambda request: httpx.Response(502, text="Bad Gateway"))
+    with pytest.raises(ServiceError, match="HTTP 502") as raised:
+        Client("http://fake", transport=down).localize(b"x", timeout_s=0.05)
+    assert raised.value.code == "unreachable"
+
+
+def test_waiting_ends_and_the_job_goes_on():
+    fake = FakeService()
+    fake.job("a", 1)  # runs, and sends pings
+    with Client("http://fake", transport=fake.transport) as service, pytest.raises(ServiceError) as raised:
+        service.wait("a", timeout_s=0.3)
+    assert raised.value.code == "timeout"
+
+
+def test_an_async_stream_is_parsed_as_it_comes(quick):
+    job = FakeService().job("a", 2, finished=True)
+
+    async def chunks() -> AsyncIterator[bytes]:
+        for chunk in job.events():
+            yield chunk
+
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, content=chunks()))
+
+    async def run() -> list:
+        async with AsyncClient("http://fake", transport=transport) as service:
+            return [item async for item in service.follow("a")]
+
+    *steps, last = asyncio.run(run())
+    assert [step.index for step in steps] == [0, 1]
+    assert np.allclose(steps[1].pose.world_from_camera, records(2)[1].pose.world_from_camera)
+    assert last.answer().score == 0.93
+
+
+def test_a_point_is_projected_where_frames_md_says():
+    taken = json.loads((ROOT / "scenes" / "studio" / "truth.json").read_text())[0]
+    camera = Intrinsics(**{name: taken["intrinsics"][name] for name in ("width", "height", "fx", "fy", "cx", "cy")})
+    pixel = Pose(np.array(taken["world_from_camera"])).project([2.42, 1.96, 0.847], camera)
+    assert np.allclose(pixel, [366.7, 350.4], atol=0.05)
