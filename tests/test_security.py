@@ -62,7 +62,7 @@ def send(client: httpx.Client, key: str = "", **headers: str) -> httpx.Response:
 
 
 def test_without_a_key_only_the_outside_is_seen(locked):
-    for path in ("/livez", "/readyz", "/", "/ui/style.css", "/docs", "/openapi.json"):
+    for path in ("/livez", "/readyz", "/", "/ui/style.css", "/client.js", "/docs", "/openapi.json"):
         assert locked.get(path).status_code == 200, path
     for path in ("/jobs", "/scenes", "/scenes/room", "/scenes/room/splats", "/capabilities", "/metrics", "/nowhere"):
         refused = locked.get(path)

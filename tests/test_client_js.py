@@ -1,0 +1,86 @@
+"""The JavaScript client, run by Node: against a running service, and against one whose connections break."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+
+from api_server import ROOT, photo
+from fake_service import FakeService
+from node import node
+
+CLIENT = ROOT / "service" / "web" / "static" / "client.js"
+IMPORT = f'import {{ Client, ServiceError }} from "{CLIENT.as_uri()}";\n'
+
+
+def test_it_is_served_and_needs_nothing(shared):
+    answer = shared.get("/client.js")
+    assert answer.headers["content-type"].startswith("text/javascript")
+    assert answer.text == CLIENT.read_text("utf-8")
+    assert not re.search(r"^\s*import |\bimport\(", answer.text, re.M)
+
+
+def test_a_photo_is_localized_in_node(shared):
+    module = (
+        IMPORT
+        + """
+const service = new Client(process.argv[2]);
+const file = new File([Buffer.from(process.argv[3], "base64")], "a.jpg");
+const steps = [], codes = [];
+const truth = { position: [0, 0, 0], quaternion_wxyz: [1, 0, 0, 0] };
+const job = await service.localize(file, { scene: "room", seed: 5, truth },
+  { onRecord: step => steps.push(step.index) });
+const code = error => codes.push([error instanceof ServiceError, error.code, error.status]);
+await service.localize(file, { scene: "nowhere" }).catch(code);
+await service.follow("nothing").catch(code);
+await service.submit(new Blob(["x"]), { scene: "room" }).catch(code);
+const stored = await service.job(job.id), { jobs } = await service.jobs({ limit: 1 });
+const picture = await service.render("room", { position: [0, 0, 0], quaternion_wxyz: [1, 0, 0, 0] });
+console.log(JSON.stringify({ steps, codes, seed: stored.seed, name: stored.photo.name, newest: jobs.length,
+  rows: job.result.pose.world_from_camera.matrix.length, scenes: (await service.scenes()).map(scene => scene.id),
+  picture: picture.size > 100 }));
+"""
+    )
+    told = json.loads(node(module, str(shared.base_url), base64.b64encode(photo()).decode()))
+    assert told["steps"] == list(range(len(told["steps"])))
+    assert told["steps"]
+    assert told["codes"] == [
+        [True, "scene_not_found", 404],
+        [True, "job_not_found", 404],
+        [True, "invalid_image", 422],
+    ]
+    assert (told["seed"], told["name"], told["rows"], told["picture"]) == (5, "a.jpg", 4, True)
+    assert told["scenes"] == ["room"]
+
+
+def test_a_lost_connection_is_taken_up_where_it_broke():
+    job = FakeService().job("b", 4, finished=True)
+    events = [chunk.decode() for chunk in job.events() if not chunk.startswith(b":")]
+    module = (
+        IMPORT
+        + """
+import http from "node:http";
+const events = JSON.parse(process.argv[2]), asked = [], told = [];
+const server = http.createServer((request, response) => {
+  asked.push([request.headers["last-event-id"] ?? "", request.headers.authorization ?? ""]);
+  if (asked.length === 2) return response.writeHead(502).end("starting");
+  response.writeHead(200, { "Content-Type": "text/event-stream" });
+  const from = events.findIndex(text => text.includes(`id: ${asked.at(-1)[0]}\\n`)) + 1;
+  if (asked.length > 1) return response.end(events.slice(from).join(""));
+  // Half of an event, then the connection breaks.
+  response.write(events[0] + ": ping\\n\\n" + events[1] + events[2].slice(0, 40));
+  setTimeout(() => response.destroy(), 50);
+}).listen(0, "127.0.0.1", async () => {
+  const service = new Client(`http://127.0.0.1:${server.address().port}/splatfix`, { key: " a-key\\n" });
+  const ended = await service.follow("b", { onRecord: step => told.push(step.index),
+    onLost: () => told.push("lost"), onResumed: () => told.push("resumed") });
+  console.log(JSON.stringify({ asked, told, score: ended.result.score, base: service.base.pathname }));
+  server.close();
+});
+"""
+    )
+    told = json.loads(node(module, json.dumps(events)))
+    assert told["told"] == [0, 1, "lost", "resumed", 2, 3]
+    assert told["asked"] == [["", "Bearer a-key"], ["1.1", "Bearer a-key"], ["1.1", "Bearer a-key"]]
+    assert (told["score"], told["base"]) == (0.93, "/splatfix/")
