@@ -20,18 +20,21 @@ _MAX_FILES = 2000
 def curl_line(
     url: str, folder: Path | None, cameras: Sequence[NamedCamera], *, scene_id: str = "", key: str = ""
 ) -> str:
-    """Return a shell command that localizes a photo of the folder, or a placeholder `PHOTO.jpg` if it has none."""
+    """Return a shell command that localizes a photo of the folder, or a placeholder `PHOTO.jpg` if it has none.
+
+    `key` is an API key, or a variable of the shell that has one; empty where the service needs none.
+    """
     # A scene that is a single file lies among files that have nothing to do with it.
     photo = example_photo(folder, cameras) if folder and folder.is_dir() else None
     parts = ["curl", "-H", "Prefer: wait=30", "-F", f"photo=@{photo or 'PHOTO.jpg'}"]
-    if key:
-        parts[1:1] = ["-H", f"Authorization: Bearer {key}"]
     if scene_id:
         parts += ["-F", f"scene={scene_id}"]
     intrinsics = _needed_intrinsics(photo, cameras) if photo else None
     if intrinsics:
         parts += ["-F", f"intrinsics={json.dumps(intrinsics)}"]
-    return shlex.join([*parts, f"{url}/localize"])
+    line = shlex.join([*parts, f"{url}/localize"])
+    # In double quotes, so that the shell fills in a variable.
+    return line.replace("curl ", f'curl -H "Authorization: Bearer {key}" ', 1) if key else line
 
 
 def example_photo(folder: Path, cameras: Sequence[NamedCamera]) -> Path | None:

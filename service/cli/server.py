@@ -52,7 +52,9 @@ def run(settings: Settings, out: Console, err: Console) -> None:
             )
         )
         logging.getLogger("service").setLevel(logging.INFO)
-        arguments = server, application, settings, key, out, err
+        # A lasting key isn't known here, only its hash.
+        shell_key = key or ("$SPLATFIX_KEY" if keys else "")
+        arguments = server, application, settings, (key, shell_key), out, err
         threading.Thread(target=_announce, args=arguments, daemon=True).start()
         server.run(sockets=[listener])
 
@@ -66,9 +68,18 @@ def _listener(host: str, port: int) -> socket.socket:
 
 
 def _announce(
-    server: uvicorn.Server, application: FastAPI, settings: Settings, key: str, out: Console, err: Console
+    server: uvicorn.Server,
+    application: FastAPI,
+    settings: Settings,
+    keys: tuple[str, str],
+    out: Console,
+    err: Console,
 ) -> None:
-    """Wait until the service is ready, then print its addresses and an example request."""
+    """Wait until the service is ready, then print its addresses and an example request.
+
+    `keys` are the key that was made for this run, and what the example takes as a key; each empty if there is none.
+    """
+    key, shell_key = keys
     with err.status("starting") as status:
         # uvicorn has no event for it; the app makes its state while it starts.
         while not server.started:
@@ -96,6 +107,7 @@ def _announce(
         stored = app_state.scene_store.find(ready[0])
         # With one scene a request need not name it: a shorter example.
         named = ready[0] if len(scenes) > 1 else ""
-        example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=key)
-        lines += ["Try it:", f"  {example}"]
+        example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=shell_key)
+        hint = " (SPLATFIX_KEY: a key from `splatfix keys add NAME`)" if shell_key and not key else ""
+        lines += [f"Try it{hint}:", f"  {example}"]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import secrets
 import socket
 import sys
 import time
@@ -29,6 +30,7 @@ class ViewerChild:
         # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
         self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"SPLATFIX_VIEWER_KEY": key}
         self.port = _free_port()
+        self.run = ""
         self.command = [sys.executable, "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
 
@@ -49,6 +51,8 @@ class ViewerChild:
         child = await asyncio.create_subprocess_exec(
             *self.command, stdin=nothing, stdout=nothing, env=self._environment
         )
+        # Not the process id alone: after a restart in a container it may be the same.
+        self.run = f"{child.pid}-{secrets.token_hex(4)}"
         try:
             code = await child.wait()
             _log.warning("the viewer ended with code %s; it is started again", code)

@@ -3,7 +3,8 @@
 The viewer's page derives the address of its WebSocket from its own: the page /viewer/jobs/ID/ connects to
 /viewer/jobs/ID. The path after /viewer is passed on, and names the job to show. All pages are the same file, so the
 relay returns it for every path that the viewer has no file for. A browser without a GPU sets a cookie
-(`static/viewer.js`), which the relay passes on as a query parameter.
+(`static/viewer.js`), which the relay passes on as a query parameter. The same script asks `/viewer-run` whether the
+viewer is still the one that the page was opened with.
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ class Upstream(Protocol):
 
     port: int
     """On loopback. Nothing may listen there, while the viewer starts."""
+    run: str
+    """Another one for each process that has listened there."""
 
 
 class Relay:
@@ -45,6 +48,7 @@ class Relay:
         # trust_env: HTTP_PROXY must not apply to loopback.
         self._http = httpx.AsyncClient(trust_env=False, timeout=30.0)
         self.router = APIRouter(include_in_schema=False)
+        self.router.add_api_route("/viewer-run", self._run)
         for path in ("/viewer", "/viewer/{path:path}"):
             self.router.add_api_route(path, self._page)
             self.router.add_api_websocket_route(path, self._socket)
@@ -63,6 +67,12 @@ class Relay:
             script = f'<head><script src="{request.scope.get("root_path", "")}/ui/viewer.js"></script>'
             content = content.replace(b"<head>", script.encode(), 1)
         return Response(content, answer.status_code, media_type=kind)
+
+    @route_policy(role="read")
+    async def _run(self) -> str:
+        """Return which run of the viewer answers: an open page belongs to one, and is loaded anew for the next."""
+        await self._ask("")
+        return self._upstream.run
 
     async def _ask(self, path: str) -> httpx.Response:
         try:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs, quote, urlsplit
 
 from starlette.datastructures import Headers
 from starlette.requests import HTTPConnection
@@ -59,7 +59,10 @@ class Authentication:
                 return
             self._check_role(policy.role, caller)
         except (Unauthorized, Forbidden) as error:
-            await _refuse(error, scope, receive, send)
+            if isinstance(error, Unauthorized) and policy.key_in_address and _opens_page(scope):
+                await _redirect_to_form(scope)(scope, receive, send)
+            else:
+                await _refuse(error, scope, receive, send)
             return
         scope["state"]["caller"] = caller
         await self._app(scope, receive, send)
@@ -127,6 +130,19 @@ class Authentication:
             samesite="lax",
         )
         return response
+
+
+def _opens_page(scope: Scope) -> bool:
+    """Return whether a person opens a page, to whom a problem document in JSON would tell nothing."""
+    return scope["type"] == "http" and "text/html" in Headers(scope=scope).get("accept", "")
+
+
+def _redirect_to_form(scope: Scope) -> Response:
+    """Redirect to the page that asks for a key, without the wrong one in the address; afterwards back to this page."""
+    root = scope.get("root_path", "")
+    then = quote(scope["path"].removeprefix(root).lstrip("/"))
+    refused = "&refused" if _key_in_address(scope) else ""
+    return RedirectResponse(f"{root}/#/key?then={then}{refused}", 303)
 
 
 def _key_in_address(scope: Scope) -> dict[str, str]:

@@ -4,6 +4,7 @@ import { ask } from "./api.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, degrees, h, length, seconds, words } from "./dom.js";
 import { poseDistance } from "./formats.js";
+import { photoOf } from "./result.js";
 
 export function show(main, first, second) {
   document.title = "comparison – splatfix";
@@ -18,7 +19,7 @@ function scenes(jobs) {
 }
 
 function compared(jobs, [sceneA, sceneB]) {
-  const pairs = jobs.map(job => blend(job.links.photo, job.links.render, `The scene at the pose that ${job.estimator} found`));
+  const pairs = jobs.map(job => blend(photoOf(job), job.links.render, `The scene at the pose that ${job.estimator} found`));
   const same = jobs[0].photo.sha256 === jobs[1].photo.sha256;
   return [
     h("p", { class: same ? "lead" : "warning" }, same ? jobs[0].photo.name : "These jobs are on different photos."),

@@ -1,7 +1,8 @@
 // One job: its progress while it runs, then its answer.
 
 import { ask, ENDED, follow } from "./api.js";
-import { h, say, seconds, words } from "./dom.js";
+import { h, say, seconds, sentence, words } from "./dom.js";
+import { askKey } from "./key.js";
 import { result } from "./result.js";
 import { recalled } from "./sent.js";
 
@@ -10,10 +11,14 @@ export function show(main, id) {
   const stops = [];
   let left = false;
   const view = { main, onLeave: stop => (left ? stop() : stops.push(stop)) };
-  open(view, id).catch(error => {
-    main.replaceChildren(h("h1", {}, "No such job"), h("p", { class: "trouble", role: "alert" }, error.message));
-  });
+  open(view, id).catch(error => refused(view, error));
   return () => { left = true; stops.forEach(stop => stop()); };
+}
+
+function refused({ main }, error) {
+  if (error.status === 401) return askKey();
+  const title = error.status === 404 ? "Job not found" : "The job can't be shown";
+  main.replaceChildren(h("h1", {}, title), h("p", { class: "trouble", role: "alert" }, error.message));
 }
 
 async function open(view, id) {
@@ -33,7 +38,6 @@ async function finish(view, job) {
 }
 
 function progress(view, job) {
-  const began = performance.now();
   const bar = h("progress", { max: 1, "aria-label": "Progress" });
   const line = h("p", { class: "line" });
   const stages = h("ol", { class: "stages" });
@@ -45,20 +49,20 @@ function progress(view, job) {
   });
   view.main.replaceChildren(h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
     h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages,
-      h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Watch it in the viewer"), cancel))));
+      h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Watch in viewer"), cancel))));
 
-  const state = { latest: null, usual: null, from: job.started ? Date.parse(job.started) : null };
+  const state = { latest: null, latestAt: 0, usual: null, job, scene: null };
   usualTime(job).then(usual => { state.usual = usual; });
   const draw = () => {
-    const elapsed = (performance.now() - began) / 1000;
-    line.textContent = described(state, elapsed);
-    if (state.usual && state.latest) bar.value = Math.min(0.97, elapsed / state.usual);
+    line.textContent = described(state);
+    if (state.usual && state.latest) bar.value = Math.min(0.97, elapsed(state) / state.usual);
   };
-  const timer = setInterval(draw, 100);
-  const stop = follow(job, {
+  const timers = [setInterval(draw, 100), setInterval(() => state.latest || refresh(state), 1000)];
+  refresh(state);
+  const leave = follow(job, {
     onRecord: record => {
       if (record.stage !== state.latest?.stage) stages.append(h("li", {}, words(record.stage)));
-      state.latest = record;
+      [state.latest, state.latestAt] = [record, performance.now()];
       draw();
     },
     onRestart: () => {
@@ -66,23 +70,44 @@ function progress(view, job) {
       state.latest = null;
       draw();
     },
-    onEnd: ended => { clearInterval(timer); finish(view, ended); },
-    onTrouble: gone => {
+    onEnd: ended => { stop(); finish(view, ended); },
+    onLost: () => {
       trouble.hidden = false;
-      trouble.textContent = gone ? "The connection to the job was refused." : "The connection is lost; trying again…";
+      trouble.textContent = "The connection to the service is lost. Reconnecting…";
     },
+    onBack: () => {
+      trouble.hidden = true;
+      say("Connected again");
+    },
+    onRefused: error => { stop(); refused(view, error); },
   });
-  view.onLeave(() => { clearInterval(timer); stop(); });
+  const stop = () => { timers.forEach(clearInterval); leave(); };
+  view.onLeave(stop);
   draw();
 }
 
-function described(state, elapsed) {
-  const { latest, usual } = state;
-  const left = usual && latest ? usual - elapsed : null;
-  const eta = left === null ? "" : left > 0 ? `, about ${seconds(left)} left` : ", longer than usual";
-  return latest
-    ? `${words(latest.stage)}, step ${latest.index + 1}, ${seconds(elapsed)}${eta}`
-    : `waiting for its turn, ${seconds(elapsed)}`;
+/** While there is no record, ask in which state the job and its scene are. */
+async function refresh(state) {
+  const [job, scene] = await Promise.all([
+    ask(state.job.links.self).catch(() => null), ask(`scenes/${encodeURIComponent(state.job.scene)}`).catch(() => null)]);
+  if (job) state.job = job;
+  state.scene = scene;
+}
+
+/** The job's time by the service's clock, so that it is right whenever this page was opened. */
+function elapsed({ latest, latestAt }) {
+  return latest.elapsed_s + (performance.now() - latestAt) / 1000;
+}
+
+function described(state) {
+  const { latest, usual, job, scene } = state;
+  if (latest) {
+    const left = usual ? usual - elapsed(state) : null;
+    const eta = left === null ? "" : left > 0 ? `, about ${seconds(left)} left` : ", longer than usual";
+    return `${sentence(latest.stage)}, step ${latest.index + 1}, ${seconds(elapsed(state))}${eta}`;
+  }
+  if (scene && ["loading", "unloaded"].includes(scene.state)) return `Queued: the scene is ${scene.state}`;
+  return job.state === "running" ? "Running" : "Queued";
 }
 
 /** The median time of the last jobs of this kind, in seconds; null if there are none. */

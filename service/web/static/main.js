@@ -1,12 +1,15 @@
-// Which view the address asks for; a photo that is dropped or pasted anywhere.
+// Which view the address asks for; photos that are dropped or pasted anywhere.
 
-import { h, say } from "./dom.js";
+import * as batch from "./batch.js";
 import * as compare from "./compare.js";
 import * as history from "./history.js";
+import * as key from "./key.js";
 import * as job from "./job.js";
 import * as start from "./start.js";
 
 const ROUTES = [
+  [/^#\/key$/, key.show],
+  [/^#\/batch\/([\w,-]*)$/, batch.show],
   [/^#\/jobs$/, history.show],
   [/^#\/jobs\/([\w-]+)$/, job.show],
   [/^#\/compare\/([\w-]+)\/([\w-]+)$/, compare.show],
@@ -18,10 +21,10 @@ let leave = null;
 
 function route() {
   leave?.();
-  const hash = location.hash.split("?")[0];
+  const [hash, query = ""] = location.hash.split("?");
   const [pattern, show] = ROUTES.find(([pattern]) => pattern.test(hash));
   main.replaceChildren();
-  leave = show(main, ...pattern.exec(hash).slice(1)) ?? null;
+  leave = show(main, ...pattern.exec(hash).slice(1), query) ?? null;
   for (const link of document.querySelectorAll("header nav a")) {
     const here = link.getAttribute("href") === (hash || "#/");
     here ? link.setAttribute("aria-current", "page") : link.removeAttribute("aria-current");
@@ -48,14 +51,8 @@ addEventListener("paste", event => {
   if (event.clipboardData?.files.length) submitted(event.clipboardData.files);
 });
 
-async function submitted(files) {
-  try {
-    await start.submit(files[0]);
-  } catch (error) {
-    if (start.told(error)) return;
-    main.prepend(h("p", { class: "trouble", role: "alert" }, error.message));
-    say(error.message);
-  }
+function submitted(files) {
+  start.submit([...files]).catch(start.told);
 }
 
 route();

@@ -15,7 +15,7 @@ export function result(job, scene) {
     ...verdict(job),
     h("div", { class: "columns" },
       h("div", {},
-        ...(answer ? pictures(job) : [h("img", { class: "preview", alt: "The photo", src: job.links.photo })]),
+        ...(answer ? pictures(job) : [h("img", { class: "preview", alt: "The photo", src: photoOf(job) })]),
         numbers(job, scene)),
       h("div", {}, ...(answer ? poses(job) : []), taking(job), h("h2", {}, "Next"), again(job))),
   ];
@@ -43,12 +43,17 @@ function alternatives({ alternatives: others }) {
   return h("div", { class: "warning" }, "It may as well have been taken at", h("ul", {}, ...others.map(place)));
 }
 
+/** The photo's address; while the job ran, the same one may have had another photo of the sequence. */
+export function photoOf(job) {
+  return `${job.links.photo}?records=${job.records}`;
+}
+
 function pictures(job) {
-  const pair = blend(job.links.photo, job.links.render, "The scene rendered at the pose", recalled(job.id)?.file);
+  const pair = blend(photoOf(job), job.links.render, "The scene rendered at the pose", recalled(job.id)?.file);
   return [
     pair.element, blendSlider([pair]),
     h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "See how it was found"),
-      h("a", { class: "button", href: job.links.photo, download: "" }, "Photo"),
+      h("a", { class: "button", href: photoOf(job), download: "" }, "Photo"),
       h("a", { class: "button", href: job.links.render, download: "" }, "Render")),
   ];
 }
@@ -116,7 +121,7 @@ function again(job) {
   const file = recalled(job.id)?.file;
   if (file) {
     const button = h("button", { type: "button" }, "Localize this photo again");
-    button.addEventListener("click", () => submit(file).catch(told));
+    button.addEventListener("click", () => submit([file]).catch(told));
     place.append(button);
   }
   place.append(h("a", { class: "button", href: "#/" }, "Another photo"));

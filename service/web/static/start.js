@@ -1,13 +1,17 @@
 // The first view: scenes, the photo, and what may be sent beside it.
 
 import { ask } from "./api.js";
-import { bytes, count, h, words } from "./dom.js";
+import * as batch from "./batch.js";
+import { bytes, count, h, say, sentence } from "./dom.js";
 import { viewOf } from "./example.js";
+import { askKey } from "./key.js";
 import { OptionsForm } from "./options.js";
-import { remember } from "./sent.js";
+import { sendingBox, sendPhoto } from "./sending.js";
 
-// Kept while other views are shown, so that the next photo goes the same way.
-const chosen = { scene: null, form: null };
+const ANY = "auto";
+const SCENE_KEY = "splatfix-scene";
+// Kept while other views are shown, so that the next photo goes the same way; the scene also over a reload.
+const chosen = { scene: stored(), form: null };
 let alertLine = null;
 
 export function show(main) {
@@ -25,32 +29,51 @@ export function show(main) {
   return () => { clearTimeout(timer.id); alertLine = null; };
 }
 
-/** Send a photo with what is chosen, and go to its job; `known` are fields that go before those. Raises Problem. */
-export async function submit(file, known = {}) {
-  if (!file) return;
+/** Send photos with what is chosen, and show their job or table; `known` are fields that go before those. */
+export async function submit(files, known = {}) {
+  if (!files.length) return;
   if (alertLine) alertLine.hidden = true;
   const fields = { ...(chosen.form ? chosen.form.fields() : {}), ...known };
   const scene = chosen.scene ?? await onlyScene();
   if (scene) fields.scene = scene;
-  const body = new FormData();
-  for (const [name, value] of Object.entries(fields)) body.append(name, value);
-  body.append("photo", file, file.name || "photo");
-  document.body.classList.add("sending");
+  if (files.length > 1) return batch.start([...files], fields);
+  const box = sendingBox(files[0].name || "photo");
+  const main = document.querySelector("#main");
+  main.querySelector(".sendbox")?.remove();
+  main.prepend(box.element);
   try {
-    const job = await ask("localize", { method: "POST", body });
-    remember(job.id, file, fields);
+    const job = await sendPhoto(files[0], fields, box.told, box.signal);
     location.hash = `#/jobs/${job.id}`;
+  } catch (error) {
+    if (error.name !== "AbortError") told(error);
   } finally {
-    document.body.classList.remove("sending");
+    box.element.remove();
   }
 }
 
-/** Show an error where this view has its place for it; false if another view is shown. */
+/** Show an error: at its place in this view, above any other. */
 export function told(error) {
-  if (!alertLine) return false;
-  alertLine.textContent = error.message;
-  alertLine.hidden = false;
-  return true;
+  if (error.status === 401) return askKey();
+  const line = alertLine ?? h("p", { class: "trouble", role: "alert" });
+  if (!alertLine) document.querySelector("#main").prepend(line);
+  line.textContent = error.message;
+  line.hidden = false;
+  say(error.message);
+}
+
+function stored() {
+  try {
+    return localStorage.getItem(SCENE_KEY);
+  } catch {
+    return null;  // storage may be forbidden
+  }
+}
+
+function choose(id) {
+  chosen.scene = id;
+  try {
+    localStorage.setItem(SCENE_KEY, id);
+  } catch { /* forbidden: the choice holds as long as this page */ }
 }
 
 async function onlyScene() {
@@ -65,7 +88,7 @@ function exampleButton() {
     button.disabled = true;
     try {
       const { file, fields } = await viewOf(chosen.scene);
-      await submit(file, fields);
+      await submit([file], fields);
     } catch (error) {
       told(error);
     }
@@ -76,19 +99,19 @@ function exampleButton() {
 
 function picker(example) {
   const hasCamera = navigator.maxTouchPoints > 0;  // a phone or tablet
-  const pick = h("input", { type: "file", accept: "image/*,.heic,.heif", id: "photo", class: "sr" });
+  const pick = h("input", { type: "file", accept: "image/*,video/*,.heic,.heif,.mkv", id: "photo", class: "sr", multiple: true });
   const shoot = h("input", { type: "file", accept: "image/*", id: "shoot", class: "sr", capture: "environment" });
   for (const input of [pick, shoot]) {
     input.addEventListener("change", async () => {
-      const file = input.files[0];
+      const files = [...input.files];
       input.value = "";
-      await submit(file).catch(told);
+      await submit(files).catch(told);
     });
   }
   return h("div", { class: "drop" },
-    h("p", {}, h("strong", {}, "Drop a photo here"), ", paste it, or"),
+    h("p", {}, h("strong", {}, "Drop photos or a video here"), ", paste, or"),
     h("div", { class: "buttons" },
-      pick, h("label", { for: "photo", class: "button primary" }, "Choose a photo"),
+      pick, h("label", { for: "photo", class: "button primary" }, "Choose photos"),
       ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : []), example));
 }
 
@@ -115,36 +138,37 @@ async function listScenes(place, timer, example) {
   try {
     ({ scenes } = await ask("scenes"));
   } catch (error) {
-    if (error.status === 401) place.replaceChildren(h("legend", {}, "Key"), keyForm());
-    else told(error);
+    if (error.status === 401) askKey();
+    else place.replaceChildren(h("legend", {}, "Scene"), h("p", { class: "trouble", role: "alert" }, `${error.message} Trying again…`));
+    if (error.status !== 401) timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
     return;
   }
-  if (!scenes.some(scene => scene.id === chosen.scene)) chosen.scene = null;
+  const several = scenes.length > 1;
+  if (!scenes.some(scene => scene.id === chosen.scene) && !(several && chosen.scene === ANY)) chosen.scene = null;
   chosen.scene ??= (scenes.find(scene => scene.state === "ready") ?? scenes[0])?.id ?? null;
-  const choose = id => {
-    chosen.scene = id;
-    example.hidden = !scenes.some(scene => scene.id === id && scene.state === "ready" && scene.cameras);
+  const offer = () => {
+    example.hidden = !scenes.some(scene => scene.id === chosen.scene && scene.state === "ready" && scene.cameras);
   };
-  choose(chosen.scene);
+  const changed = id => { choose(id); offer(); };
+  offer();
+  const cards = scenes.map(scene => card(scene, changed));
   place.replaceChildren(h("legend", {}, "Scene"),
-    scenes.length ? h("div", { class: "cards" }, scenes.map(scene => card(scene, choose))) : h("p", {}, "No scene is loaded."));
-  if (scenes.some(scene => ["loading", "preparing"].includes(scene.state))) {
+    scenes.length ? h("div", { class: "cards" }, several ? anyCard(changed) : null, cards) : h("p", {}, "There is no scene."));
+  if (scenes.some(scene => ["loading", "preparing", "unloading"].includes(scene.state))) {
     timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
   }
 }
 
-/** The key goes to the service once, which leaves a cookie for it and takes it out of the address. */
-function keyForm() {
-  return h("form", { action: "./", method: "get" },
-    h("p", {}, "This service asks for an API key."),
-    h("p", { class: "buttons" },
-      h("input", { type: "password", name: "key", required: true, autocomplete: "current-password", "aria-label": "API key" }),
-      h("button", {}, "Enter")));
+function anyCard(changed) {
+  const radio = h("input", { type: "radio", name: "scene", value: ANY, checked: chosen.scene === ANY });
+  radio.addEventListener("change", () => changed(ANY));
+  return h("label", { class: "card any" }, radio, h("span", { class: "name" }, "Any scene"),
+    h("span", { class: "quiet" }, "Search all loaded scenes; single photos only."));
 }
 
-function card(scene, choose) {
+function card(scene, changed) {
   const radio = h("input", { type: "radio", name: "scene", value: scene.id, checked: scene.id === chosen.scene });
-  radio.addEventListener("change", () => choose(scene.id));
+  radio.addEventListener("change", () => changed(scene.id));
   const ready = scene.gaussians !== null;
   const picture = ready
     ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
@@ -154,5 +178,5 @@ function card(scene, choose) {
     : scene.error?.detail ?? "";
   return h("label", { class: "card" }, radio, picture,
     h("span", { class: "name" }, scene.name),
-    h("span", { class: "quiet" }, scene.state === "ready" ? size : `${words(scene.state)} ${size}`));
+    h("span", { class: "quiet" }, scene.state === "ready" ? size : `${sentence(scene.state)}${size ? `: ${size}` : "…"}`));
 }

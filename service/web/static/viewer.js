@@ -25,16 +25,52 @@ document.addEventListener("click", event => {
   location.href = new URL(link.dataset.splatfix, root);
 });
 
-// viser's page speaks only with the very version that it came from, so an open page must be loaded anew when the
-// service comes back with another one. Asked every few seconds while somebody looks.
-let known = null;
+// The page belongs to one run of the viewer, with which its state ends. After a restart, be it of the service with
+// another version of viser's page, it is loaded anew; until then a bar says why nothing moves.
+const CHECK_MS = 1000;
+let run = null;
+
 async function check() {
-  if (document.hidden) return;
-  const answer = await fetch(new URL("version", root), { cache: "no-store" }).catch(() => null);
-  if (!answer?.ok) return;
-  const version = await answer.text();
-  if (known !== null && version !== known) location.reload();
-  known = version;
+  if (!document.hidden) await compare().catch(() => show("The connection to the service is lost. Reconnecting…"));
+  setTimeout(check, CHECK_MS);
 }
+
+async function compare() {
+  const answer = await fetch(new URL("viewer-run", root), { cache: "no-store" });
+  if (answer.status === 401) {
+    const then = encodeURIComponent(location.pathname.slice(root.pathname.length));
+    show("The session has ended.", { text: "Sign in", page: `./#/key?then=${then}` });
+    return;
+  }
+  if (!answer.ok) throw new Error(answer.status);
+  const current = await answer.text();
+  run ??= current;
+  if (run === current) {
+    bar.remove();
+    return;
+  }
+  const { pending } = await (await fetch(new URL("readyz", root), { cache: "no-store" })).json();
+  if (!pending.length) location.reload();
+  else show(`The service is starting (${pending[0]}).`);
+}
+
+const bar = document.createElement("div");
+bar.setAttribute("role", "alert");
+bar.className = "splatfix-lost";
+bar.style.cssText = "position:fixed;inset:0 0 auto;z-index:2000;padding:.6em 1em;background:#b3261e;color:#fff;" +
+  "font:15px/1.4 system-ui,sans-serif;text-align:center";
+
+function show(message, link) {
+  bar.textContent = `${message} `;
+  if (link) {
+    const anchor = document.createElement("a");
+    anchor.textContent = link.text;
+    anchor.href = "#";
+    anchor.style.color = "#fff";
+    anchor.dataset.splatfix = link.page;
+    bar.append(anchor);
+  }
+  if (!bar.isConnected) document.body?.append(bar);
+}
+
 check();
-setInterval(check, 3000);
