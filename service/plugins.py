@@ -96,7 +96,7 @@ class PluginRegistry:
     def _plugin(self, name: str) -> _Plugin:
         found = self._found()
         if name not in found:
-            raise UnknownName(f"there is no '{name}'; known: {', '.join(found)}.", where=self._kind)
+            raise UnknownName(f"unknown value '{name}'; known: {', '.join(found)}.", where=self._kind)
         return found[name]
 
     def _found(self) -> dict[str, _Plugin]:

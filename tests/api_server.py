@@ -109,6 +109,7 @@ def _without_values(text: str) -> str:
         (r"\b[0-9a-f]{16}\b", "ID"),
         (r"(known|it has): [^.]+", r"\1: NAMES"),
         (r"\d+/(second|hour)", "RATE"),
+        (r"limit [^)]+", "limit SIZE"),
         (r"\d+(\.\d+)?", "NUMBER"),
     ):
         text = re.sub(pattern, stands, text)

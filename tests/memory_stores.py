@@ -136,7 +136,7 @@ class MemoryJobStore:
     def get(self, job_id: str) -> StoredJob:
         with self._lock:
             if job_id not in self._rows:
-                raise JobNotFound(f"there is no job '{job_id}', or it was forgotten.", where="job")
+                raise JobNotFound(f"job '{job_id}' not found or expired.", where="job")
             return self._rows[job_id].job
 
     def queued(self) -> list[StoredJob]:

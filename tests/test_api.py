@@ -34,7 +34,11 @@ from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 import service.estimators
 from service.localize import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
+from service.web import hints
 from service.web.schemas import resources
+from service.web.schemas.job_spec import job_spec, read_fields
+from service.web.schemas.request_body import parsed_json
+from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields
 from service.web.settings import Settings
 
 # ------------------------------------------------------------------ the life of a job
@@ -507,6 +511,44 @@ BAD_FIELDS = [
 ]  # fmt: skip
 
 
+def test_a_refusal_names_what_is_allowed_with_an_example_that_is_right(shared):
+    """Each example is read from the text of a refusal and sent."""
+    wrong = {
+        **{"seed": "x", "budget_s": "0", "deadline_s": "0", "camera_id": "/", "every": "0", "keep_photo": "maybe"},
+        **{"options": "{", "prior": {"pose": 1}, "truth": {"pose": 1}, "intrinsics": {"fov": 60}, "times_s": "[1]"},
+    }
+    assert wrong.keys() <= hints.EXAMPLES.keys()
+    for field, value in wrong.items():
+        problem = post(shared, **{field: value}).json()
+        assert problem["where"].partition(".")[0] == field
+        named, _, example = problem["hint"].partition("Example: ")[2].partition("=")
+        assert named == field, problem
+        read = read_fields({field: parsed_json(example, field) if field in FIELD_ERRORS else example})
+        assert getattr(read, field) is not None
+    for field, known in (("prior", "world_from_camera"), ("truth", "quaternion_wxyz"), ("intrinsics", "trust")):
+        assert known in post(shared, **{field: wrong[field]}).json()["detail"] + hints.hint_for("", field)
+    assert "sigma_deg" in post(shared, prior={"pose": 1}).json()["detail"]
+    assert "covariance" not in post(shared, truth={"pose": 1}).json()["detail"]  # a prior's only
+
+
+def test_the_examples_of_hints_are_right():
+    fields = read_fields(hints.EXAMPLES)
+    assert fields.model_fields_set == set(hints.EXAMPLES)
+    assert set(hints.EXAMPLES) == set(LocalizeFields.model_fields)
+    job_spec(fields.model_copy(update={"estimator": "view_index"}))
+
+
+@pytest.mark.parametrize("estimator", ["icomma", "inerf", "inerf_dagger", "pnerf"])
+def test_an_estimator_that_needs_a_prior_is_refused_without_one(shared, estimator):
+    before = shared.get("/jobs").json()
+    answer = post(shared, estimator=estimator)
+    assert_problem(answer, 422, "invalid_prior", "prior")
+    assert estimator in answer.json()["detail"]
+    assert shared.get("/jobs").json() == before
+    listed = {e["name"]: e["needs_prior"] for e in shared.get("/capabilities").json()["estimators"]}
+    assert (listed[estimator], listed["view_index"]) == (True, False)
+
+
 @pytest.mark.parametrize(("fields", "status", "code", "where"), BAD_FIELDS)
 def test_a_bad_field_is_refused_before_anything_is_queued(shared, fields, status, code, where):
     before = shared.get("/jobs").json()
@@ -582,7 +624,17 @@ def test_a_body_too_large_is_refused_announced_or_not(stepping):
         assert_problem(client.put("/nowhere", content=large), 413, "content_too_large")
         chunks = (large[:100_000] for _ in range(15))
         assert_problem(client.post("/localize", content=chunks, headers=kind), 413, "content_too_large")
+        # Below the body's limit, which leaves room for base64, but above the photo's.
+        refused = post(client, photo() + b" " * 1000)
+        assert_problem(refused, 413, "content_too_large")
+        assert refused.json()["detail"] == "Upload too large (limit 1 kB)."
         assert client.get("/livez").status_code == 200
+
+
+def test_the_limit_of_uploads_depends_on_who_is_served():
+    assert settings().upload_limit == 1_000_000_000
+    assert settings(host="0.0.0.0").upload_limit == 50_000_000
+    assert settings(host="0.0.0.0", max_upload_bytes=7).upload_limit == 7
 
 
 def test_a_bug_in_a_route_is_a_problem_document_without_details(stepping, caplog):

@@ -40,7 +40,7 @@ FLOORS = {
         {"retrieval", "descent", "verification"},
     ],
     "service/web": [
-        {"api_model", "api_keys", "settings", "metrics", "viewer_process"},
+        {"api_model", "hints", "api_keys", "settings", "metrics", "viewer_process"},
         {"problems", "route_policy"},
         {"schemas"},
         {"middleware"},

@@ -171,7 +171,7 @@ def test_a_renderer_that_cannot_run_is_an_error(room, capsys, monkeypatch):
     with pytest.raises(UnknownName) as unknown:
         list(machine(Shared(room, "none", small=True)))
     told = f"UnknownName: {unknown.value}"
-    assert "there is no 'none'" in told
+    assert "unknown value 'none'" in told
     states = [{"part": each.name, "state": "not run", "seconds": 0.0, "rows": []} for each in gpu.PARTS]
     states[0] |= {"state": "failed", "error": told}
     monkeypatch.setattr(gpu, "run", lambda folder, **options: {**options, "scene": "room", "parts": states})
@@ -179,7 +179,7 @@ def test_a_renderer_that_cannot_run_is_an_error(room, capsys, monkeypatch):
     with pytest.raises(SystemExit) as ended:
         command_line.main()
     assert ended.value.code == 2
-    assert "there is no 'none'" in capsys.readouterr().err
+    assert "unknown value 'none'" in capsys.readouterr().err
 
 
 def test_unknown_part(room):

@@ -27,6 +27,8 @@ from service import jit
 from service.cli.render import render
 from service.geometry import moved, pose_distance
 from service.types import Pose
+from service.web.app import data_folder
+from service.web.settings import unknown_variables
 from tests.small_room import INTRINSICS, pose_at, write_room
 
 ROOT = Path(__file__).parents[1]
@@ -98,6 +100,12 @@ def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo,
     assert row["status"] == "localized"
     code, told, _ = splatfix("localize", photo, *given)
     assert told.startswith(f"{photo}: localized, score ")
+    grey = tmp_path / "grey.png"
+    Image.new("RGB", (INTRINSICS["width"], INTRINSICS["height"]), (90, 90, 90)).save(grey)
+    code, told, _ = splatfix("localize", photo, grey, *given)
+    assert (code, "not_localized" in told) == (0, True)
+    assert splatfix("localize", photo, grey, *given, "--fail")[0] == 1
+    assert splatfix("localize", photo, *given, "--fail")[0] == 0
 
 
 def test_photos_tell_the_lens_of_the_next_ones_where_that_is_asked_for(splatfix, room, photo, tmp_path):
@@ -200,10 +208,24 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         assert complaint.count("\n") == 1
 
 
-def test_a_port_in_use_and_a_bad_setting_are_told(splatfix, monkeypatch):
+def test_a_variable_that_is_no_setting_is_told():
+    environment = dict.fromkeys(("SPLATFIX_WORKRES", "SPLATFIX_FOO", "SPLATFIX_WORKERS", "SPLATFIX_KEY", "HOME"), "1")
+    kubernetes = dict.fromkeys(("SPLATFIX_SERVICE_HOST", "SPLATFIX_PORT_8000_TCP_ADDR"), "1")
+    foo, workers = unknown_variables(environment | kubernetes)
+    assert foo.startswith("SPLATFIX_FOO is no setting")
+    assert workers.endswith("is SPLATFIX_WORKERS meant?")
+
+
+def test_a_port_in_use_a_used_folder_and_a_bad_setting_are_told(splatfix, monkeypatch, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         code, _, complaint = splatfix("serve", "--port", taken.getsockname()[1])
     assert (code, "in use" in complaint) == (2, True)
+    with data_folder(tmp_path / "data"):
+        monkeypatch.setenv("SPLATFIX_DATA_DIR", str(tmp_path / "data"))
+        code, _, complaint = splatfix("serve", "--port", 0)
+    assert (code, "another process uses it" in complaint) == (2, True)
+    assert "Traceback" not in complaint
+    assert complaint.count("\n") == 1
     monkeypatch.setenv("SPLATFIX_WORKERS", "0")
     code, _, complaint = splatfix("serve")
     assert (code, complaint.startswith("error: workers: ")) == (2, True)

@@ -173,6 +173,27 @@ def test_a_geopose_request_is_answered_on_earth(place):
     assert np.allclose(looks, [-forward[1], forward[0], forward[2]], atol=0.02)
 
 
+def test_a_geopose_request_tells_what_is_known_of_the_pose(place):
+    client, _, folder = place
+    told = client.post("/geopose", json=geopose_request(folder)).json()
+    prior = {"geopose": told["geopose"], "accuracy": {"position": 0.5, "orientation": 10.0}}
+    request = geopose_request(folder) | {"priorPoses": [prior]}
+    assert client.post("/geopose", json=request).status_code == 200
+    newest = client.get("/jobs").json()["jobs"][0]
+    job = client.get(newest["links"]["self"]).json()
+    # Back from Earth it is the pose that was found; a unit of the scene is two metres.
+    found, used = (np.array(pose["world_from_camera"]["matrix"]) for pose in (job["result"]["pose"], job["prior"]))
+    assert np.allclose(found, used, atol=0.02)
+    assert np.sqrt(job["prior_region"]["covariance"]["matrix"][3][3]) == pytest.approx(0.25)
+    far = told["geopose"] | {"position": told["geopose"]["position"] | {"h": 80.0}}
+    request = geopose_request(folder) | {"priorPoses": [prior, prior | {"geopose": far}]}
+    assert_problem(client.post("/geopose", json=request), 409, "no_pose")  # the last one counts, and excludes the pose
+    turned = told["geopose"] | {"quaternion": {"x": 0, "y": 0, "z": 0, "w": 2}}
+    request = geopose_request(folder) | {"priorPoses": [{"geopose": turned}]}
+    answer = client.post("/geopose", json=request)
+    assert_problem(answer, 422, "invalid_prior", "priorPoses.0.geopose.quaternion")
+
+
 def test_the_pose_alone_is_an_ogc_geopose(place):
     client, _, folder = place
     answer = client.post("/geopose", json=geopose_request(folder), headers={"Accept": "application/geopose+json"})

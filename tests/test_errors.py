@@ -127,9 +127,13 @@ def send_photo(s: SimpleNamespace, data: bytes | None = None, **fields) -> httpx
     return post(s.client, data, prefer="", **{"scene": "good", **fields})
 
 
-def geopose(s: SimpleNamespace, scene: str = "good", image: bytes | None = None, **reading) -> httpx.Response:
+def geopose(
+    s: SimpleNamespace, scene: str = "good", image: bytes | None = None, prior: dict | None = None, **reading
+) -> httpx.Response:
     shot = {"imageBytes": base64.b64encode(photo() if image is None else image).decode(), **reading}
-    return s.client.post(f"/geopose?scene={scene}", json={"sensorReadings": {"cameraReadings": [shot]}})
+    known = {"geopose": {"position": {"lat": 0, "lon": 0, "h": 0}, "quaternion": prior}}
+    request = {"sensorReadings": {"cameraReadings": [shot]}, "priorPoses": [known] if prior else []}
+    return s.client.post(f"/geopose?scene={scene}", json=request)
 
 
 def render(s: SimpleNamespace, scene: str = "good", **changes) -> httpx.Response:
@@ -244,6 +248,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("geopose", "no_geo_anchor"): lambda s: geopose(s, "plain"),
     ("geopose", "invalid_image"): lambda s: geopose(s, image=b"x"),
     ("geopose", "invalid_intrinsics"): lambda s: geopose(s, params={"model": "MAGIC", "modelParams": [1]}),
+    ("geopose", "invalid_prior"): lambda s: geopose(s, prior={"x": 1, "y": 1, "z": 0, "w": 0}),
     ("geopose", "no_pose"): geopose,
     ("geopose", "deadline_exceeded"): impatient_geopose,
     ("geopose", "estimator_fault"): lambda s: failing_geopose(s, steps=0),
@@ -486,6 +491,10 @@ def test_every_error_has_an_example_and_each_example_its_error():
     }
     assert set(EXAMPLES) == ours | http
     assert BadInput.code in EXAMPLES
+
+
+def test_no_error_is_without_a_hint():
+    assert not [code for code, problem in EXAMPLES.items() if not problem.hint]
 
 
 def test_the_names_in_the_examples_are_real():

@@ -91,6 +91,26 @@ def test_no_scene_is_called_auto(tmp_path):
         named_scenes([tmp_path])
 
 
+def test_scenes_of_one_name_get_ids_of_their_own(tmp_path):
+    folders = [tmp_path / floor / "kitchen" for floor in ("first", "second", "attic/second")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "scene.ply").write_bytes(ply())
+    named = named_scenes([*folders, folders[0]])  # one is given twice
+    assert [(scene.id, scene.path) for scene in named] == list(
+        zip(("kitchen", "second-kitchen", "second-kitchen-2"), folders, strict=True)
+    )
+
+
+def test_a_file_that_cannot_be_read_leaves_the_one_that_can(tmp_path):
+    (tmp_path / "scene.ply").write_bytes(ply())
+    (tmp_path / "biker.ksplat").write_bytes(b"?")
+    assert load_scene(tmp_path).info.format == "ply"
+    (tmp_path / "second.ply").write_bytes(ply())
+    with pytest.raises(CorruptScene, match=r'"file": "scene\.ply"'):
+        load_scene(tmp_path)
+
+
 def service_on(folder: Path, **changes):
     return serving(create_app(settings(scenes=[folder], cache_dir=folder.parent / "cache", **changes)))
 

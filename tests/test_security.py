@@ -185,6 +185,22 @@ def test_a_page_opened_with_a_key_gets_a_cookie_and_a_clean_address(locked, ring
     assert_problem(locked.get("/", params={"key": "sfx_wrong"}), 401, "unauthorized")
 
 
+@pytest.mark.parametrize(
+    ("path", "form"),
+    [
+        ("/viewer/", "/#/key?then=viewer/"),
+        ("/viewer/jobs/x/", "/#/key?then=viewer/jobs/x/"),
+        ("/?key=sfx_wrong", "/#/key?then=&refused"),
+        ("/viewer/?key=sfx_wrong", "/#/key?then=viewer/&refused"),
+    ],
+)
+def test_who_opens_a_page_without_a_valid_key_is_asked_for_one(locked, path, form):
+    asked = locked.get(path, headers={"Accept": "text/html,*/*", "X-Forwarded-Prefix": "/fix"})
+    assert (asked.status_code, asked.headers["location"]) == (303, f"/fix{form}")
+    assert "set-cookie" not in asked.headers
+    assert_problem(locked.get(path), 401, "unauthorized")  # a program has the document
+
+
 def test_a_token_opens_the_viewer_for_a_while(locked, ring):
     made = locked.post("/tokens", headers=bearer(ring["localize"])).json()
     entered = locked.get("/viewer/jobs/x/", params={"token": made["token"]})
@@ -438,6 +454,18 @@ def test_logs_have_ids_and_no_secrets(stepping, ring, tmp_path, caplog):
 def finished_with(client: httpx.Client, path: str, key: str) -> dict:
     until(lambda: client.get(path, headers=bearer(key)).json()["finished"])
     return client.get(path, headers=bearer(key)).json()
+
+
+def test_the_viewers_polling_is_not_logged(stepping, ring, tmp_path, caplog):
+    caplog.set_level(logging.INFO, "service")
+    keys = KeyRing(tmp_path / "keys.json")
+    viewer = keys.make_temporary("viewer", "read")
+    with serving(create_app(settings(), {"room": make_scene()}, keys)) as client:
+        for path, status in (("/jobs", 200), ("/scenes", 200), ("/jobs/none", 404)):
+            assert client.get(path, headers=bearer(viewer)).status_code == status
+        client.get("/scenes", headers=bearer(ring["read"]))
+    lines = [r.getMessage() for r in caplog.records if r.getMessage().startswith("GET")]
+    assert [line.rpartition(" ")[0].rpartition(" ")[0] for line in lines] == ["GET /jobs/none 404", "GET /scenes 200"]
 
 
 def test_the_photos_own_name_reaches_no_path(client, tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated
 
 import typer
@@ -14,6 +15,7 @@ def doctor(
 ) -> None:
     """Print what runs on this machine, and why the rest doesn't. Exit code 1 if localizing can't work."""
     from service.cli.diagnostics import compile_kernels, findings
+    from service.web.settings import unknown_variables
 
     if warm:
         with err.status("compiling"):
@@ -26,5 +28,7 @@ def doctor(
             healthy &= finding.ok or not finding.needed
     for name, value in settings_of({}).model_dump().items():
         say(f"     SPLATFIX_{name.upper():22} {value}")
+    for line in unknown_variables(os.environ):
+        say(f"no   {line}")
     if not healthy:
         raise typer.Exit(1)

@@ -26,6 +26,7 @@ from service.errors import InvalidRequest
 if TYPE_CHECKING:
     from service.jobs.model import JobRecord
     from service.localize import LoadedScene
+    from service.results import Status
     from service.web.schemas.job_results import Result
     from service.web.schemas.request_body import Body
     from service.web.schemas.requests import LocalizeFields
@@ -62,10 +63,17 @@ def localize(
         bool, typer.Option("--learn-lenses", help="Photos tell the lens of the same camera's next ones, by EXIF.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
+    fail: Annotated[
+        bool, typer.Option("--fail", help="Exit with code 1 unless every photo or frame is localized.")
+    ] = False,
 ) -> None:
-    """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which."""
+    """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which.
+
+    The exit code is 0 also for photos that are not localized, unless --fail is given; 2 for an error.
+    """
     from service.localize import DEFAULT_ESTIMATOR
     from service.photos.sequence import is_sequence
+    from service.results import Status
     from service.scene_formats.discovery import find_scenes
     from service.web.schemas.request_body import Body, body_of
 
@@ -87,10 +95,12 @@ def localize(
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
     output = _Output(as_json, csv_file, tum_file)
     if track_camera:
-        _localize_sequence(body_of(files, {}), fields, loaded[0], output)
+        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], output)
     else:
         bodies = [Body(data, name, {}) for name, data in files]
-        _localize_each(bodies, fields, loaded, output, learn_lenses=learn_lenses)
+        statuses = _localize_each(bodies, fields, loaded, output, learn_lenses=learn_lenses)
+    if fail and any(status != Status.LOCALIZED for status in statuses):
+        raise typer.Exit(1)
 
 
 def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
@@ -119,8 +129,8 @@ def _require_one_scene(paths: list[Path]) -> None:
 
 def _localize_each(
     bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output, *, learn_lenses: bool
-) -> None:
-    """Localize every photo by itself, in the one scene or in each of several."""
+) -> list[Status]:
+    """Localize every photo by itself, in the one scene or in each of several; return their statuses."""
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
@@ -147,10 +157,11 @@ def _localize_each(
         print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
     if output.csv_file:
         result_tables.write_photo_table(output.csv_file, results)
+    return [result.status for _, result in results]
 
 
-def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, output: _Output) -> None:
-    """Track the camera of a video, or of photos in their order, through a scene."""
+def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, output: _Output) -> list[Status]:
+    """Track the camera of a video, or of photos in their order, through a scene; return the frames' statuses."""
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.engine import SequenceSource
@@ -177,3 +188,4 @@ def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, 
         result_tables.write_frame_table(output.csv_file, result.frames or [])
     if output.tum_file:
         output.tum_file.write_text(trajectory_of(result.frames or []), encoding="utf-8")
+    return [frame.status for frame in result.frames or []]

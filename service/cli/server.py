@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import socket
 import threading
 import time
@@ -16,9 +17,8 @@ from service.cli.example_request import curl_line
 from service.errors import InvalidRequest
 from service.logs import json_handler
 from service.web.api_keys import KeyRing
-from service.web.app import create_app
-from service.web.middleware.authentication import is_loopback
-from service.web.settings import DATA_HOME, Settings
+from service.web.app import create_app, data_folder
+from service.web.settings import DATA_HOME, Settings, is_loopback, unknown_variables
 
 _CONNECTIONS_S = 3
 """Time for open connections after SIGTERM, before the running jobs get their own."""
@@ -30,12 +30,17 @@ def run(settings: Settings, out: Console, err: Console) -> None:
         logging.getLogger().handlers = [json_handler()]
     if settings.data_dir is None and settings.port:  # a random port is never the same again
         settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
+    for line in unknown_variables(os.environ):
+        err.print(f"warning: {line}", style="yellow", markup=False, highlight=False, soft_wrap=True)
     keys = KeyRing(settings.keys_file)
     # Beyond this machine nobody may come in without a key, so one is made where there is none.
     key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_temporary("start", "admin")
     # The socket first: the port is known, and an error is reported before scenes are loaded.
     with _listener(settings.host, settings.port) as listener:
         settings = settings.model_copy(update={"port": listener.getsockname()[1]})
+        # Tried before the server starts, which would print the error with its traceback.
+        with data_folder(settings.data_dir):
+            pass
         # After the port: the viewer gets the address of the service.
         application = create_app(settings, keys=keys)
         server = uvicorn.Server(

@@ -57,6 +57,9 @@ class IcommaConfig:
 ICOMMA = IcommaConfig()
 
 
+NEEDS_PRIOR = True
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     steps: int = 500

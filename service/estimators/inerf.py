@@ -42,6 +42,9 @@ INERF = InerfConfig()
 LIMITS = {"steps": (1, 100_000), "rays": (0, 10_000_000), "rate": (0, 10), "long_side_px": (32, 4096)}
 
 
+NEEDS_PRIOR = True
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     steps: int = 500

@@ -18,6 +18,9 @@ from service.types import Query
 prepare = inerf.prepare
 
 
+NEEDS_PRIOR = True
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     steps: int = 500

@@ -57,6 +57,9 @@ class PnerfConfig:
 PNERF = PnerfConfig()
 
 
+NEEDS_PRIOR = True
+
+
 @dataclass(frozen=True, slots=True)
 class Options:
     hypotheses: int = 64

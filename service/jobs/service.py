@@ -174,12 +174,12 @@ class Jobs:
         return self._current(self._store.get(job_id))
 
     def result(self, job: StoredJob) -> JobResult:
-        """Return what a job that succeeded found. Raises JobNotReady; JobNotFound if it was forgotten just now."""
+        """Return what a job that succeeded found. Raises JobNotReady; JobNotFound if it expired just now."""
         if job.state != "succeeded":
             raise JobNotReady(f"the job is {job.state}.", where="job")
         result = self._store.result(job.id)
         if result is None:
-            raise JobNotFound(f"there is no job '{job.id}', or it was forgotten.", where="job")
+            raise JobNotFound(f"job '{job.id}' not found or expired.", where="job")
         return result
 
     def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:

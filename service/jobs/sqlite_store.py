@@ -219,7 +219,7 @@ class SqliteJobStore:
         with self._database.reading() as reader:
             found = _select(reader, "WHERE id = ?", job_id)
         if not found:
-            raise JobNotFound(f"there is no job '{job_id}', or it was forgotten.", where="job")
+            raise JobNotFound(f"job '{job_id}' not found or expired.", where="job")
         return found[0]
 
     def queued(self) -> list[StoredJob]:

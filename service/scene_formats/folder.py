@@ -124,7 +124,9 @@ def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
         if not candidates[0].is_file():
             raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
     else:
-        candidates = sorted(p for p in path.iterdir() if p.is_file() and is_scene_file(p))
+        files = sorted(p for p in path.iterdir() if p.is_file() and is_scene_file(p))
+        # A file that can't be read here doesn't make another one ambiguous.
+        candidates = [p for p in files if p.suffix.lower() in readable_suffixes()] or files
     if not candidates:
         raise SceneNotFound(f"the folder has no scene file ({', '.join(readable_suffixes())}).", where=str(path))
     if len(candidates) > 1:

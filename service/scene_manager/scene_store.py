@@ -13,8 +13,9 @@ import re
 import shutil
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import IO, Protocol, Self, runtime_checkable
@@ -88,16 +89,30 @@ class SceneStore(Protocol):
 
 
 def named_scenes(paths: Iterable[Path]) -> list[StoredScene]:
-    """Return the scenes at the paths that an operator names, without reading them. Raises SceneNotFound, BadInput."""
+    """Return the scenes at the paths that an operator names, without reading them. Raises SceneNotFound, BadInput.
+
+    Of several scenes with one name the first keeps it; the others' ids begin with the folder that they are in.
+    """
     found: dict[str, StoredScene] = {}
+    named: set[Path] = set()
     for path in (scene for given in paths for scene in find_scenes(given)):
-        scene_id = path.resolve().stem if path.is_file() else path.resolve().name
+        place = path.resolve()
+        scene_id = place.stem if path.is_file() else place.name
         if scene_id == AUTO:
             raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
+        if place in named:
+            continue
+        named.add(place)
         if scene_id in found:
-            raise BadInput(f"two scenes are called '{scene_id}'.", where=str(path))
+            free = _free_id(f"{place.parent.name}-{scene_id}", found)
+            _log.warning("there is a scene %s already: that at %s gets the id %s", scene_id, path, free)
+            scene_id = free
         found[scene_id] = StoredScene(scene_id, path)
     return list(found.values())
+
+
+def _free_id(wanted: str, taken: Container[str]) -> str:
+    return next(name for name in (wanted, *(f"{wanted}-{n}" for n in count(2))) if name not in taken)
 
 
 class FolderSceneStore:

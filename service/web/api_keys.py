@@ -22,6 +22,8 @@ from service.errors import InvalidRequest, StorageFailed
 Role = Literal["read", "localize", "admin"]
 ROLES: tuple[Role, ...] = get_args(Role)
 """In ascending order; each role includes those before it."""
+VIEWER_KEY = "viewer"
+"""Name of the key of the viewer's process."""
 _PREFIX = "sfx_"
 """Marks a key for people and for secret scanners."""
 _SECRET_BYTES = 32
@@ -67,7 +69,7 @@ class KeyRing:
     def __bool__(self) -> bool:
         """Return whether a client needs a key: whether there is any but the viewer's own."""
         self._refresh()
-        return bool(self._stored) or any(key.name != "viewer" for key in self._temporary)
+        return bool(self._stored) or any(key.name != VIEWER_KEY for key in self._temporary)
 
     def keep_sessions(self, path: Path) -> None:
         """Sign tokens with the secret in a file, made if it isn't there, so that they outlive a restart.

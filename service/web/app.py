@@ -35,9 +35,9 @@ from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.status import StoredScene
-from service.web.api_keys import KeyRing
+from service.web.api_keys import VIEWER_KEY, KeyRing
 from service.web.metrics import Metrics
-from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts, is_loopback
+from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Proxy
 from service.web.middleware.route_lookup import RouteLookup
@@ -47,7 +47,7 @@ from service.web.problems import add_error_handlers
 from service.web.route_policy import RoutePolicy, declare, require_policies
 from service.web.routes import router
 from service.web.routes.dependencies import AppState
-from service.web.settings import Settings
+from service.web.settings import Settings, is_loopback
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
 
@@ -65,7 +65,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     for scene in named:
         engine.add(scene, required=settings.preload is None or scene.id in settings.preload)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
-    viewer = ViewerChild(settings.loopback_url, keys.make_temporary("viewer", "read")) if settings.viewer else None
+    viewer = ViewerChild(settings.loopback_url, keys.make_temporary(VIEWER_KEY, "read")) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
 
     @asynccontextmanager

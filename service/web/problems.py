@@ -7,11 +7,12 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
-from typing import Any
+from typing import Any, get_args
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import Match
@@ -48,6 +49,7 @@ from service.errors import (
     Unauthorized,
 )
 from service.web.api_model import Model
+from service.web.hints import hint_for
 
 _log = logging.getLogger(__name__)
 
@@ -117,7 +119,7 @@ class Problem(Model):
     where: str = ""
     """Field, file or element that is concerned; empty if there is none."""
     hint: str = ""
-    """What to do about it."""
+    """What to do about it; for a field, what it may have, with an example."""
 
 
 def problem_of(error: Exception, instance: str) -> Problem:
@@ -163,7 +165,7 @@ def _problem(status: int, code: str, detail: str, instance: str, where: str = ""
         instance=_sendable(instance),
         code=code,
         where=_sendable(where),
-        hint=_sendable(hint),
+        hint=_sendable(hint or hint_for(code, where)),
     )
 
 
@@ -234,11 +236,29 @@ def _allowed(request: Request) -> set[str]:
     return methods
 
 
-def field_and_message(errors: Sequence[Any]) -> tuple[str, str]:
-    """Return the field of pydantic's first error, and the messages of all, joined."""
+def field_and_message(errors: Sequence[Any], model: type[BaseModel] | None = None) -> tuple[str, str]:
+    """Return the field of pydantic's first error, and the messages of all, joined; `model` is what was validated."""
     places = [".".join(str(part) for part in e["loc"]) for e in errors]
-    messages = [e["msg"] if p == places[0] else f"{p}: {e['msg']}" for p, e in zip(places, errors, strict=True)]
+    told = [_message(e, model) for e in errors]
+    messages = [text if p == places[0] else f"{p}: {text}" for p, text in zip(places, told, strict=True)]
     return places[0], "; ".join(messages) + "."
+
+
+def _message(error: Any, model: type[BaseModel] | None) -> str:
+    if error["type"] != "extra_forbidden":
+        return error["msg"]
+    known = _fields_at(model, error["loc"][:-1])
+    return f"unknown field; known: {', '.join(sorted(known))}" if known else "unknown field"
+
+
+def _fields_at(model: type[BaseModel] | None, path: Sequence[int | str]) -> tuple[str, ...]:
+    """Return the names of the fields of the model at a path within another."""
+    for name in path:
+        field = model.model_fields.get(str(name)) if model else None
+        # A field may be a model or, mostly, a model or None.
+        kinds = [] if field is None else [field.annotation, *get_args(field.annotation)]
+        model = next((k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)), None)
+    return tuple(model.model_fields) if model else ()
 
 
 def invalid_request(errors: Sequence[Any]) -> InvalidRequest:

@@ -37,8 +37,8 @@ class BodyLimit:
 SMALL_BYTES = 1_000_000
 SMALL_BODY = BodyLimit(lambda settings: SMALL_BYTES)
 """A body without a file."""
-PHOTO_BODY = BodyLimit(lambda settings: settings.max_upload_bytes * 4 // 3 + SMALL_BYTES)
-"""Photos in base64, which takes 4/3 of their bytes, and the fields beside them."""
+PHOTO_BODY = BodyLimit(lambda settings: settings.upload_limit * 4 // 3 + SMALL_BYTES)
+"""Photos in base64, which takes 4/3 of their bytes, and the fields beside them; their own size is checked later."""
 SCENE_BODY = BodyLimit(lambda settings: settings.max_scene_bytes)
 
 

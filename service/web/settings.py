@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import os
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +17,16 @@ from service.jobs.embedded_engine import EngineConfig
 from service.jobs.read_photo import MAX_FRAMES
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 
+_PREFIX = "SPLATFIX_"
+
 DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share") / "splatfix"
 """Folder in which `splatfix serve` keeps its jobs, in a subfolder for each port."""
 
 CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "splatfix"
 """Folder of the settings' file and of the API keys."""
+
+_OTHER_VARIABLES = frozenset({"config", "plugins_dir", "weights_dir", "viewer_key", "key"})
+"""Of the environment, in lower case: read elsewhere, or by the commands that we print."""
 
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
@@ -34,10 +42,30 @@ def _cores() -> int:
     return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
+def unknown_variables(environment: Mapping[str, str]) -> list[str]:
+    """Return a sentence for each variable SPLATFIX_* that is no setting, with the name that may be meant."""
+    known = {*Settings.model_fields, *_OTHER_VARIABLES}
+    found = []
+    for variable in sorted(environment):
+        prefix, name = variable[: len(_PREFIX)], variable[len(_PREFIX) :].lower()
+        # Kubernetes adds SPLATFIX_SERVICE_HOST, SPLATFIX_PORT_8000_TCP, ... for a service of that name.
+        if prefix.upper() != _PREFIX or name in known or re.match(r"(service|port|test)_", name):
+            continue
+        near = difflib.get_close_matches(name, sorted(known), 1)
+        meant = f"; is {_PREFIX}{near[0].upper()} meant?" if near else "; `splatfix doctor` lists them."
+        found.append(f"{variable} is no setting, and has no effect{meant}")
+    return found
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether only this machine reaches an address to listen on."""
+    return host in ("localhost", "::1") or host.startswith("127.")
+
+
 class Settings(BaseSettings):
     """The settings, checked; their descriptions are shown by `splatfix doctor`."""
 
-    model_config = SettingsConfigDict(env_prefix="SPLATFIX_", use_attribute_docstrings=True, extra="forbid")
+    model_config = SettingsConfigDict(env_prefix=_PREFIX, use_attribute_docstrings=True, extra="forbid")
 
     @classmethod
     def settings_customise_sources(
@@ -99,8 +127,9 @@ class Settings(BaseSettings):
     and what was remembered is deleted at the start."""
     crashes: int = Field(default=3, ge=1)
     """A job whose attempts were lost this many times, by crashes of the service, is not run again."""
-    max_upload_bytes: int = Field(default=50_000_000, ge=1)
-    """Size limit of a photo, a video, or several photos together."""
+    max_upload_bytes: int | None = Field(default=None, ge=1)
+    """Size limit of a photo, a video, or several photos together. None: 1 GB where only this machine is served, else
+    50 MB."""
     max_frames: int = Field(default=MAX_FRAMES, ge=1)
     """Number of photos, or frames of a video, in one job."""
     max_uploads: int = Field(default=8, ge=1)
@@ -127,6 +156,13 @@ class Settings(BaseSettings):
     """Log in JSON; None: unless the log goes to a terminal."""
     viewer: bool = True
     """Start the viewer, and serve it under /viewer."""
+
+    @property
+    def upload_limit(self) -> int:
+        """`max_upload_bytes`, or its default for the address that is listened on."""
+        if self.max_upload_bytes is not None:
+            return self.max_upload_bytes
+        return 1_000_000_000 if is_loopback(self.host) else 50_000_000
 
     @property
     def jobs(self) -> JobsConfig:

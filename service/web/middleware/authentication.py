@@ -20,6 +20,7 @@ from service.errors import Forbidden, Unauthorized
 from service.web.api_keys import Caller, KeyRing, Role
 from service.web.problems import problem_response, refuse
 from service.web.route_policy import SAFE_METHODS, RoutePolicy
+from service.web.settings import is_loopback
 
 COOKIE = "splatfix_session"
 SESSION_S = 12 * 3600.0
@@ -156,11 +157,6 @@ def allowed_hosts(listens_on: str, given: Sequence[str], *, open_to_all: bool) -
     if given:
         return tuple(given)
     return _LOOPBACK if open_to_all and is_loopback(listens_on) else ()
-
-
-def is_loopback(host: str) -> bool:
-    """Return whether only this machine reaches an address to listen on."""
-    return host in ("localhost", "::1") or host.startswith("127.")
 
 
 async def _refuse(error: Unauthorized | Forbidden, scope: Scope, receive: Receive, send: Send) -> None:

@@ -151,4 +151,12 @@ def _check_length(scope: Scope, limit: int) -> None:
 
 def too_large(limit: int) -> HTTPException:
     """Return the error for a body of more bytes."""
-    return HTTPException(413, f"The body may have {limit} bytes.")
+    return HTTPException(413, f"Upload too large (limit {_readable(limit)}).")
+
+
+def _readable(count: int) -> str:
+    """Return a number of bytes in the largest decimal unit of which there is one, with at most two digits behind."""
+    for unit, size in (("GB", 10**9), ("MB", 10**6), ("kB", 10**3)):
+        if count >= size:
+            return f"{count / size:.2f}".rstrip("0").rstrip(".") + f" {unit}"
+    return f"{count} bytes"

@@ -12,6 +12,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.logs import bound
+from service.web.api_keys import VIEWER_KEY
 from service.web.metrics import Metrics
 from service.web.problems import problem_response
 
@@ -30,7 +31,7 @@ _PAGES_POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
 )
-_NOT_LOGGED = ("/livez", "/readyz", "/metrics")
+_NOT_LOGGED = ("/livez", "/readyz", "/metrics", "/viewer-run")
 
 
 class Proxy:
@@ -66,8 +67,12 @@ class Proxy:
 
     def _report(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "other")
+        path = scope["path"].removeprefix(scope.get("root_path", ""))
         self._metrics.request(scope["method"], route, status, seconds)
-        if scope["path"] not in _NOT_LOGGED:
+        caller = scope["state"].get("caller")
+        # The viewer asks twice a second whether there are new jobs.
+        polls = caller is not None and caller.name == VIEWER_KEY and scope["method"] == "GET" and status < 400
+        if not polls and not path.startswith(_NOT_LOGGED):
             # Without the query, which may contain a key.
             _log.info("%s %s %d %.0f ms", scope["method"], scope["path"], status, 1000 * seconds)
 

@@ -34,6 +34,7 @@ router = APIRouter()
         *(
             "invalid_image",
             "invalid_intrinsics",
+            "invalid_prior",
             "no_pose",
             "deadline_exceeded",
             "interrupted",
@@ -66,7 +67,9 @@ async def geopose(
     if anchor is None:
         raise NoGeoAnchor(f"scene '{scene_id}' has no geo_anchor.", where="scene")
     wait_s = app_state.settings.max_wait_s
-    fields = LocalizeFields(scene=scene_id, intrinsics=intrinsics, deadline_s=wait_s)
+    fields = LocalizeFields(
+        scene=scene_id, intrinsics=intrinsics, prior=gpp.prior_of(wanted, anchor), deadline_s=wait_s
+    )
     job = await create_job(request, app_state, Body(photo, "", {}), fields)
     if live := app_state.jobs.live(job.id):
         await live.wait(wait_s)

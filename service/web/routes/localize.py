@@ -11,7 +11,7 @@ from fastapi import APIRouter, Header, Request, Response
 
 from service.jobs.model import ENDED, StoredJob
 from service.jobs.service import JobOrder
-from service.web.middleware.limits import client_of
+from service.web.middleware.limits import client_of, too_large
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document, lens_owner
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
@@ -116,9 +116,14 @@ async def localize_photo(
 async def create_job(
     request: Request, app_state: AppState, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
 ) -> StoredJob:
-    """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed."""
+    """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed;
+    HTTPException 413.
+    """
     # The same as for the limits: idempotency keys of different clients are independent.
     client = client_of(request.scope)
+    # The whole body was allowed a third more, for base64.
+    if len(body.photo) > app_state.settings.upload_limit:
+        raise too_large(app_state.settings.upload_limit)
 
     def accept() -> StoredJob:
         sha256 = hashlib.sha256(body.photo).hexdigest()

@@ -30,7 +30,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     ),
     (
         e.UnknownName(
-            "there is no 'magic'; known: icomma, inerf, inerf_dagger, mc_do, pnerf, view_index.", where="estimators"
+            "unknown value 'magic'; known: icomma, inerf, inerf_dagger, mc_do, pnerf, view_index.", where="estimators"
         ),
         "/localize",
     ),
@@ -78,7 +78,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         e.UnsupportedFormat("a text PLY is not read.", where="scene.ply", hint="Save it as binary."),
         "/localize",
     ),
-    (e.JobNotFound("there is no job '3f9c2a7be1d04c58', or it was forgotten.", where="job"), _JOB),
+    (e.JobNotFound("job '3f9c2a7be1d04c58' not found or expired.", where="job"), _JOB),
     (
         e.RecordNotFound("the job has 12 records and is succeeded.", where="iterations"),
         f"{_JOB}/iterations/12/render.jpg",
@@ -118,7 +118,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (HTTPException(404, "Not Found"), "/nowhere"),
     (HTTPException(405, "Method Not Allowed"), "/localize"),
     (HTTPException(408, "The body took too long to arrive."), "/localize"),
-    (HTTPException(413, "The body may have 67666666 bytes."), "/localize"),
+    (HTTPException(413, "Upload too large (limit 50 MB)."), "/localize"),
     (HTTPException(415, "Send multipart/form-data or application/json, not 'image/jpeg'."), "/localize"),
     (HTTPException(503, "The viewer does not answer; it may be starting."), "/viewer/"),
     (RuntimeError(), f"{_JOB}/photo"),

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 from pyproj import Transformer
 
-from service.geometry import quat_from_rotation
+from service.geometry import quat_from_rotation, rotation_from_quat
 from service.types import GeoAnchor, Pose
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -34,6 +34,24 @@ def geographic(anchor: GeoAnchor, pose: Pose) -> tuple[Float64[np.ndarray, "3"],
     ecef_from_camera = ecef_from_enu @ enu_from_world @ pose.world_from_camera[:3, :3] @ _OPENCV_FROM_OPENGL
     rotation = quat_from_rotation(_ecef_from_enu(latitude, longitude).T @ ecef_from_camera)
     return np.array([latitude, longitude, height]), rotation
+
+
+def pose_on_earth(
+    anchor: GeoAnchor, position: Float64[np.ndarray, "3"], quaternion_wxyz: Float64[np.ndarray, "4"]
+) -> Pose:
+    """Return the pose in the scene of one on WGS84, as `geographic` returns it: its inverse. Raises InvalidPrior."""
+    ecef_from_geodetic = Transformer.from_crs("EPSG:4979", "EPSG:4978")
+    origin = np.array(ecef_from_geodetic.transform(anchor.latitude_deg, anchor.longitude_deg, anchor.height_m))
+    ecef_from_enu = _ecef_from_enu(anchor.latitude_deg, anchor.longitude_deg)
+    scaled = anchor.enu_from_world[:3, :3]
+    enu_from_world = scaled / np.cbrt(np.linalg.det(scaled))
+    latitude, longitude, _ = position
+    enu = ecef_from_enu.T @ (np.array(ecef_from_geodetic.transform(*position)) - origin)
+    ecef_from_camera = _ecef_from_enu(latitude, longitude) @ rotation_from_quat(quaternion_wxyz)
+    world_from_camera = np.eye(4)
+    world_from_camera[:3, :3] = enu_from_world.T @ ecef_from_enu.T @ ecef_from_camera @ _OPENCV_FROM_OPENGL
+    world_from_camera[:3, 3] = np.linalg.solve(scaled, enu - anchor.enu_from_world[:3, 3])
+    return Pose(world_from_camera)
 
 
 def _ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3 3"]:

@@ -1,8 +1,8 @@
 """Requests and responses of Open AR Cloud's GeoPoseProtocol, by which AR clients are localized on Earth.
 
 The first camera reading of a request is used: its image, and its camera's parameters (in COLMAP's models). The scene is
-the only one with a geo_anchor, or the nearest to the request's geolocation. Other readings (sensors, prior poses) are
-accepted and ignored.
+the only one with a geo_anchor, or the nearest to the request's geolocation. The last of the prior poses is the job's
+prior; with an accuracy it is a Gaussian. Readings of other sensors are accepted and ignored.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.errors import InvalidIntrinsics, InvalidRequest, NoGeoAnchor
+from service.errors import InvalidIntrinsics, InvalidPrior, InvalidRequest, NoGeoAnchor
 from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
 from service.scene_manager.status import SceneStatus
 from service.types import GeoAnchor
 from service.web.api_model import Model
+from service.web.schemas.geodesy import pose_on_earth
 from service.web.schemas.job_results import Result
 from service.web.schemas.poses import GeoPose
+from service.web.schemas.requests import PriorIn
 
 _EARTH_M = 6_371_000.0
 
@@ -58,12 +60,48 @@ class SensorReadings(_Foreign):
     geolocationReadings: list[GeolocationReading] = Field(default_factory=list, max_length=1000)
 
 
+class PriorPosition(_Foreign):
+    lat: float = Field(ge=-90, le=90)
+    lon: float = Field(ge=-180, le=180)
+    h: float = Field(allow_inf_nan=False)
+    """Metres above the ellipsoid."""
+
+
+class PriorQuaternion(_Foreign):
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class PriorGeoPose(_Foreign):
+    position: PriorPosition
+    quaternion: PriorQuaternion
+
+
+class PriorAccuracy(_Foreign):
+    position: float = Field(gt=0, allow_inf_nan=False)
+    """Metres."""
+    orientation: float = Field(gt=0, le=180, allow_inf_nan=False)
+    """Degrees."""
+
+
+class PriorPose(_Foreign):
+    """An earlier response, or what a device knows by itself."""
+
+    geopose: PriorGeoPose
+    accuracy: PriorAccuracy | None = None
+    """Standard deviations. With them, poses outside of the Gaussian's 99.9 % region are rejected."""
+
+
 class GeoPoseRequest(_Foreign):
     id: str = Field(default="", max_length=200)
     timestamp: float = 0.0
     """Milliseconds since 1970."""
     type: str = "geopose"
     sensorReadings: SensorReadings
+    priorPoses: list[PriorPose] = Field(default_factory=list, max_length=1000)
+    """In the order of time: the last one is used."""
 
 
 class GeoPoseAccuracy(Model):
@@ -118,6 +156,35 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
     }
 
 
+def prior_of(request: GeoPoseRequest, anchor: GeoAnchor) -> PriorIn | None:
+    """Return the last prior pose as the prior of a request to localize in a scene; None without any.
+
+    Raises InvalidPrior.
+    """
+    if not request.priorPoses:
+        return None
+    where = f"priorPoses.{len(request.priorPoses) - 1}"
+    given, accuracy = request.priorPoses[-1].geopose, request.priorPoses[-1].accuracy
+    place, q = given.position, given.quaternion
+    quaternion = np.array([q.w, q.x, q.y, q.z])
+    # NaN fails the comparison; 1e-3, as for other poses.
+    if not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise InvalidPrior(
+            "must have length 1.", where=f"{where}.geopose.quaternion", hint='Example: {"x": 0, "y": 0, "z": 0, "w": 1}'
+        )
+    pose = pose_on_earth(anchor, np.array([place.lat, place.lon, place.h]), quaternion)
+    spread: dict[str, float] = {}
+    if accuracy:
+        metres = _metres_per_unit(anchor)
+        spread = {"sigma_deg": accuracy.orientation, "sigma_units": accuracy.position / metres}
+    return PriorIn(world_from_camera=pose.world_from_camera.tolist(), **spread)
+
+
+def _metres_per_unit(anchor: GeoAnchor) -> float:
+    # The determinant of a similarity is its scale cubed.
+    return float(np.cbrt(np.linalg.det(anchor.enu_from_world[:3, :3])))
+
+
 def nearest_scene(scenes: Sequence[SceneStatus], request: GeoPoseRequest) -> str:
     """Return the id of the scene to localize in. Raises NoGeoAnchor."""
     places = {s.id: s.info.geo_anchor for s in scenes if s.info and s.info.geo_anchor}
@@ -147,8 +214,7 @@ def response_of(request: GeoPoseRequest, result: Result, anchor: GeoAnchor) -> G
     accuracy = None
     if result.covariance is not None:
         variance = np.diag(np.array(result.covariance.matrix))
-        # Metres per scene unit: the determinant of a similarity is its scale cubed.
-        metres = float(np.cbrt(np.linalg.det(anchor.enu_from_world[:3, :3])))
+        metres = _metres_per_unit(anchor)
         accuracy = GeoPoseAccuracy(
             position=metres * float(np.sqrt(variance[3:].mean())),
             orientation=float(np.degrees(np.sqrt(variance[:3].mean()))),

@@ -33,7 +33,7 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
     try:
         return LocalizeFields.model_validate(values)
     except ValidationError as error:
-        where, message = field_and_message(error.errors())
+        where, message = field_and_message(error.errors(), LocalizeFields)
         raise FIELD_ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
 
 
@@ -46,6 +46,8 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
     options = options_from(estimator, fields.options)
     intrinsics = None if fields.intrinsics is None else checked_intrinsics(fields.intrinsics)
     prior, region = (None, None) if fields.prior is None else prior_from(fields.prior)
+    if prior is None and needs_prior(estimator):
+        raise InvalidPrior(f"'{estimator}' needs an approximate pose of the photo, and there is none.", where="prior")
     return JobSpec(
         estimator=estimator,
         scene=tuple(fields.scene) if isinstance(fields.scene, list) else fields.scene,
@@ -79,6 +81,11 @@ def options_from(estimator: str, values: Mapping[str, Any]) -> Any:
     except ValidationError as error:
         where, message = field_and_message(error.errors())
         raise InvalidOptions(message, where=f"options.{where}") from error
+
+
+def needs_prior(estimator: str) -> bool:
+    """Return whether an estimator refines a pose, and can't search for one. Raises UnknownName, BackendMissing."""
+    return getattr(ESTIMATORS.load(estimator), "NEEDS_PRIOR", False)
 
 
 _ADAPTERS: dict[type, TypeAdapter] = {}

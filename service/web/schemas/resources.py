@@ -24,7 +24,7 @@ from service.web.schemas.conversion import (
     region_out,
     result_out,
 )
-from service.web.schemas.job_spec import options_adapter
+from service.web.schemas.job_spec import needs_prior, options_adapter
 from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
 from service.web.schemas.scenes import SceneLinks, SceneOut, SceneSummary
 from service.web.schemas.system import Capabilities, Capability, EstimatorCapability
@@ -149,7 +149,7 @@ def capabilities(settings: Settings) -> Capabilities:
         matchers=plugins(MATCHERS, settings.matcher),
         rasterizers=plugins(RASTERIZERS, settings.rasterizer or choose_rasterizer()[0]),
         scene_formats=plugins(SCENE_FORMATS),
-        max_upload_bytes=settings.max_upload_bytes,
+        max_upload_bytes=settings.upload_limit,
         max_wait_s=settings.max_wait_s,
     )
 
@@ -162,7 +162,8 @@ def _estimator(plugin: Capability) -> EstimatorCapability:
         except Exception as error:  # any error of a plug-in's code; the others must still be listed
             reason = f"its Options have no JSON schema: {error}"
             plugin = plugin.model_copy(update={"available": False, "reason": reason})
-    return EstimatorCapability(**plugin.model_dump(), options_schema=schema)
+    needed = plugin.available and needs_prior(plugin.name)
+    return EstimatorCapability(**plugin.model_dump(), options_schema=schema, needs_prior=needed)
 
 
 def plugins(registry: PluginRegistry, default: str = "") -> list[Capability]:

@@ -24,6 +24,8 @@ class EstimatorCapability(Capability):
 
     options_schema: dict[str, Any] | None
     """JSON Schema of the request's `options`; null if the estimator can't run here."""
+    needs_prior: bool = False
+    """It refines an approximate pose: a request without `prior` is refused."""
 
 
 class Capabilities(Model):

@@ -12,6 +12,12 @@ export class Problem extends Error {
 
 const UNREACHABLE = { detail: "The service can't be reached.", hint: "Is it running?" };
 
+/** Return the error of an answer; where a key is needed, the page that asks for it is opened, once. */
+function refused(body, status) {
+  if (status === 401 && !location.hash.startsWith("#/key")) location.hash = `#/key?back=${encodeURIComponent(location.hash)}`;
+  return new Problem(body, status);
+}
+
 /** Return the service's answer. Raises Problem. */
 export async function send(path, init) {
   let response;
@@ -20,7 +26,7 @@ export async function send(path, init) {
   } catch {
     throw new Problem(UNREACHABLE, 0);
   }
-  if (!response.ok) throw new Problem(await response.json().catch(() => null), response.status);
+  if (!response.ok) throw refused(await response.json().catch(() => null), response.status);
   return response;
 }
 
@@ -85,7 +91,7 @@ export function follow(job, { onRecord, onRestart, onEnd, onLost, onBack, onRefu
 export function upload(path, form, onProgress, signal) {
   return new Promise((resolve, reject) => {
     const request = new XMLHttpRequest();  // fetch doesn't tell how much was sent
-    const refuse = problem => reject(new Problem(problem, request.status));
+    const refuse = problem => reject(refused(problem, request.status));
     request.open("POST", path);
     request.responseType = "json";
     request.upload.addEventListener("progress", event => onProgress(event.loaded / event.total));

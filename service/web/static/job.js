@@ -2,7 +2,6 @@
 
 import { ask, ENDED, follow } from "./api.js";
 import { h, say, seconds, sentence, words } from "./dom.js";
-import { askKey } from "./key.js";
 import { result } from "./result.js";
 import { recalled } from "./sent.js";
 
@@ -16,7 +15,7 @@ export function show(main, id) {
 }
 
 function refused({ main }, error) {
-  if (error.status === 401) return askKey();
+  if (error.status === 401) return;  // a form for the key is shown
   const title = error.status === 404 ? "Job not found" : "The job can't be shown";
   main.replaceChildren(h("h1", {}, title), h("p", { class: "trouble", role: "alert" }, error.message));
 }

@@ -5,12 +5,8 @@ import { h } from "./dom.js";
 
 const AFTER = /^viewer\/[\w/-]*$/;
 
-/** Show the form; afterwards go on with what was asked for. */
-export function askKey() {
-  location.hash = "#/key";
-}
-
-/** `query` is what follows `?` in the address: `then`, a page of the service, and `refused`, if a key was wrong. */
+/** `query` is what follows `?` in the address: `then`, a page of the service, or `back`, a view of
+ * this one, to go on with; `refused`, if a key was wrong. */
 export function show(main, query) {
   document.title = "API key – splatfix";
   const given = new URLSearchParams(query);
@@ -21,7 +17,7 @@ export function show(main, query) {
     h("p", { class: "buttons" }, key, h("button", { class: "primary" }, "Sign in")), trouble);
   form.addEventListener("submit", event => {
     event.preventDefault();
-    enter(key.value.trim(), given.get("then") ?? "").catch(error => {
+    enter(key.value.trim(), given.get("then") ?? "", given.get("back") ?? "").catch(error => {
       trouble.hidden = false;
       trouble.textContent = error.status === 401 ? "The key is not valid." : error.message;
       key.select();
@@ -31,10 +27,10 @@ export function show(main, query) {
   key.focus();
 }
 
-async function enter(key, then) {
+async function enter(key, then, back) {
   if (!/^[\x21-\x7e]+$/.test(key)) throw new Problem({ detail: "The key is not valid." }, 401);
   const answer = await send("tokens", { method: "POST", headers: { Authorization: `Bearer ${key}` } });
   // A token of some minutes: the page that it opens leaves the cookie, and takes it out of the address.
   const { token } = await answer.json();
-  location.href = `./${AFTER.test(then) ? then : ""}?token=${encodeURIComponent(token)}`;
+  location.href = `./${AFTER.test(then) ? then : ""}?token=${encodeURIComponent(token)}${back.startsWith("#/") ? back : ""}`;
 }

@@ -8,7 +8,7 @@ const NUMBERS = ["width", "height", "fx", "fy", "cx", "cy"];
 export class OptionsForm {
   constructor(capabilities) {
     this.estimators = capabilities.estimators.filter(estimator => estimator.available);
-    this.estimator = select(this.estimators.map(e => [e.name, e.default ? `${e.name} (default)` : e.name]),
+    this.estimator = select(this.estimators.map(e => [e.name, e.name + (e.default ? " (default)" : e.needs_prior ? " (needs a prior pose)" : "")]),
       this.estimators.find(e => e.default)?.name);
     this.estimator.addEventListener("change", () => this.#listOptions());
     this.seed = input({ type: "number", min: 0, step: 1, placeholder: "0" });

@@ -1,4 +1,4 @@
-// The answer of an ended job: photo and render blended, the pose in every convention, why, and what to take along.
+// The answer of an ended job: photo and render blended, the pose in every convention, why, and what to export.
 
 import { ask, asksForKey } from "./api.js";
 import { blend, blendSlider } from "./blend.js";
@@ -52,7 +52,7 @@ function pictures(job) {
   const pair = blend(photoOf(job), job.links.render, "The scene rendered at the pose", recalled(job.id)?.file);
   return [
     pair.element, blendSlider([pair]),
-    h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "See how it was found"),
+    h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Open in viewer"),
       h("a", { class: "button", href: photoOf(job), download: "" }, "Photo"),
       h("a", { class: "button", href: job.links.render, download: "" }, "Render")),
   ];
@@ -103,10 +103,10 @@ function taking(job) {
   const line = keyed => curlLine(sent?.fields ?? fieldsOf(job), sent?.file.name || job.photo.name || "photo.jpg", keyed);
   const curl = h("pre", { class: "curl", tabIndex: 0 }, line(false));
   asksForKey().then(asks => { curl.textContent = line(asks); });
-  return h("section", {}, h("h2", {}, "Take along"),
+  return h("section", {}, h("h2", {}, "Export"),
     h("p", { class: "buttons" }, file("JSON", job.links.self), file("Trace", job.links.trace),
       ...exports(job).map(([name, format]) => file(name, `${job.links.export}/${format}`))),
-    h("h3", {}, "This very request"),
+    h("h3", {}, "Repeat with curl"),
     h("div", { class: "poserow" }, curl, copyButton(() => curl.textContent, "the curl line")));
 }
 

@@ -4,7 +4,6 @@ import { ask } from "./api.js";
 import * as batch from "./batch.js";
 import { bytes, count, h, say, sentence } from "./dom.js";
 import { viewOf } from "./example.js";
-import { askKey } from "./key.js";
 import { OptionsForm } from "./options.js";
 import { sendingBox, sendPhoto } from "./sending.js";
 
@@ -53,7 +52,7 @@ export async function submit(files, known = {}) {
 
 /** Show an error: at its place in this view, above any other. */
 export function told(error) {
-  if (error.status === 401) return askKey();
+  if (error.status === 401) return;  // a form for the key is shown
   const line = alertLine ?? h("p", { class: "trouble", role: "alert" });
   if (!alertLine) document.querySelector("#main").prepend(line);
   line.textContent = error.message;
@@ -138,9 +137,9 @@ async function listScenes(place, timer, example) {
   try {
     ({ scenes } = await ask("scenes"));
   } catch (error) {
-    if (error.status === 401) askKey();
-    else place.replaceChildren(h("legend", {}, "Scene"), h("p", { class: "trouble", role: "alert" }, `${error.message} Trying again…`));
-    if (error.status !== 401) timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
+    if (error.status === 401) return;
+    place.replaceChildren(h("legend", {}, "Scene"), h("p", { class: "trouble", role: "alert" }, `${error.message} Trying again…`));
+    timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
     return;
   }
   const several = scenes.length > 1;
