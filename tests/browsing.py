@@ -58,7 +58,10 @@ def free_port() -> int:
 @contextmanager
 def served(app: FastAPI, port: int = 0) -> Iterator[str]:
     """Serve an app in a thread; gives its URL."""
-    config = uvicorn.Config(app, port=port, log_level="critical", ws="websockets-sansio", ws_max_size=2**26)
+    # Streams of open pages would keep it from ending.
+    config = uvicorn.Config(
+        app, port=port, log_level="critical", ws="websockets-sansio", ws_max_size=2**26, timeout_graceful_shutdown=1
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run)
     thread.start()

@@ -475,7 +475,10 @@ def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path:
     slow = {"estimator": "mc_do", "options": json.dumps({"hypotheses": 4096, "refinement_steps": 10000})}
     with served(create_app(settings), port) as url:
         until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
-        page = opened(browser, f"{url}/#/key", 1000, 700)
+        context = browser.new_context(viewport={"width": 1000, "height": 700})
+        page, viewer = context.new_page(), context.new_page()
+        page.bring_to_front()
+        page.goto(f"{url}/#/key")
         page.get_by_label("API key").fill(key)
         page.get_by_label("API key").press("Enter")
         page.get_by_role("radio").wait_for()
@@ -483,7 +486,7 @@ def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path:
         job = httpx.post(f"{url}/localize", data=slow, trust_env=False, timeout=90, **asked).json()
         page.goto(f"{url}/#/jobs/{job['id']}")
         expect(page.locator(".line")).to_contain_text("step ")
-        viewer = page.context.new_page()
+        viewer.bring_to_front()
         viewer.goto(f"{url}/viewer/jobs/{job['id']}/")
         viewer.get_by_text("running", exact=True).wait_for(timeout=PATIENCE_MS)
         viewer.evaluate("window.old = true")
@@ -505,8 +508,7 @@ def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path:
         assert len(stages) == len(set(stages))
         page.get_by_role("button", name="Cancel").click()
         page.locator(".badge.cancelled").wait_for()
-    viewer.close()
-    page.close()
+        context.close()
 
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
