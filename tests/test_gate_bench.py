@@ -94,6 +94,23 @@ def test_floors_set_by_hand_survive_a_fit(tmp_path: Path) -> None:
     assert "mistake a thing for a similar one" in read.set_by_hand[by_hand].reason
 
 
+def test_colours_count_unless_matches_and_gradients_support_another_light(tmp_path: Path) -> None:
+    right = sample("a", "clean", True, 0.97).signals
+    in_other_light = {**right, "colours": 0.1, "colours_half": 0.2, "local_colour_correlation": 0.4}
+    colours = ["colours", "colours_half", "local_colour_correlation"]
+    assert SHIPPED_MODEL.below_floor(in_other_light) == colours
+    assert SHIPPED_MODEL.below_floor(in_other_light, light_may_differ=True) == []
+    for name, value in {"inliers": 80.0, "inlier_share": 0.55, "inlier_spread": 0.45, "gradients_half": 0.88}.items():
+        assert SHIPPED_MODEL.below_floor({**in_other_light, name: value}, light_may_differ=True)[-3:] == colours
+    # Other doubts remain, and without matches there is no support.
+    assert SHIPPED_MODEL.below_floor({**in_other_light, "drift_px": 15.0}, light_may_differ=True) == ["drift_px"]
+    alone = {name: value for name, value in in_other_light.items() if not name.startswith("inlier")}
+    assert SHIPPED_MODEL.below_floor(alone, light_may_differ=True) == colours
+    # A fit keeps the rule, and so does its file.
+    write_model(fit_model(scene_samples("a", 4, np.random.default_rng(4)), SHIPPED_MODEL, {}), tmp_path / "m.json")
+    assert load_model(tmp_path / "m.json").other_light == SHIPPED_MODEL.other_light
+
+
 def test_a_photo_that_always_fails_moves_only_its_own_fold() -> None:
     """Were the test on the samples of the fit, the odd photo's right poses would lower the floors and pass."""
     rng = np.random.default_rng(3)

@@ -8,7 +8,7 @@ Floors are of right poses of photos spoilt within reason.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -106,7 +106,9 @@ def fit_model(samples: Sequence[Sample], shape: GateModel, data: Mapping[str, An
     ends |= {name: entry.floor for name, entry in shape.set_by_hand.items()}
     counts = {"poses": len(samples), "right": int(table.right.sum()), "doubted": int(table.doubted.sum())}
     fitted_on = {**data, **counts}
-    return GateModel(shape.scales, parts["with_matches"], parts["photometric"], ends, shape.set_by_hand, fitted_on)
+    return replace(
+        shape, with_matches=parts["with_matches"], photometric=parts["photometric"], floors=ends, fitted_on=fitted_on
+    )
 
 
 def summary(samples: Sequence[Sample], shape: GateModel) -> dict[str, Any]:

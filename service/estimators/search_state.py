@@ -178,8 +178,10 @@ class SearchState:
         images = self.images.corrected(found.correction)
         rendered, refinement = found.view_at_pose(images, self.renderer)
         # A pose refined from a prior has no matches behind it.
-        matches = found.num_inliers or 0
-        return verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, self.config.verification)
+        matches, unique = found.num_inliers or 0, not self.tools.prepared.repeats_itself
+        return verify(
+            images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, self.config.verification
+        )
 
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""

@@ -80,6 +80,7 @@ def verify(
     refinement: RefinementResult | None = None,
     pixels_may_decide: bool = False,
     supporting_matches: int = 0,
+    light_may_differ: bool = False,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
     """Return the verdict on a pose; `rendered` is a render with the photo's intrinsics there or within a pixel of it.
@@ -87,6 +88,8 @@ def verify(
     `refinement` is the refinement on that render that led to the pose, if one did: it saves a linearization. With
     `pixels_may_decide`, for a pose that something else supports already, no fresh matches are made if the signals of
     the pixels suffice; the verdict then reports the `supporting_matches` with a view that led to the pose.
+    `light_may_differ`: colours that disagree don't count where matches and gradients support the pose; not for a scene
+    that repeats itself, where colours tell similar things apart.
     """
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
@@ -99,7 +102,7 @@ def verify(
     few = len(features.scores) < config.min_features
     # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
-        return verdict_of(signals | NO_MATCHES, uncertainty, few, config)
+        return verdict_of(signals | NO_MATCHES, uncertainty, few, config=config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     if uncertainty and query.lens_prior is None:
@@ -107,7 +110,7 @@ def verify(
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
-    return _within_prior(verdict_of(signals, uncertainty, few, config), images, pose)
+    return _within_prior(verdict_of(signals, uncertainty, few, light_may_differ, config), images, pose)
 
 
 def _photometric_signals(
@@ -178,11 +181,12 @@ def verdict_of(
     signals: Mapping[str, float],
     uncertainty: PoseUncertainty | None,
     few_features: bool = False,
+    light_may_differ: bool = False,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
     """Return the verdict on a pose with these signals."""
     # The sum of the model could compensate for one bad signal; floors don't.
-    doubtful = config.model.below_floor(signals)
+    doubtful = config.model.below_floor(signals, light_may_differ)
     score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
     little = signals["coverage"] < config.min_coverage
     doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals, uncertainty, config)

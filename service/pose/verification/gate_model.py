@@ -3,6 +3,8 @@
 A logistic model without negative weights: each signal is mapped to 0..1 and cut off at both ends. Besides, each signal
 has a floor: below it a pose is in doubt, however good the other signals are, because a sum would compensate for one
 that is bad. `splatfix bench gate` fits weights and floors, and writes the file; floors that were set by hand it keeps.
+Where the scene may be lit otherwise than in its training photos, floors of colours don't hold if matches and gradients
+support the pose (`OtherLight`).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 MODEL_FILE = Path(__file__).with_name("model.json")
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,17 @@ class HandSetFloor:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherLight:
+    """When colours that disagree are taken for other light: evidence that doesn't depend on light is above floors."""
+
+    ignored: tuple[str, ...]
+    """Signals whose own floors then don't hold."""
+    floors: Mapping[str, float]
+    """Of the others, in the signals' units."""
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class GateModel:
     """Weights, floors and scales by the signals' names, and what they were fitted on."""
 
@@ -74,6 +87,8 @@ class GateModel:
     """In the signals' units; for a signal whose scale descends, a ceiling. Includes those that were set by hand."""
     set_by_hand: Mapping[str, HandSetFloor] = field(default_factory=dict)
     """Floors that a fit keeps, by the signals' names."""
+    other_light: OtherLight | None = None
+    """Kept by a fit, too; None: colours always count."""
     fitted_on: Mapping[str, Any] = field(default_factory=dict)
     """Scenes with their hashes and photos, and counts of right and wrong poses."""
 
@@ -84,13 +99,20 @@ class GateModel:
         logit = model.bias + sum(weight * self.scales[name](signals[name]) for name, weight in model.weights.items())
         return float(1.0 / (1.0 + np.exp(-logit)))
 
-    def below_floor(self, signals: Mapping[str, float]) -> list[str]:
-        """Return the names of the signals that are below their floors."""
-        return [
-            name
-            for name, value in signals.items()
-            if name in self.floors and self.scales[name](value) < self.scales[name](self.floors[name])
-        ]
+    def below_floor(self, signals: Mapping[str, float], light_may_differ: bool = False) -> list[str]:
+        """Return the names of the signals that are below their floors.
+
+        With `light_may_differ` those of colours don't count where the others support the pose (`OtherLight`).
+        """
+        below = self._below(signals, self.floors)
+        rule = self.other_light if light_may_differ else None
+        if rule is None or not below or not rule.floors.keys() <= signals.keys() or self._below(signals, rule.floors):
+            return below
+        return [name for name in below if name not in rule.ignored]
+
+    def _below(self, signals: Mapping[str, float], floors: Mapping[str, float]) -> list[str]:
+        scales = self.scales
+        return [n for n, value in signals.items() if n in floors and scales[n](value) < scales[n](floors[n])]
 
 
 def model_from_json(content: Mapping[str, Any]) -> GateModel:
@@ -98,12 +120,14 @@ def model_from_json(content: Mapping[str, Any]) -> GateModel:
     if content["version"] != FORMAT_VERSION:
         raise ValueError(f"the gate's model has version {content['version']}, this code reads {FORMAT_VERSION}")
     set_by_hand = {name: HandSetFloor(**entry) for name, entry in content["set_by_hand"].items()}
+    other = content["other_light"]
     return GateModel(
         scales=MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
         with_matches=_logistic(content["with_matches"]),
         photometric=_logistic(content["photometric"]),
         floors=MappingProxyType(content["floors"] | {name: entry.floor for name, entry in set_by_hand.items()}),
         set_by_hand=MappingProxyType(set_by_hand),
+        other_light=other and OtherLight(tuple(other["ignored"]), MappingProxyType(other["floors"]), other["reason"]),
         fitted_on=MappingProxyType(content["fitted_on"]),
     )
 
@@ -126,6 +150,12 @@ def model_to_json(model: GateModel) -> dict[str, Any]:
         # Each floor stands in one place only, so that the two can't contradict one another.
         "floors": {name: floor for name, floor in model.floors.items() if name not in model.set_by_hand},
         "set_by_hand": {name: asdict(entry) for name, entry in model.set_by_hand.items()},
+        "other_light": model.other_light
+        and {
+            "ignored": list(model.other_light.ignored),
+            "floors": dict(model.other_light.floors),
+            "reason": model.other_light.reason,
+        },
     }
 
 
