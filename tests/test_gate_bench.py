@@ -101,7 +101,8 @@ def test_colours_count_unless_matches_and_gradients_support_another_light(tmp_pa
     assert SHIPPED_MODEL.below_floor(in_other_light) == colours
     assert SHIPPED_MODEL.below_floor(in_other_light, light_may_differ=True) == []
     for name, value in {"inliers": 80.0, "inlier_share": 0.55, "inlier_spread": 0.45, "gradients_half": 0.88}.items():
-        assert SHIPPED_MODEL.below_floor({**in_other_light, name: value}, light_may_differ=True)[-3:] == colours
+        weaker = {**in_other_light, name: value}
+        assert set(SHIPPED_MODEL.below_floor(weaker, light_may_differ=True)) >= set(colours)
     # Other doubts remain, and without matches there is no support.
     assert SHIPPED_MODEL.below_floor({**in_other_light, "drift_px": 15.0}, light_may_differ=True) == ["drift_px"]
     alone = {name: value for name, value in in_other_light.items() if not name.startswith("inlier")}
