@@ -20,7 +20,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Package -> its floors, bottom to top: a module imports from the floors below its own, and from itself.
 FLOORS = {
     "service": [
-        {"types", "results", "errors", "plugins", "logs", "versions", "distortion", "client"},
+        {"types", "results", "errors", "plugins", "logs", "versions", "distortion", "client", "operating_system"},
         {"interfaces", "geometry", "jit", "photos"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators"},
@@ -99,6 +99,7 @@ WRAPPED = {
     "httpx": {"service/web/viewer_relay.py", "service/client.py"},
     "uvicorn": {"service/cli/server.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
+    "filelock": {"service/operating_system.py"},
     "typer": {"service/cli"},
     "rich": {"service/cli"},
     "viser": {"viewer"},
@@ -190,6 +191,22 @@ def test_jobs_know_scenes_through_the_engine_and_databases_through_the_store():
         if place.is_relative_to("service/jobs") and place.name != "embedded_engine.py":
             scenes = {module for module in modules if module.startswith("service.scene_manager")}
             assert scenes <= {"service.scene_manager.status"}, place
+
+
+def test_what_one_system_lacks_is_imported_in_one_file():
+    for path in SOURCES:
+        found = set(imported(path)) & {"fcntl", "resource", "pwd", "grp", "termios", "msvcrt", "winreg"}
+        assert not found or path == ROOT / "service/operating_system.py", f"{path} imports {found}"
+
+
+def test_texts_are_read_and_written_in_a_named_encoding():
+    """Windows has another one unless it is named."""
+    for path in SOURCES:
+        for call in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute):
+                named = [keyword.arg for keyword in call.keywords]
+                place = {"read_text": 0, "write_text": 1}.get(call.func.attr)
+                assert place is None or len(call.args) > place or "encoding" in named, f"{path}:{call.lineno}"
 
 
 def test_the_rules_can_fail():

@@ -14,7 +14,7 @@ import promql_parser
 import pytest
 import yaml
 
-from service.web import settings
+from service import operating_system
 
 ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"
@@ -169,9 +169,9 @@ def test_dashboard_and_alerts_ask_for_metrics_that_the_service_has(plugins):
 def test_workers_follow_the_containers_share_of_processors(text, expected, tmp_path, monkeypatch):
     quota = tmp_path / "cpu.max"
     quota.write_text(text)
-    monkeypatch.setattr(settings, "_CPU_QUOTA", quota)
-    monkeypatch.setattr(settings.os, "sched_getaffinity", lambda pid: set(range(64)), raising=False)
-    assert settings._cores() == expected
+    monkeypatch.setattr(operating_system, "_CPU_QUOTA", quota)
+    monkeypatch.setattr(operating_system.os, "sched_getaffinity", lambda pid: set(range(64)), raising=False)
+    assert operating_system.available_cores() == expected
 
 
 def test_nginx_takes_the_gateways_configuration(tmp_path):

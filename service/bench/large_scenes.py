@@ -92,9 +92,11 @@ def write_folder(scene: GaussianScene, folder: Path, source: Path, *, cameras: b
     # Without cameras the renderer couldn't know at which resolution the scene was trained.
     if scene.info.training_long_side_px:
         manifest["training_size"] = [scene.info.training_long_side_px, scene.info.training_long_side_px * 3 // 4]
-    (folder / MANIFEST).write_text(json.dumps(manifest))
+    (folder / MANIFEST).write_text(json.dumps(manifest), "utf-8")
     if cameras:
-        (folder / "transforms.json").write_text(json.dumps({"frames": [_frame(named) for named in scene.cameras]}))
+        (folder / "transforms.json").write_text(
+            json.dumps({"frames": [_frame(named) for named in scene.cameras]}), "utf-8"
+        )
     for name in ("truth.json", "photos"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name)

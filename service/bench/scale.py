@@ -163,5 +163,5 @@ def _outcomes(folder: Path, loaded: LoadedScene, units: Units) -> list[Outcome]:
 
 def process_memory() -> dict[str, int]:
     """Return the counters of /proc/self/status for this process, in bytes."""
-    found = re.findall(r"(\w+):\s+(\d+) kB", _STATUS.read_text())
+    found = re.findall(r"(\w+):\s+(\d+) kB", _STATUS.read_text("ascii"))
     return {name: 1024 * int(value) for name, value in found}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
+import sys
 
 import typer
 from rich.logging import RichHandler
@@ -34,6 +36,10 @@ def main() -> None:
     for library in ("OMP", "MKL", "OPENBLAS", "VECLIB_MAXIMUM"):
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
+    for stream in (sys.stdout, sys.stderr):
+        # A pipe or file has the system's encoding, on Windows one of 256 characters.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     handler = RichHandler(console=err, show_path=False) if err.is_terminal else logging.StreamHandler()
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s", handlers=[handler])
     try:

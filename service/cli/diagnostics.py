@@ -22,6 +22,7 @@ from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
+from service.operating_system import load_averages, missing_limits
 from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
 from service.pose.refinement.photometric import refine_photometric
 from service.render import RASTERIZERS
@@ -51,6 +52,7 @@ def findings() -> Iterator[Finding]:
         yield _tried(f"renderer {name}", partial(_try_renderer, name))
     yield _tried("matcher", _try_matcher)
     yield _package("pi-heif", "HEIC photos")
+    yield Finding("limits of decoders", not missing_limits(), missing_limits() or "memory and CPU time", needed=False)
     yield from plugin_findings()
     yield _package("viser", "the viewer")
     yield _gpu()
@@ -70,13 +72,13 @@ def compile_kernels() -> None:
 def processor() -> str:
     """Return the processor's name, cores, SIMD extensions and load, on which every timing depends."""
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
+    lines = info.read_text("utf-8").splitlines() if info.exists() else []
     # One block for each core: of the same keys, the last core's value stays.
     values = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
     flags = set(values.get("flags", values.get("Features", "")).split())
     simd = [name for name in ("avx512f", "avx512bw", "avx2", "fma", "asimd", "sve") if name in flags]
     model = values.get("model name", platform.processor() or platform.machine())
-    load = ", ".join(f"{value:.1f}" for value in os.getloadavg()) if hasattr(os, "getloadavg") else "unknown"
+    load = ", ".join(f"{value:.1f}" for value in load_averages()) or "unknown"
     return f"{model}, {os.cpu_count()} cores ({' '.join(simd) or 'no SIMD known'}), load {load}"
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from service.errors import PhotoGone, StorageFailed
+from service.operating_system import sync_folder
 
 
 @runtime_checkable
@@ -107,8 +108,4 @@ def write_durably(path: Path, data: bytes) -> None:
         # The file and then its entry in the folder: either alone may be lost with the power.
         file.flush()
         os.fsync(file.fileno())
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    sync_folder(path.parent)

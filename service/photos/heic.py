@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from service.operating_system import child_environment, limited_command
+
 _PROGRAM = Path(__file__).with_name("heic_decoder_process.py")
+_MEMORY_BYTES = 2 << 30
+"""64 megapixels take 1 GB: as stored, as RGB, and as output."""
+_CPU_S = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +32,8 @@ class DecodedHeic:
 
 def decode_heic(data: bytes, max_pixels: int, max_s: float) -> DecodedHeic:
     """Decode a photo within a time limit; of one with more pixels only the header. Raises ValueError."""
-    # -I and an almost empty environment: the process finds its libraries, and nothing of ours.
-    command = [sys.executable, "-I", str(_PROGRAM), str(max_pixels)]
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    command = limited_command(_PROGRAM, max_pixels, memory_bytes=_MEMORY_BYTES, cpu_s=_CPU_S)
+    kept = child_environment()
     try:
         output = subprocess.run(command, input=data, capture_output=True, timeout=max_s, check=True, env=kept).stdout
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:

@@ -9,29 +9,29 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import select
 import struct
 import subprocess
-import sys
 import tempfile
-import time
+import threading
 from collections.abc import Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from service.errors import InvalidImage
+from service.operating_system import child_environment, limited_command
 
 MAX_FRAME_PIXELS = 4096 * 2304
 """4K, of cinema and television."""
 MAX_EVERY = 1000
 """Frames that one request may skip between two: each is decoded all the same, within `_FRAME_S`."""
 _CHILD = Path(__file__).with_name("video_decoder_process.py")
+_MEMORY_BYTES = 2 << 30
+"""4K takes 0.6 GB, with the frames that later ones refer to."""
 _FRAME_S = 60
 """Wall time for one message; a thousand frames of 4K, of which the last one is wanted, take 20 s."""
 _STILL_BRANDS = (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1", b"avif", b"avis", b"jxl ")
@@ -84,19 +84,18 @@ def _messages(data: bytes, every: int) -> Generator[tuple[dict[str, Any], bytes]
     """Yield the decoder's messages; at least one. Raises InvalidImage."""
     if not is_video(data):
         raise InvalidImage("not an MP4, MOV, WebM, Matroska or AVI video.", where="photo")
-    child = [sys.executable, "-I", str(_CHILD), str(every), str(MAX_FRAME_PIXELS)]
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    child = limited_command(_CHILD, every, MAX_FRAME_PIXELS, memory_bytes=_MEMORY_BYTES)
     # A file, not a pipe: MP4 may have its index at the end.
     with tempfile.TemporaryFile() as file:
         file.write(data)
         file.seek(0)
         decoder = subprocess.Popen(
-            child, stdin=file, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=kept, bufsize=0
+            child, stdin=file, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=child_environment()
         )
     assert decoder.stdout is not None
     count = 0
     try:
-        while message := _message(decoder.stdout.fileno()):
+        while message := _message(decoder, decoder.stdout):
             if "end" in message[0]:
                 return
             if "error" in message[0]:
@@ -116,24 +115,18 @@ def _messages(data: bytes, every: int) -> Generator[tuple[dict[str, Any], bytes]
         )
 
 
-def _message(pipe: int) -> tuple[dict[str, Any], bytes] | None:
+def _message(decoder: subprocess.Popen[bytes], pipe: IO[bytes]) -> tuple[dict[str, Any], bytes] | None:
     """Return the next message; None at the end of the pipe: the decoder has crashed or takes too long."""
-    until = time.monotonic() + _FRAME_S
-    # Two lengths, big-endian, then JSON and pixels.
-    lengths = _read_exactly(pipe, 8, until)
-    line, pixels = (
-        (_read_exactly(pipe, length, until) for length in struct.unpack(">II", lengths)) if lengths else (b"", b"")
-    )
-    return None if lengths is None or line is None or pixels is None else (json.loads(line), pixels)
-
-
-def _read_exactly(pipe: int, count: int, until: float) -> bytes | None:
-    """Return `count` bytes; None if the pipe ends or time is up first."""
-    data = bytearray()
-    while len(data) < count:
-        ready = select.select([pipe], [], [], max(0.0, until - time.monotonic()))[0]
-        part = os.read(pipe, count - len(data)) if ready else b""
-        if not part:
+    # Ending the process ends the read: no system but Unix waits for a pipe with a deadline.
+    deadline = threading.Timer(_FRAME_S, decoder.kill)
+    deadline.start()
+    try:
+        # Two lengths, big-endian, then JSON and pixels.
+        lengths = pipe.read(8)
+        if len(lengths) < 8:
             return None
-        data += part
-    return bytes(data)
+        parts = [pipe.read(length) for length in struct.unpack(">II", lengths)]
+    finally:
+        deadline.cancel()
+    whole = sum(map(len, parts)) == sum(struct.unpack(">II", lengths))
+    return (json.loads(parts[0]), parts[1]) if whole else None

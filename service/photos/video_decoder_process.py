@@ -4,14 +4,14 @@
 
 Each message is two big-endian lengths of 4 bytes, JSON, and pixels (RGB, upright). The first one is of the video,
 {"frames"}, the others of each EVERYth frame, {"number", "time_s", "width", "height"}; {"end"} or {"error", "hint"} is
-the last one. With EVERY 0 no frame is decoded. Started by `video` only; imports nothing of the service.
+the last one. With EVERY 0 no frame is decoded. Started by `video` only, with a limit of its memory; imports nothing of
+the service.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import resource
 import struct
 import sys
 from collections.abc import Iterator
@@ -20,9 +20,6 @@ from typing import Any, BinaryIO, cast
 import cv2
 import numpy as np
 
-_MEMORY_BYTES = 2 << 30
-"""4K takes 0.6 GB, with the frames that later ones refer to."""
-
 
 class _Refused(Exception):
     """Two arguments: what is wrong, and what to do about it."""
@@ -30,8 +27,6 @@ class _Refused(Exception):
 
 def main() -> None:
     """Decode the file on stdin, which must be seekable, and write messages to stdout."""
-    for limit, value in ((resource.RLIMIT_AS, _MEMORY_BYTES), (resource.RLIMIT_CORE, 0)):
-        resource.setrlimit(limit, (value, value))
     out = sys.stdout.buffer
     try:
         for head, pixels in _decoded(sys.stdin.buffer, *map(int, sys.argv[1:])):

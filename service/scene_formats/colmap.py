@@ -86,7 +86,7 @@ def _binary_images(path: Path) -> list[_Image]:
 
 def _text_cameras(path: Path) -> dict[int, Intrinsics]:
     result = {}
-    for line in path.read_text("utf-8").splitlines():
+    for line in path.read_text("utf-8-sig").splitlines():
         if line.strip() and not line.startswith("#"):
             number, model, width, height, *parameters = line.split()
             result[int(number)] = _intrinsics(model, int(width), int(height), [float(p) for p in parameters])
@@ -95,7 +95,7 @@ def _text_cameras(path: Path) -> dict[int, Intrinsics]:
 
 def _text_images(path: Path) -> list[_Image]:
     """Parse images.txt: two lines an image; the second one, its points, may be empty."""
-    lines = [line for line in path.read_text("utf-8").splitlines() if not line.startswith("#")]
+    lines = [line for line in path.read_text("utf-8-sig").splitlines() if not line.startswith("#")]
     result = []
     for line in lines[::2]:
         if line.strip():

@@ -66,7 +66,7 @@ def read_json(path: Path) -> dict[str, Any]:
     if path.stat().st_size > MAX_JSON_BYTES:
         raise CorruptScene(f"larger than {MAX_JSON_BYTES} bytes.", where=path.name)
     try:
-        text = path.read_text("utf-8")
+        text = path.read_text("utf-8-sig")  # editors of Windows begin a file with a byte order mark
         data = json.loads(text)
         if "\\ud" in text.lower():  # half of a surrogate pair is no text that could be sent or stored
             json.dumps(data, ensure_ascii=False).encode()

@@ -8,7 +8,6 @@ paths of requests.
 from __future__ import annotations
 
 import asyncio
-import fcntl
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -31,6 +30,7 @@ from service.jobs.sqlite_lens_store import SqliteLensStore
 from service.jobs.sqlite_store import SqliteJobStore
 from service.lenses.lens_memory import LensMemory
 from service.matchers import MATCHERS
+from service.operating_system import locked
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.scene_store import FolderSceneStore, named_scenes
@@ -179,11 +179,9 @@ def data_folder(path: Path | None) -> Iterator[Path]:
     """Lock a folder for this process; None: a temporary one. Raises StorageFailed, also if it is locked."""
     with ExitStack() as stack:
         folder = path or Path(stack.enter_context(TemporaryDirectory(prefix="splatfix-")))
-        # The lock is released by the kernel, also when the process is killed.
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            lock = stack.enter_context((folder / "lock").open("w"))
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            stack.callback(locked(folder / "lock").release)
         except OSError as error:
             reason = "another process uses it" if isinstance(error, BlockingIOError) else error.strerror
             raise StorageFailed(

@@ -16,6 +16,7 @@ from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EngineConfig
 from service.jobs.read_photo import MAX_FRAMES
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
+from service.operating_system import available_cores
 
 _PREFIX = "SPLATFIX_"
 
@@ -27,19 +28,6 @@ CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
 
 _OTHER_VARIABLES = frozenset({"config", "plugins_dir", "weights_dir", "viewer_key", "key"})
 """Of the environment, in lower case: read elsewhere, or by the commands that we print."""
-
-_CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-
-
-def _cores() -> int:
-    """Count the processors that this process may use: its CPU affinity, within the CPU quota of its cgroup."""
-    # macOS has no affinities.
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    try:
-        quota, period = _CPU_QUOTA.read_text().split()
-    except (OSError, ValueError):
-        return cores
-    return cores if quota == "max" else max(1, min(cores, round(int(quota) / int(period))))
 
 
 def unknown_variables(environment: Mapping[str, str]) -> list[str]:
@@ -100,7 +88,7 @@ class Settings(BaseSettings):
     """Matcher of local features, for all scenes; some need weights in the folder SPLATFIX_WEIGHTS_DIR."""
     rasterizer: str | None = None
     """Renderer; None: a GPU renderer if this machine has a suitable GPU, else the CPU renderer."""
-    workers: int = Field(default_factory=_cores, ge=1)
+    workers: int = Field(default_factory=available_cores, ge=1)
     """Number of jobs that run at once, each on one thread."""
     queue_size: int = Field(default=32, ge=1)
     """Number of jobs that may be queued; further ones are refused with 503."""

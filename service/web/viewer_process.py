@@ -1,8 +1,8 @@
 """Runs the viewer as a child process for as long as the service runs.
 
-It is started as `python -m viewer --service URL --port N` on loopback, and exits by itself when its parent process is
-gone. After a crash it is started again, with a growing pause if it crashes repeatedly; browsers only lose their
-connection.
+It is started as `python -m viewer --service URL --port N` on loopback, and exits by itself when this process is gone,
+since its standard input ends then. After a crash it is started again, with a growing pause if it crashes repeatedly;
+browsers only lose their connection.
 """
 
 from __future__ import annotations
@@ -28,11 +28,13 @@ class ViewerChild:
     def __init__(self, service_url: str, key: str) -> None:
         """`key` is the viewer's API key. It is passed in the environment: other users can see a process's arguments."""
         # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
-        self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"SPLATFIX_VIEWER_KEY": key}
+        # It finds modules where this process does, and not (-P) in a working directory that has a `viewer` of its own.
+        self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ
+        self._environment |= {"SPLATFIX_VIEWER_KEY": key, "PYTHONPATH": os.pathsep.join(sys.path)}
         self.port = _free_port()
         self.run = ""
-        self.command = [sys.executable, "-m", "viewer", "--service", service_url]
-        self.command += ["--port", str(self.port), "--parent", str(os.getpid())]
+        self.command = [sys.executable, "-P", "-m", "viewer", "--service", service_url]
+        self.command += ["--port", str(self.port), "--end-with-stdin"]
 
     async def supervise(self) -> None:
         """Start the viewer, and start it again whenever it ends, until this is cancelled."""
@@ -47,9 +49,11 @@ class ViewerChild:
 
     async def _run_once(self) -> None:
         # The log goes to stderr. On stdout viser prints its own address, which users shouldn't open.
-        nothing = asyncio.subprocess.DEVNULL
         child = await asyncio.create_subprocess_exec(
-            *self.command, stdin=nothing, stdout=nothing, env=self._environment
+            *self.command,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.DEVNULL,
+            env=self._environment,
         )
         # Not the process id alone: after a restart in a container it may be the same.
         self.run = f"{child.pid}-{secrets.token_hex(4)}"
