@@ -1,0 +1,318 @@
+"""What a browser's session decides by itself: which view, which job, which buttons; with stand-ins for what it draws."""
+
+from __future__ import annotations
+
+import itertools
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import pytest
+from fake_service import PHOTO, orbit, records
+
+from service.types import Camera
+from viewer import job_display
+from viewer.action_queue import ActionQueue
+from viewer.controls import NEXT, PLAY, PREVIOUS, Controls
+from viewer.job_display import FOLLOW_AFTER_OPEN_S, JobDisplay
+from viewer.job_selection import JobSelection
+
+COUNTS = [0, 1, 3]
+
+
+class Clock:
+    """Time that passes only when a test says so."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(job_display, "time", clock)
+    return clock
+
+
+def display(count: int | None, *, shown: bool = False) -> JobDisplay:
+    """A display of a job with so many records, of which one has been shown or none; None: of no job."""
+    controls, scene, scene_display = Mock(), Mock(), Mock()
+    controls.speed.value = "2"
+    scene_display.show.return_value = False
+    stream = None
+    if count is not None:
+        job = Mock(outcome=None, truth=None, scene="ball", photo_step=None, photo=None)
+        job.camera = lambda record: record
+        stream = SimpleNamespace(id="j", attempt=1, records=records(count), job=job, error="")
+    found = JobDisplay(controls, scene, scene_display, Mock(), Mock())
+    found.stream = stream  # type: ignore[assignment]
+    found.step = Mock(empty=not shown)
+    return found
+
+
+# ------------------------------------------------------------------ whose the view is
+
+
+@pytest.mark.parametrize(
+    ("count", "shown", "late", "moves"),
+    [
+        (0, False, False, False),  # there is no pose yet
+        (0, False, True, False),
+        (3, False, False, True),
+        (3, False, True, True),  # the first record, however long it took
+        (3, True, False, True),
+        (3, True, True, False),  # later the view is the user's
+    ],
+)
+def test_the_view_follows_a_job_that_was_just_opened(
+    clock: Clock, count: int, shown: bool, late: bool, moves: bool
+) -> None:
+    job = display(count, shown=shown)
+    job._opened = clock.now
+    clock.now += FOLLOW_AFTER_OPEN_S + (0.01 if late else -0.01)
+    job.sync()
+    assert bool(job._scene.look_from_behind.called) is moves
+    if moves:
+        assert job._scene.look_from_behind.call_args.args == (job.stream.records[-1].pose,)
+
+
+def test_the_view_is_followed_for_two_seconds(clock: Clock) -> None:
+    """As long as docs and comments say; a scene that is shown first begins them anew."""
+    job = display(3, shown=True)
+    job._scene_display.show.return_value = True
+    job.sync()
+    job._scene_display.show.return_value = False
+    for seconds, follows in ((1.9, True), (2.1, False)):
+        job._scene.reset_mock()
+        clock.now = 100.0 + seconds
+        job.sync()
+        assert bool(job._scene.look_from_behind.called) is follows
+
+
+def test_a_view_that_the_user_chose_stays(clock: Clock) -> None:
+    for choose in (JobDisplay.fly_to_result, JobDisplay.look_through):
+        job = display(3, shown=True)
+        job._opened = clock.now
+        choose(job)
+        job.sync()
+        assert not job._scene.look_from_behind.called
+
+
+@pytest.mark.parametrize("count", [None, *COUNTS])
+def test_what_needs_a_record_does_nothing_without_one(clock: Clock, count: int | None) -> None:
+    job = display(count)
+    job.sync()
+    for act in (job.fly_to_result, job.look_through, job.redraw, job.tick, lambda: job.press(NEXT), lambda: job.go_to(7)):
+        act()
+    there = bool(count)
+    assert bool(job._scene.fly_to.called) is there
+    assert bool(job._scene.look_through.called) is there
+    assert bool(job.step.redraw.called) is there
+    assert bool(job.step.show.called) is there
+    if there:
+        assert job._scene.fly_to.call_args.args == (job.stream.records[-1].pose,)
+
+
+def test_a_job_that_has_not_answered_shows_its_headline_alone(clock: Clock) -> None:
+    job = display(2)
+    job.stream.job = None
+    job.sync()
+    assert job._controls.headline.content
+    assert not job._scene_display.show.called
+    assert not job.step.show.called
+
+
+# ------------------------------------------------------------------ the player
+
+
+def test_buttons_step_and_play(clock: Clock) -> None:
+    job = display(3)
+    job.sync()  # live: the newest
+
+    def shown() -> int:
+        return job.step.show.call_args.args[1]
+
+    for button, index in ((PREVIOUS, 1), (PREVIOUS, 0), (PREVIOUS, 0), (NEXT, 1)):
+        job.press(button)
+        assert shown() == index
+        assert job.tick_in_s is None
+    job.press(PLAY)
+    clock.now = 200.0
+    job.tick()
+    assert shown() == 2
+    assert job.tick_in_s is None  # at the end
+    job.press(PLAY)  # from the start
+    assert shown() == 0
+    job.tick()
+    clock.now += 0.2
+    assert job.tick_in_s == pytest.approx(0.3)  # two a second
+    clock.now += 5
+    assert job.tick_in_s == 0
+    job.go_to(0)
+    assert job.tick_in_s is None
+
+
+def test_another_job_begins_anew(clock: Clock) -> None:
+    job = display(3)
+    job.sync()
+    before = job.stream
+    job.open("other")
+    assert job._streams.leave.call_args.args == (before, job._on_change)
+    assert job.stream is job._streams.follow.return_value
+    assert job.step.clear.called
+    assert job._on_change.called  # its records may be there already
+    job.leave()
+    assert job.stream is None
+    job.tick()  # of no job: nothing is shown
+
+
+def test_a_click_jumps_looks_or_does_nothing(clock: Clock) -> None:
+    camera = Camera(PHOTO, orbit(0))
+    for target, index, looks in ((1, 1, False), (0, 0, False), (camera, None, True), (None, None, False)):
+        job = display(3)
+        job.sync()
+        job.step.reset_mock()
+        job._scene.hit.return_value = target
+        job.click((0, 0, 0), (0, 0, 1))
+        assert (job.step.show.call_args.args[1] if job.step.show.called else None) == index
+        assert bool(job._scene.look_through.called) is looks
+
+
+# ------------------------------------------------------------------ which buttons there are
+
+
+def controls() -> Controls:
+    found: Any = object.__new__(Controls)
+    for name in ("step", "look_through", "fly", "replay"):
+        setattr(found, name, SimpleNamespace(disabled=True, max=0, label="save"))
+    found.window, found.saving_replay = SimpleNamespace(visible=True), False
+    return found
+
+
+@pytest.mark.parametrize(("count", "saving"), [*itertools.product(COUNTS, [False, True])])
+def test_buttons_are_there_for_what_can_be_done(count: int, saving: bool) -> None:
+    for saving_first in (False, True):  # in either order
+        found = controls()
+        if saving_first:
+            found.set_saving_replay(saving)
+        found.set_step_count(count)
+        if not saving_first:
+            found.set_saving_replay(saving)
+        assert found.step.disabled is found.look_through.disabled is found.fly.disabled is (count == 0)
+        assert found.replay.disabled is (count == 0 or saving)
+        assert found.step.max == max(0, count - 1)
+        assert found.window.visible is (count > 0)
+        assert ("making" in found.replay.label) is saving
+        if saving:  # and it can be saved again afterwards
+            found.set_saving_replay(False)
+            assert found.replay.disabled is (count == 0)
+
+
+def test_a_window_without_images_stays_hidden() -> None:
+    found = controls()
+    found.window.visible = False
+    found.set_step_count(3)
+    assert not found.window.visible
+
+
+# ------------------------------------------------------------------ which job is shown
+
+
+def listed(*names: str) -> tuple[Any, ...]:
+    return tuple(Mock(id=name, photo=f"{name}.jpg", status="running", outcome=None) for name in names)
+
+
+def selection(
+    jobs: tuple[Any, ...] | None, *, asked: str | None = None, shown: str | None = None, scene: str | None = None
+) -> JobSelection:
+    lists = SimpleNamespace(jobs=jobs, scenes=("ball", "copy"))
+    job = Mock(stream=None if shown is None else SimpleNamespace(id=shown))
+    job.open.side_effect = lambda id: setattr(job, "stream", SimpleNamespace(id=id))
+    job.leave.side_effect = lambda: setattr(job, "stream", None)
+    return JobSelection(Mock(), lists, job, Mock(scene_id=scene), asked)  # type: ignore[arg-type]
+
+
+@pytest.fixture(autouse=True)
+def _labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("viewer.job_selection.job_label", lambda job: f"job {job.id}")
+
+
+@pytest.mark.parametrize(
+    ("jobs", "asked", "shown", "scene", "opened", "first_scene"),
+    [
+        (None, None, None, None, None, None),  # nothing is known yet
+        ((), None, None, None, None, "ball"),
+        ((), None, None, "copy", None, None),  # a scene is shown already
+        (("b", "a"), None, None, None, "b", None),
+        (("b", "a"), None, "b", "ball", None, None),
+        (("c", "b"), None, "b", "ball", "c", None),
+        (("b", "a"), "a", None, None, "a", None),
+        (("b", "a"), "a", "a", "ball", None, None),
+        (("b", "a"), "gone", None, None, "gone", None),
+        (None, "a", None, None, "a", None),
+    ],
+)
+def test_the_job_that_was_asked_for_is_opened_or_the_newest(
+    jobs: tuple[str, ...] | None,
+    asked: str | None,
+    shown: str | None,
+    scene: str | None,
+    opened: str | None,
+    first_scene: str | None,
+) -> None:
+    found = selection(None if jobs is None else listed(*jobs), asked=asked, shown=shown, scene=scene)
+    assert found._controls.newest.value is (asked is None)
+    found.sync()
+    assert (found._job.open.call_args.args[0] if found._job.open.called else None) == opened
+    assert (found._scene.show.call_args.args[0] if found._scene.show.called else None) == first_scene
+    current = opened or shown
+    if jobs and current in jobs:
+        assert found._controls.jobs.value == f"job {current}"
+        assert found._controls.jobs.options == tuple(f"job {name}" for name in jobs)
+    else:
+        assert isinstance(found._controls.jobs.value, Mock)  # unchanged
+
+
+def test_a_chosen_job_or_scene_ends_following() -> None:
+    found = selection(listed("b", "a"), shown="b", scene="ball")
+    found.choose_job("job unknown")
+    assert not found._job.open.called
+    found.choose_job("job a")
+    assert found._job.open.call_args.args == ("a",)
+    assert found._controls.newest.value is False
+    found.choose_newest(True)
+    assert found._job.open.call_args.args == ("b",)
+    found.choose_newest(False)
+    found._lists.jobs = listed("c", "b")
+    found.sync()
+    assert found._job.stream.id == "b"
+    found.choose_scene("ball")  # the one that is shown
+    assert not found._job.leave.called
+    found.choose_scene("copy")
+    assert found._job.leave.called
+    assert found._controls.set_step_count.call_args.args == (0,)
+    assert found._scene.show.call_args.args == ("copy", None)
+    found.sync()
+    assert found._job.stream is None
+    assert found._controls.newest.value is False
+
+
+# ------------------------------------------------------------------ actions
+
+
+def test_actions_run_in_order_and_the_last_of_a_key_wins() -> None:
+    queue, done = ActionQueue(), []
+    for name, key in (("a", "x"), ("b", "y"), ("c", "x")):
+        queue.post(lambda name=name: done.append(name), key)
+    for action in queue.take(0) or []:
+        action()
+    assert done == ["c", "b"]
+    assert queue.take(0) == []
+    assert not queue.closed
+    queue.post(done.clear)
+    queue.close()
+    assert queue.closed
+    assert queue.take(None) is None
