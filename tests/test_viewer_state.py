@@ -1,4 +1,4 @@
-"""What a browser's session decides by itself: which view, which job, which buttons; with stand-ins for what it draws."""
+"""What a browser's session decides by itself: view, job, buttons; with stand-ins for what it draws."""
 
 from __future__ import annotations
 
@@ -105,8 +105,10 @@ def test_a_view_that_the_user_chose_stays(clock: Clock) -> None:
 def test_what_needs_a_record_does_nothing_without_one(clock: Clock, count: int | None) -> None:
     job = display(count)
     job.sync()
-    for act in (job.fly_to_result, job.look_through, job.redraw, job.tick, lambda: job.press(NEXT), lambda: job.go_to(7)):
+    for act in (job.fly_to_result, job.look_through, job.redraw, job.tick):
         act()
+    job.press(NEXT)
+    job.go_to(7)
     there = bool(count)
     assert bool(job._scene.fly_to.called) is there
     assert bool(job._scene.look_through.called) is there
@@ -123,6 +125,20 @@ def test_a_job_that_has_not_answered_shows_its_headline_alone(clock: Clock) -> N
     assert job._controls.headline.content
     assert not job._scene_display.show.called
     assert not job.step.show.called
+
+
+@pytest.mark.parametrize("true", [False, True])
+def test_all_of_a_job_is_shown_as_it_arrives(clock: Clock, true: bool) -> None:
+    job = display(3)
+    job.stream.job.truth = orbit(0) if true else None
+    job.sync()
+    assert ("true" in job._controls.legend.content) is true
+    assert job._controls.set_step_count.call_args.args == (3,)
+    assert job._scene.trajectory.show.call_args.args == (job.stream.records, job.stream.job)
+    assert job.step.show.call_args.args == (job.stream, 2)
+    job.set_mode("flicker")
+    assert job.step.set_mode.call_args.args == ("flicker",)
+    assert job.step.redraw.call_args.args == (job.stream, 2)
 
 
 # ------------------------------------------------------------------ the player
