@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from service.bench import localize as bench
+from service.bench import modifications
 from service.bench import render as render_bench
 from service.bench.bench_photos import find_photos, prepare_photo
 from service.bench.miss_images import save_miss_images
@@ -457,6 +458,13 @@ class TestModifications:
         assert np.allclose(modify(red, ["saturation=0"], rng).rgb, 0.299 * 0.4, atol=1e-6)
         assert np.allclose(modify(red, ["saturation=0.5"], rng).rgb[0, 0], [0.2598, 0.0598, 0.0598], atol=1e-6)
         assert np.allclose(modify(original, ["jpeg=80"], rng).rgb, 0.4, atol=0.01)
+
+    def test_samples_on_and_beyond_the_edge_are_black(self):
+        white = np.ones((4, 6, 3), np.float32)
+        x, y = np.meshgrid([0.0, 1e-6, 3.0, 6 - 1e-6, 6.0], [0.0, 1e-6, 2.0, 4 - 1e-6, 4.0])
+        expected = np.zeros((5, 5))
+        expected[1:4, 1:4] = 1
+        assert np.array_equal(modifications._sample(white, x, y)[..., 0], expected)
 
     def test_blur_has_its_width(self):
         """A bright point becomes a Gaussian of the given sigma, in pixels of a photo 800 wide."""

@@ -187,6 +187,18 @@ def test_unknown_part(room):
         gpu.run(room, names=["speed"])
 
 
+@pytest.mark.parametrize("facts", [None, {"commit": "abc"}])
+def test_facts_of_a_run_are_in_its_outcome_and_the_machine_in_every_run(facts, tmp_path, monkeypatch):
+    def outcome_of(parts, setup, *, facts, **options):
+        return {"parts": [part.name for part in parts], "facts": facts, "setup": setup}
+
+    monkeypatch.setattr(gpu, "run_parts", outcome_of)
+    found = gpu.run(tmp_path / "room", renderer="cpu", small=True, names=["index"], facts=facts)
+    assert found["facts"] == {**(facts or {}), "scene": "room", "renderer": "cpu", "small": True}
+    assert found["parts"] == ["machine", "index"]
+    assert len(gpu.run(tmp_path / "room")["parts"]) == len(gpu.PARTS)
+
+
 def test_a_result_that_is_none(tmp_path):
     (tmp_path / "x.json").write_text('{"parts": []}')
     done = CliRunner().invoke(app, ["bench", "gpu", "--table-of", str(tmp_path / "x.json")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
 from service.pose.retrieval.free_space import _steps_in_the_clear, free_space_of
 from service.pose.retrieval.index import built_index
-from service.pose.retrieval.lod_proxy import LOD, LodConfig, lod_proxy, occlusion_depths
+from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer, lod_proxy, occlusion_depths
 from service.pose.retrieval.view_placement import (
     PlacementConfig,
     _Views,
@@ -199,6 +200,36 @@ def test_a_thinned_scene_is_as_closed_and_as_far() -> None:
     a, b = whole.render([camera])[0], thin.render([camera])[0]
     assert b.alpha.mean() > 0.95 * a.alpha.mean()
     assert np.median(np.abs(a.median_depth - b.median_depth) / a.median_depth) < 0.08
+
+
+@pytest.mark.parametrize(("count", "simplified"), [(500_000, False), (500_001, True)])
+def test_only_scenes_of_more_than_half_a_million_gaussians_are_simplified(count: int, simplified: bool) -> None:
+    """As docs/results/scale.md says, by 200,000 of them; a stand-in for the renderer notes what it is given."""
+    one = blobs(np.zeros((1, 3)), 0.01)
+    names = ("means", "quats", "scales", "opacities", "sh")
+    many = {name: np.broadcast_to(getattr(one, name), (count, *getattr(one, name).shape[1:])) for name in names}
+    made, rendered = [], []
+
+    class Noting:
+        def of(self, scene: GaussianScene) -> Noting:
+            made.append(scene.count)
+            return self
+
+        def render(self, cameras: list[Camera], **options: object) -> list[Frame]:
+            rendered.append((cameras[0].intrinsics.long_side, options.get("occlusion_depths") is not None))
+            shape = cameras[0].intrinsics.height, cameras[0].intrinsics.width
+            return [Frame(np.zeros((*shape, 3), np.float32), *3 * [np.ones(shape, np.float32)])]
+
+    renderer: Any = Noting()
+    scene = replace(one, **many)
+    pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    OccludedRenderer(scene, renderer, np.random.default_rng(0)).render(Camera(search_camera(160), pose))
+    if simplified:
+        assert made == [pytest.approx(200_000, rel=0.01)]
+        assert rendered == [(64, False), (160, True)]
+    else:
+        assert made == []
+        assert rendered == [(160, False)]
 
 
 def test_a_horizon_lies_behind_what_hides_and_nowhere_where_one_sees_through() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tracemalloc
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 import reference_renderer as reference
 import torch
+from test_documented_numbers import numbers, rows_of
 
 from service.geometry import look_at, moved, se3_exp
 from service.interfaces import Frame, Rasterizer
+from service.localize import LoadedScene
 from service.render import RASTERIZERS
 from service.render.cpu import CpuRasterizer, dilation_for
 from service.render.gsplat_cuda import GsplatRasterizer
@@ -314,6 +317,32 @@ def test_dilation_follows_the_render_size():
     long = camera.intrinsics.long_side
     unknown = replace(INFO, training_focal_px=None, training_long_side_px=4 * long)
     assert dilation_for(camera, unknown) == pytest.approx(0.3 / 16)
+
+
+def test_a_scene_of_unknown_resolution_counts_as_trained_at_a_thousand_pixels():
+    camera = make_camera(500, 400)
+    assert dilation_for(camera, replace(INFO, training_focal_px=None)) == pytest.approx(0.3 / 4)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_a_gaussian_takes_the_documented_memory(degree):
+    """The table in docs/deploy.md, and what the allocator says."""
+    scene = make_scene(64 * 256, degree)
+    (said,) = [
+        row[1]
+        for row in rows_of("deploy.md", "what | needs")
+        if row[0].startswith("a Gaussian") and row[0].endswith(f"SH degree {degree}")
+    ]
+    in_scene, packed = numbers(said)
+    assert scene.nbytes == in_scene * scene.count
+    CpuRasterizer(make_scene(10, degree))  # what is kept from the first one on
+    tracemalloc.start()
+    renderer = CpuRasterizer(scene)
+    allocated, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert renderer.nbytes == pytest.approx(packed * scene.count, rel=0.005)  # and a sphere for each block
+    assert renderer.nbytes == pytest.approx(allocated, rel=0.01)
+    assert LoadedScene.of(scene, rasterizer="cpu").nbytes == pytest.approx((in_scene + packed) * scene.count, rel=0.005)
 
 
 def test_trained_at_another_size_is_that_scene_in_the_same_memory(create):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,16 @@ import pytest
 from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
-from service.geometry import pose_distance
+from service.geometry import moved, pose_distance, project, transformed
+from service.interfaces import Features, Matcher
 from service.jobs.model import JobResult
 from service.localize import LoadedScene, Request, localize
+from service.pose.features.rendered_views import View
+from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
 from service.pose.verification.ambiguity import rank_answers
 from service.results import Reason, StageTiming, Status
 from service.tracking import Tracker
-from service.types import Pose
+from service.types import Camera, Intrinsics, Pose
 from service.web.schemas.conversion import result_out
 
 
@@ -75,3 +79,131 @@ def test_answers_are_ranked_by_what_they_leave_unexplained() -> None:
     assert [number for number, _ in ranked] == [1, 0]
     assert [probability for _, probability in ranked] == pytest.approx([0.619, 0.380], abs=0.001)
     assert [number for number, _ in rank_answers([0.02, 0.04])] == [0]
+
+
+# ------------------------------------------------------------------ which hypotheses are looked for
+
+CAMERA = Intrinsics(800, 600, 700.0, 700.0, 400.0, 300.0)
+ANSWER = Pose(np.eye(4))
+
+
+class ByNumber(Matcher):
+    """Matches features whose descriptors are the same number."""
+
+    name = "by number"
+
+    def extract(self, rgb: np.ndarray, limit: int) -> Features:
+        raise NotImplementedError
+
+    def match(self, a: Features, b: Features) -> np.ndarray:
+        pairs = np.nonzero(a.descriptors == b.descriptors.T)
+        return np.stack(pairs, 1).astype(np.int32)
+
+
+def shifted(by: float) -> Pose:
+    return moved(ANSWER, np.array([0, 0, 0, by, 0, 0]))
+
+
+def planted(sizes: Sequence[int], views: Sequence[Pose]) -> tuple[Features, list[View], list[Pose]]:
+    """A photo of so many points for each of some poses, all seen by each of some views with strengths in their order.
+
+    The points lie about 6 units ahead; pose k is k + 1 units beside the answer.
+    """
+    rng = np.random.default_rng(0)
+    poses = [shifted(k + 1.0) for k in range(len(sizes))]
+    in_camera = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (sum(sizes), 3))
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    points = np.stack(
+        [transformed(poses[k].world_from_camera, p[None])[0] for k, p in zip(owner, in_camera, strict=True)]
+    )
+    px = project(in_camera, CAMERA).astype(np.float32)
+    strengths = np.linspace(1, 0.5, len(px), dtype=np.float32)
+    photo = Features(px, strengths, np.arange(len(px), dtype=np.float32)[:, None])
+    return photo, [View(Camera(CAMERA, pose), photo, points.astype(np.float32)) for pose in views], poses
+
+
+def hypotheses(photo: Features, views: list[View], min_inliers: int = 15, **changed: float) -> list[int]:
+    """Return the numbers of inliers of what is found; the views are alike the photo in their order."""
+    scores = np.linspace(1, 0, len(views))
+    answer = PoseAtDistance(ANSWER, 6.0)
+    config = replace(AMBIGUITY, **changed)
+    found = ambiguous_hypotheses(photo, CAMERA, answer, views, scores, ByNumber(), 4.0, min_inliers, config)
+    return [each.num_inliers for each in found]
+
+
+def test_at_most_three_hypotheses_are_looked_for_the_largest_first() -> None:
+    photo, views, _ = planted([60, 50, 40, 30, 20], [shifted(5.0)])
+    assert hypotheses(photo, views) == [60, 50, 40]
+    assert hypotheses(photo, views, max_hypotheses=9) == [60, 50, 40, 30, 20]
+
+
+@pytest.mark.parametrize(("agree", "found"), [(15, [15]), (14, [])])
+def test_a_hypothesis_needs_as_many_matches_as_are_asked_for(agree: int, found: list[int]) -> None:
+    photo, views, _ = planted([agree], [shifted(5.0)])
+    assert hypotheses(photo, views) == found
+
+
+@pytest.mark.parametrize(("place", "found"), [(5, [40]), (6, [])])
+def test_six_views_from_elsewhere_are_matched(place: int, found: list[int]) -> None:
+    photo, (full,), _ = planted([40], [shifted(5.0)])
+    empty = View(full.camera, Features(*(part[:0] for part in (photo.points_px, photo.scores, photo.descriptors))),
+                 full.points_in_world[:0])  # fmt: skip
+    assert hypotheses(photo, [full if k == place else empty for k in range(8)]) == found
+
+
+def test_views_that_show_what_the_answer_shows_are_none_from_elsewhere() -> None:
+    """Within 25 degrees, and within 0.35 of the distance to what they see, 6 units or so."""
+
+    def turned(degrees: float, by: float) -> Pose:
+        return moved(ANSWER, np.array([0, np.radians(degrees), 0, by, 0, 0]))
+
+    for pose, elsewhere in ((turned(24, 0), False), (turned(26, 0), True)):
+        photo, views, _ = planted([40], [pose])
+        assert bool(hypotheses(photo, views)) is elsewhere
+    photo, (view,), _ = planted([40], [ANSWER])
+    distances = np.linalg.norm(view.points_in_world[::8] - view.camera.pose.position_in_world, axis=1)
+    for share, elsewhere in ((0.30, False), (0.42, True)):
+        # The distance is measured from the view, which moves across what it sees.
+        views = [replace(view, camera=Camera(CAMERA, shifted(-share * float(np.median(distances)))))]
+        assert bool(hypotheses(photo, views)) is elsewhere
+
+
+@pytest.mark.parametrize(("place", "found"), [(0, [20]), (380, [20]), (400, [])])
+def test_the_four_hundred_strongest_features_are_matched(place: int, found: list[int]) -> None:
+    photo, (view,), _ = planted([20], [shifted(5.0)])
+    rng = np.random.default_rng(1)
+    # Others, which agree with nothing, as strong as their place.
+    count = 600
+    px = rng.uniform(0, 600, (count, 2)).astype(np.float32)
+    numbers = np.arange(1000, 1000 + count, dtype=np.float32)[:, None]
+    points = rng.uniform(-9, 9, (count, 3)).astype(np.float32)
+
+    def joined(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.concatenate([b[:place], a, b[place:]])
+
+    strengths = np.linspace(1, 0.1, count + 20, dtype=np.float32)
+    photo = Features(joined(photo.points_px, px), strengths, joined(photo.descriptors, numbers))
+    seen = Features(photo.points_px, strengths, joined(view.features.descriptors, -numbers))
+    view = View(view.camera, seen, joined(view.points_in_world, points))
+    assert hypotheses(photo, [view]) == found
+
+
+def test_what_the_answer_nearly_explains_is_no_evidence() -> None:
+    """Within three times an inlier's error, 4 px."""
+    photo, views, _ = planted([40], [shifted(5.0)])
+    for error_px, found in ((11.0, []), (13.0, [40])):
+        in_photo = project(views[0].points_in_world.astype(float), CAMERA)
+        near = replace(photo, points_px=(in_photo + np.array([error_px, 0])).astype(np.float32))
+        # All are off by as much to the same side: another pose explains them exactly.
+        assert hypotheses(near, views, distinct_deg=0.0, distinct_share=0.0) == found
+
+
+@pytest.mark.parametrize(
+    ("degrees", "units", "differs"),
+    [(4.9, 0, False), (5.1, 0, True), (0, 0.019 * 6, False), (0, 0.021 * 6, True)],
+)
+def test_poses_are_different_answers_beyond_five_degrees_or_a_fiftieth_of_the_distance(
+    degrees: float, units: float, differs: bool
+) -> None:
+    other = moved(ANSWER, np.array([0, np.radians(degrees), 0, units, 0, 0]))
+    assert PoseAtDistance(ANSWER, 6.0).differs_from(other) is differs

@@ -556,6 +556,18 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
     assert stopped.is_set()
 
 
+def test_a_viewer_that_stops_takes_leave_of_its_browsers(fake: FakeService) -> None:
+    """viser reports them as gone while it stops, which ends their sessions."""
+    viewer, gone = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0), threading.Event()
+    viewer.server.on_client_disconnect(lambda client: gone.set())
+    with _browser(viewer) as browser:
+        browser.wait(lambda: "no job" in browser.text(), "the page")
+        viewer.stop()
+        assert gone.is_set()
+        assert not viewer.server.get_clients()
+        assert not viewer._sessions
+
+
 def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     with pytest.raises(OSError, match="is taken"):
         Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", viewer.server.get_port())

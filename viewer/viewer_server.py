@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import re
 import threading
-import time
 
 import viser
 
 from service.client import Client
 from viewer.browser_session import BrowserSession
 from viewer.shared_data import SharedData
-from viewer.viser_internals import disable_public_tunnels, disconnect_all, requested_path
+from viewer.viser_internals import disable_public_tunnels, requested_path
 
 log = logging.getLogger(__name__)
 
@@ -47,11 +46,6 @@ class Viewer:
         for session in sessions:
             session.close()
         self._shared.close()
-        disconnect_all(self.server)
-        # The sessions end when their clients disconnect, which a stopped server no longer reports.
-        deadline = time.monotonic() + 1.0
-        while self.server.get_clients() and time.monotonic() < deadline:
-            time.sleep(0.01)
         self.server.stop()
 
     def _open(self, client: viser.ClientHandle) -> None:

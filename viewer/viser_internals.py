@@ -28,8 +28,3 @@ def disable_public_tunnels(server: viser.ViserServer) -> None:
     if handlers.pop(_messages.ShareUrlRequest, None) is None:
         server.stop()
         raise RuntimeError("this version of viser may open public tunnels: its handler was not found")
-
-
-def disconnect_all(server: viser.ViserServer) -> None:
-    """Close all connections; viser's stop() leaves them to callbacks that it has already disabled."""
-    server._websock_server.disconnect_all_clients()

@@ -1,0 +1,214 @@
+"""Numbers that documents state are those of the program: seen in what it does, just inside and just outside of them."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+from api_server import ROOT
+from PIL import Image
+from test_bench import poses
+
+from service.bench.bench_photos import BenchPhoto
+from service.bench.datasets import LAYOUTS
+from service.bench.field_queries import FieldQuery, decoded, send
+from service.bench.field_random import random_row
+from service.bench.field_rows import TOLD, Row
+from service.bench.gpu import LIMIT_S, PARTS
+from service.bench.gpu_shared import FULL
+from service.bench.modifications import MODIFICATIONS, require_modifications
+from service.bench.paper.plan import MAIN, cells
+from service.bench.pose_metrics import Units
+from service.bench.scene_modifications import SCENE_MODIFICATIONS, require_scene_modifications
+from service.bench.start_poses import start_pose
+from service.errors import InvalidOptions
+from service.geometry import pose_distance
+from service.jobs.config import JobsConfig
+from service.types import LENS_PRIORS, Camera, Intrinsics
+from service.web.settings import Settings
+
+LENS = Intrinsics(240, 180, 200.0, 204.0, 124.0, 86.0)
+
+
+def rows_of(document: str, header: str) -> Iterator[list[str]]:
+    """Yield the cells of a document's table whose header begins like this."""
+    text = (ROOT / "docs" / document).read_text("utf-8")
+    _, _, table = text.partition(f"\n| {header}")
+    for line in table.split("\n\n")[0].splitlines()[2:]:
+        yield [cell.strip() for cell in line.strip("|").split(" | ")]
+
+
+def numbers(text: str) -> list[float]:
+    return [float(number) for number in re.findall(r"-?\d+(?:\.\d+)?", text)]
+
+
+# ------------------------------------------------------------------ modifications of the benches
+
+DRAWN = {row[0].strip("` "): (numbers(row[1]), numbers(row[2])) for row in rows_of("benchmarks.md", "`--modify` |")}
+SCENE_RANGES = {row[0].strip("` "): numbers(row[1]) for row in rows_of("benchmarks.md", "`--modify-scene` |")}
+
+
+@pytest.mark.parametrize(
+    ("require", "name", "low", "high"),
+    [(require_modifications, name, ends[0], ends[-1]) for name, (ends, _) in DRAWN.items()]
+    + [(require_scene_modifications, name, ends[0], ends[-1]) for name, ends in SCENE_RANGES.items()],
+)
+def test_values_are_taken_up_to_the_documented_ends(require, name: str, low: float, high: float) -> None:
+    require([f"{name}={low}", f"{name}={high}"])
+    for beyond in (low - 1e-3, high + 1e-3):
+        with pytest.raises(InvalidOptions, match=f"'{name}' takes {low:g} to {high:g}"):
+            require([f"{name}={beyond}"])
+
+
+def test_every_modification_is_documented() -> None:
+    assert set(DRAWN) == set(MODIFICATIONS)
+    assert set(SCENE_RANGES) == set(SCENE_MODIFICATIONS)
+
+
+@pytest.fixture(scope="module")
+def random_rows() -> list[Row]:
+    rng = np.random.default_rng(5)
+    return [random_row(rng, LENS) for _ in range(4000)]
+
+
+def test_random_values_fill_their_documented_ranges(random_rows: list[Row]) -> None:
+    seen: dict[str, list[float]] = {}
+    for row in random_rows:
+        for spec in row.modify:
+            name, _, value = spec.partition("=")
+            seen.setdefault(name, []).append(float(value))
+    assert set(seen) == {name for name, (_, drawn) in DRAWN.items() if drawn}
+    for name, values in seen.items():
+        drawn = DRAWN[name][1]
+        low, high = min(drawn), max(drawn)
+        reach = 0.05 * (high - low)  # of 300 values or more
+        assert low <= min(values) <= low + reach, name
+        assert high - reach <= max(values) <= high, name
+
+
+def test_random_combinations_are_as_frequent_as_documented(random_rows: list[Row]) -> None:
+    shares: dict[str, dict[str, float]] = {}
+    for what, text in rows_of("results/field.md", "how often |"):
+        shares[what] = {name: float(share) / 100 for name, share in re.findall(r"`(\w+)` (\d+) %", text)}
+        shares[what][""] = numbers(text)[0] / 100
+    names = [[spec.partition("=")[0] for spec in row.modify] for row in random_rows]
+    bent, cut = ["k1", "fisheye", "shutter_yaw", "shutter_pitch"], ["crop", "off_centre", "zoom"]
+    pixels = [name for name in MODIFICATIONS if name not in (*bent, *cut, "roll", "focal")]
+    lenses = [next((name for name in row if name in bent), None) for row in names]
+    defects = Counter(sum(name in pixels for name in row) for row in names)
+    told = Counter(row.told for row in random_rows)
+    pairs = [(lenses.count(None), shares["lens"][""])]
+    pairs += [(lenses.count(name), (1 - shares["lens"][""]) * shares["lens"][name]) for name in bent]
+    pairs += [(sum(name in row for row in names), shares["cut"][name]) for name in cut]
+    pairs += [(defects[count], share) for count, share in enumerate((0.2, 0.4, 0.3, 0.1))]
+    pairs += [(sum("roll" in row for row in names), shares["rolled"][""])]
+    pairs += [(sum(bool(row.modify_scene) for row in random_rows), shares["another scene"][""])]
+    with_told = sum(row.told != "withheld" for row in random_rows)
+    pairs += [(sum("focal" in row for row in names) * len(names) / with_told, shares["a wrong focal length"][""])]
+    # Where nothing is distorted, `pinhole` is `told`.
+    moved = shares["told"]["pinhole"] * shares["lens"][""]
+    expected = shares["told"] | {"told": shares["told"]["told"] + moved, "pinhole": shares["told"]["pinhole"] - moved}
+    pairs += [(told[name], expected[name]) for name in TOLD]
+    for count, share in pairs:
+        # Five standard deviations of a binomial distribution.
+        assert abs(count / len(names) - share) < 5 * np.sqrt(share * (1 - share) / len(names)), (count, share)
+
+
+def test_starts_fill_their_documented_ranges() -> None:
+    units = Units(np.zeros(3), 1.0, forward_facing=False)
+    cameras, rng = [Camera(LENS, pose) for pose in poses()], np.random.default_rng(0)
+    text = {row[0]: row[1] for row in rows_of("benchmarks.md", "start | offset")}
+    angles = [pose_distance(start_pose("inplace", poses()[1], units, cameras, rng), poses()[1])[0] for _ in range(80)]
+    low, high = numbers(text["`inplace`"])
+    assert low <= min(angles) < low + 1.5
+    assert high - 1.5 < max(angles) <= high
+    _, length = numbers(text["`pnerf`"])
+    shifts = [
+        np.abs(start_pose("pnerf", poses()[1], units, cameras, rng).position_in_world - poses()[1].position_in_world)
+        for _ in range(80)
+    ]
+    assert 0.95 * length < np.max(shifts) <= length
+    for kind, (first, last) in {"near": (0.0, 0.05), "easy": (0.0, 0.5), "hard": (0.5, 1.0)}.items():
+        # A camera at the focus: rotations move nothing.
+        at_focus = replace(units, focus_in_world=poses()[1].position_in_world)
+        moved = [
+            np.abs(start_pose(kind, poses()[1], at_focus, cameras, rng).position_in_world - at_focus.focus_in_world)
+            for _ in range(80)
+        ]
+        reach = 0.05 * (last - first)
+        assert first <= np.min(moved) < first + reach, kind
+        assert last - reach < np.max(moved) <= last, kind
+
+
+def test_field_photos_are_jpegs_of_the_documented_quality_and_size(tmp_path) -> None:
+    (line,) = [
+        line for line in (ROOT / "docs/results/field.md").read_text().splitlines() if line.startswith("| told | what")
+    ]
+    quality, size = numbers(line)
+    lens = Intrinsics(1600, 1200, 1400.0, 1400.0, 800.0, 600.0)
+    Image.new("RGB", (1600, 1200), "tan").save(tmp_path / "a.jpg")
+    one = BenchPhoto("a.jpg", tmp_path / "a.jpg", Camera(lens, poses()[1]))
+    sent = Image.open(io.BytesIO(send(decoded(one, (0, 0, 0)), FieldQuery(Row("r", "told"), one), 0).data))
+    assert max(sent.size) == size
+    buffer = io.BytesIO()
+    sent.convert("RGB").save(buffer, "JPEG", quality=int(quality))
+    assert sent.quantization == Image.open(buffer).quantization  # type: ignore[attr-defined]
+
+
+# ------------------------------------------------------------------ published figures
+
+
+def test_published_figures_are_of_todays_options() -> None:
+    """Whoever changes a method's default option, or a study's size, measures again."""
+    config = json.loads((ROOT / "docs/results/tables.json").read_text())["config"]
+    today = {cell.method.name: cell.method.config() for cell in cells()} | {m.name: m.config() for m in MAIN}
+    assert json.loads(json.dumps({name: today[name] for name in config["methods"]})) == config["methods"]
+
+
+def test_the_gpu_bench_measures_what_its_table_says() -> None:
+    said = {row[0]: numbers(row[1]) for row in rows_of("results/gpu.md", "part | what")}
+    assert said["pictures"] == [FULL.views, *FULL.widths]
+    assert said["poses"] == [FULL.photos, FULL.spoilt]
+    assert said["throughput"] == list(FULL.at_a_time)
+    assert said["sizes"] == [min(FULL.sizes) / 1e6, max(FULL.sizes) / 1e6]
+    assert FULL.sizes[2:] == tuple(1_000_000 * count for count in (1, 2, 4, 8, 12))
+    assert FULL.sizes[:2] == (250_000, 500_000)
+    assert said["many jobs"] == [FULL.jobs]
+    assert set(said) == {part.name for part in PARTS}
+    text = (ROOT / "docs/results/gpu.md").read_text()
+    minutes = int(re.findall(r"less than (\d+) minutes", text)[0])
+    assert 60 * (minutes - 0.5) < LIMIT_S < 60 * minutes
+    # No part alone can use up the run.
+    assert all(30 <= part.limit_s <= LIMIT_S / 3 for part in PARTS)
+
+
+# ------------------------------------------------------------------ the service
+
+
+def test_priors_of_a_lens_are_as_wide_as_the_api_says() -> None:
+    table = {(row[0], row[1]): row[2:] for row in rows_of("api.md", "`intrinsics_source` | from")}
+    said = {source.strip("` "): row for (source, _), row in table.items() if len(row) > 1}
+    given, exif, guessed = LENS_PRIORS["given"], LENS_PRIORS["exif"], LENS_PRIORS["guessed"]
+    assert given.log_focal_scale == numbers(said["given"][0])[0] / 100
+    assert np.exp(guessed.log_focal_scale) == pytest.approx(numbers(said["guessed"][0])[0], abs=0.05)
+    # With what is known of the tag it is narrower (3 to 4 %); without, it allows for crops, too.
+    assert max(numbers(said["exif"][0])) / 100 < exif.log_focal_scale < given.log_focal_scale / 2
+    for source, prior in (("given", given), ("exif", exif), ("guessed", guessed)):
+        assert prior.k1_sigma == numbers(said[source][1])[0]
+
+
+def test_what_the_jobs_have_by_default_is_what_the_service_sets() -> None:
+    ours = asdict(Settings(scenes=[], workers=1).jobs)
+    assert ours == asdict(JobsConfig())
+    text = (ROOT / "docs/api.md").read_text()
+    assert 60 * int(re.findall(r"deleted (\d+) minutes", text)[0]) == ours["photo_grace_s"]
+
+
+def test_every_layout_is_documented() -> None:
+    assert {row[0].strip("` ") for row in rows_of("benchmarks.md", "layout | what")} == set(LAYOUTS)
