@@ -14,9 +14,9 @@ from service.pose.refinement.covariance import scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.kernels import linearize, normal_equations
 from service.pose.refinement.photometric import refine_photometric
-from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, intensity, occluder_depth
+from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, evened_light, intensity, occluder_depth
 from service.pose.refinement.pyramid_level import NEUTRAL, PyramidLevel, RefinementState, _tukey_weights
-from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig, UncertaintyConfig
+from service.pose.refinement.refinement_config import REFINEMENT, LocalLightConfig, PyramidConfig, UncertaintyConfig
 from service.pose.refinement.uncertainty import pose_uncertainty
 from service.types import NO_CORRECTION, Camera, Intrinsics
 
@@ -69,6 +69,24 @@ def test_an_outline_grows_by_two_pixels_and_half_transparent_pixels_show_nothing
     found = occluder_depth(frame_of(depth, alpha), CONFIG)
     assert np.all(found[4, :12] == 3.0)
     assert np.all(found[4, 12:] == 0.0)
+
+
+def test_evened_light_hardly_depends_on_a_gain_and_a_bias_that_change_slowly() -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (120, 160)).astype(np.float32)
+    across = np.linspace(0, 1, 160, dtype=np.float32)
+    config = LocalLightConfig(min_contrast=1e-4)
+    one, other = (evened_light(i, None, config) for i in (image, (0.3 + 0.7 * across) * image + 0.2 * across))
+    assert np.abs(one - 0.5).mean() == pytest.approx(0.087, abs=0.01)  # uniform noise of standard deviation 0.1
+    assert np.abs(one - other).mean() < 0.01  # seen: 0.004; of the images themselves 0.17
+
+
+def test_evened_light_ignores_invalid_pixels() -> None:
+    image = np.random.default_rng(0).uniform(0.1, 0.9, (60, 80)).astype(np.float32)
+    valid = np.ones(image.shape, bool)
+    valid[:, 50:] = False
+    spoilt = np.where(valid, image, np.float32(7.0))
+    one, other = (evened_light(i, valid, LocalLightConfig()) for i in (image, spoilt))
+    assert np.allclose(one[valid], other[valid], atol=1e-6)
 
 
 def test_depths_are_averaged_on_smooth_surface_alone() -> None:

@@ -26,6 +26,7 @@ from service.pose.refinement.refine_stage import (
     refine_stage,
     rematch_and_refine,
 )
+from service.pose.refinement.refinement_config import OTHER_LIGHT, RefinementConfig
 from service.pose.retrieval.ambiguous_hypotheses import (
     AMBIGUITY,
     AmbiguityConfig,
@@ -82,6 +83,11 @@ class SearchConfig:
     """Inliers with a view from which on the pixels alone may decide the verification..."""
     photometric_min_inliers_free_lens: int = 100
     """...and with estimated intrinsics, with which pixels agree more easily."""
+    other_light: RefinementConfig = OTHER_LIGHT
+    """Of the refinement of a refused pose, in case the photo is in other light than the scene..."""
+    min_gradients_other_light: float = 0.75
+    """...where the gradients of the better half correlate by this much: 0.8 and more at 11 right poses of photos at
+    night that were refused, 0.5 and less at most poses in other places."""
     max_prior_loss: float = 0.1
     """Mean residual (0..1) of a refinement from a prior pose that led nowhere; right ones have 0.005 to 0.06."""
     sample_render_px: int = 256
@@ -173,15 +179,21 @@ class SearchState:
         retrieval = Retrieval(images, tools.prepared, config.retrieval)
         return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
 
-    def verify(self, found: RefinedPose, pixels_may_decide: bool = False) -> Verdict:
-        """Return the gate's verdict on a pose, from the render that refinement ended with if it is near enough."""
+    def verify(
+        self, found: RefinedPose, pixels_may_decide: bool = False, refinement_config: RefinementConfig | None = None
+    ) -> Verdict:
+        """Return the gate's verdict on a pose, from the render that refinement ended with if it is near enough.
+
+        `refinement_config`: that of the refinement that led to the pose, if it isn't the usual one.
+        """
+        config = self.config.verification
+        if refinement_config:
+            config = replace(config, refinement=refinement_config)
         images = self.images.corrected(found.correction)
         rendered, refinement = found.view_at_pose(images, self.renderer)
         # A pose refined from a prior has no matches behind it.
         matches, unique = found.num_inliers or 0, not self.tools.prepared.repeats_itself
-        return verify(
-            images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, self.config.verification
-        )
+        return verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
 
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""
@@ -211,6 +223,10 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     least = config.photometric_min_inliers_free_lens if free_lens else config.photometric_min_inliers
     pixels_may_decide = stage.expected or (found.num_inliers or 0) >= least
     verdict = state.verify(found, pixels_may_decide)
+    if _may_be_in_other_light(state, verdict):
+        again = yield from _refined_in_other_light(state, found)
+        if again is not None and again[1].score > verdict.score:
+            found, verdict = again
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.score > state.best.verdict.score:
         state.best = VerifiedPose(found, verdict, stage.variant)
@@ -219,6 +235,35 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     state.finished = verdict.status is Status.LOCALIZED or conclusive
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))
+
+
+def _may_be_in_other_light(state: SearchState, verdict: Verdict) -> bool:
+    """Return whether a refused pose shows the photo's edges, so that local light may be why it was refused.
+
+    Not in a scene that repeats itself, where edges agree at wrong poses, too, nor with estimated intrinsics.
+    """
+    if verdict.status is Status.LOCALIZED or verdict.reason in (Reason.INTRINSICS_CONTRADICTED, Reason.OUTSIDE_PRIOR):
+        return False
+    if state.tools.prepared.repeats_itself or state.images.query.lens_prior is not None:
+        return False
+    return verdict.signals["gradients_half"] >= state.config.min_gradients_other_light
+
+
+def _refined_in_other_light(
+    state: SearchState, found: RefinedPose
+) -> Generator[IterationRecord, None, tuple[RefinedPose, Verdict] | None]:
+    """Refine a pose with local light taken out of photo and renders, and verify the result; None: it diverged."""
+    config = state.config
+    start = AbsolutePose(found.pose, np.ones(found.num_inliers or 0, bool), found.correction)
+    stage = refine_stage(
+        start, state.images, state.renderer, replace(config.refinement, photometric=config.other_light)
+    )
+    again = (yield from _changed(stage, state.with_answer)).refined
+    if again is None:
+        return None
+    verdict = state.verify(again, refinement_config=config.other_light)
+    # Residuals of evened images don't compare with those of other answers.
+    return replace(again, loss=found.loss), verdict
 
 
 def _changed(

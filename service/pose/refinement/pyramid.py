@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 
 from service.interfaces import Frame
-from service.pose.refinement.refinement_config import PyramidConfig
+from service.pose.refinement.refinement_config import LocalLightConfig, PyramidConfig
 
 FAR = np.float32(1e30)
 """Depth in the place of none, where the nearest is wanted."""
@@ -40,6 +40,25 @@ def intensity(rgb: Float32[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"]) ->
     # 3 * 255 for bytes.
     scale = np.float32(1 / 765 if rgb.dtype == np.uint8 else 1 / 3)
     return (rgb[..., 0].astype(np.float32) + rgb[..., 1] + rgb[..., 2]) * scale
+
+
+def evened_light(
+    image: Float32[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"] | None, config: LocalLightConfig
+) -> Float32[np.ndarray, "h w"]:
+    """Return the image with about the same mean (0.5) and contrast everywhere, in Gaussian windows of its valid pixels.
+
+    Invariant to a gain and a bias that change slowly; what it doesn't take out are edges of shadows.
+    """
+    sigma = config.window_share * max(image.shape)
+    known = np.ones_like(image) if valid is None else valid.astype(np.float32)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.asarray(cv2.GaussianBlur(values * known, (0, 0), sigma)) / weight
+
+    weight = np.maximum(cv2.GaussianBlur(known, (0, 0), sigma), np.float32(1e-3))
+    offset = image - mean(image)
+    spread = np.sqrt(mean(offset * offset))
+    return (0.5 + config.contrast * offset / (spread + config.min_contrast)).astype(np.float32)
 
 
 def pyramid(image: Float32[np.ndarray, "h w"], levels: int, sigma_px: float) -> list[Float32[np.ndarray, "_ _"]]:

@@ -10,7 +10,14 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from service.interfaces import Frame
 from service.pose.refinement.kernels import fill_residuals, linearize
-from service.pose.refinement.pyramid import clip_like_photo, depth_pyramid, intensity, occluder_depth, pyramid
+from service.pose.refinement.pyramid import (
+    clip_like_photo,
+    depth_pyramid,
+    evened_light,
+    intensity,
+    occluder_depth,
+    pyramid,
+)
 from service.pose.refinement.refinement_config import RefinementConfig
 from service.types import Intrinsics, IntrinsicsCorrection, LensPrior
 
@@ -98,13 +105,16 @@ def linearized_levels(
 
     `with_intrinsics`: the photo's intrinsics will be estimated, too, which takes more pixels.
     """
-    image = intensity(photo)
+    image, expected = intensity(photo), intensity(clip_like_photo(photo, frame, config.pyramid))
+    if config.local_light:
+        image = evened_light(image, valid_mask, config.local_light)
+        expected = evened_light(expected, None, config.local_light)
     if valid_mask is not None:
         # Before the pyramid is built, so that pixels that mix with invalid ones are invalid, too.
         image[~valid_mask] = UNKNOWN
     settings = config.pyramid
     photos = pyramid(image, levels, settings.blur_sigma_px)
-    renders = pyramid(intensity(clip_like_photo(photo, frame, settings)), levels, settings.blur_sigma_px)
+    renders = pyramid(expected, levels, settings.blur_sigma_px)
     depths = depth_pyramid(occluder_depth(frame, settings), levels, settings.max_depth_ratio)
     most = config.max_pixels_intrinsics if with_intrinsics else config.max_pixels
     for photo_level, render, depth in zip(reversed(photos), reversed(renders), reversed(depths), strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from service.pose.features.rendered_views import VIEWS
@@ -33,6 +33,19 @@ class PyramidConfig:
     """Darker blocks of either have no part in the exposure: a black rim is no measurement."""
     max_exposed: float = 0.9
     """Brighter blocks of the photo neither: they may be clipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class LocalLightConfig:
+    """How light that differs within the photo is taken out of photo and render (`evened_light`)."""
+
+    window_share: float = 0.0625
+    """Standard deviation of the Gaussian window, as a share of the long side."""
+    min_contrast: float = 0.02
+    """Added to the standard deviation in the window: flat parts stay flat, whatever their noise."""
+    contrast: float = 0.1
+    """Standard deviation in the window afterwards; about that of usual photos, whose residuals the values here are of.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +138,9 @@ class RefinementConfig:
     shutter: ShutterConfig = field(default_factory=ShutterConfig)
     lens_error: LensErrorConfig = field(default_factory=LensErrorConfig)
     lens_test: LensTestConfig = field(default_factory=LensTestConfig)
+    local_light: LocalLightConfig | None = None
+    """Take out light that differs within the photo first; None: compare intensities, which is more exact in the same
+    light."""
     weighting: Literal["l1", "least_squares"] = "l1"
     """IRLS weights 1 / max(|r|, l1_floor), or the same weight 1 / l1_floor for all."""
     l1_floor: float = 0.02
@@ -153,3 +169,5 @@ class RefinementConfig:
 
 
 REFINEMENT = RefinementConfig()
+OTHER_LIGHT = replace(REFINEMENT, local_light=LocalLightConfig())
+"""For a photo in other light than the scene's."""
