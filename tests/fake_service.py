@@ -317,6 +317,7 @@ class FakeService:
             sha256=info.sha256,
             format=info.format,
             background_rgb=list(info.background_rgb),
+            background_is_known=info.background_is_known,
             up_in_world=info.up_in_world and list(info.up_in_world),
             metres_per_unit=None,
             render_mode="default",

@@ -50,6 +50,8 @@ def scene_facts(path: Path) -> dict[str, Any]:
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
     if not info.up_in_world:
         warnings.append("up is unknown: z is assumed where views are placed or shown")
+    if not info.background_is_known:
+        warnings.append("the background is unknown: black is assumed, white for photos with a white border")
     return facts | {"warnings": warnings}
 
 

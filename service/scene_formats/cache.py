@@ -23,7 +23,7 @@ import numpy as np
 from service.scene_formats.folder import load_scene
 from service.types import Camera, GaussianScene, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
 
-_VERSION = 1
+_VERSION = 2
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _log = logging.getLogger(__name__)
 
