@@ -170,10 +170,10 @@ def test_steps_change_picture_pose_and_numbers(fake: FakeService, viewer: Viewer
         browser.wait(lambda: browser.text().count("data:image/jpeg") == 2, "both pictures in turn")
         assert browser.widget("match lines")["visible"] is False
         browser.set("compare", "blend")
-        browser.wait(lambda: browser.widget("render's share")["visible"], "the blend")
-        browser.set("render's share", 1.0)
+        browser.wait(lambda: browser.widget("render opacity")["visible"], "the blend")
+        browser.set("render opacity", 1.0)
         browser.wait(lambda: shows(render_rgb(0, matched=False)), "nothing but the render")
-        browser.set("render's share", 0.0)
+        browser.set("render opacity", 0.0)
         browser.wait(lambda: shows((120, 160, 200)), "nothing but the photo")
 
 
@@ -580,7 +580,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
 
 def test_a_viewer_that_stops_takes_leave_of_its_browsers(fake: FakeService) -> None:
     """viser reports them as gone while it stops, which ends their sessions."""
-    viewer, gone = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0), threading.Event()
+    viewer, gone = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0), threading.Event()
     viewer.server.on_client_disconnect(lambda client: gone.set())
     with _browser(viewer) as browser:
         browser.wait(lambda: "no job" in browser.text(), "the page")

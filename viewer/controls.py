@@ -91,7 +91,7 @@ class Controls:
         """Show whether a replay file is being made; meanwhile there is no other."""
         self.saving_replay = saving
         self.replay.disabled = saving or self.step.disabled
-        self.replay.label = "saving the replay file…" if saving else _REPLAY_LABEL
+        self.replay.label = "making the replay file…" if saving else _REPLAY_LABEL
 
 
 def on_user_change(widget: Any, react: Callable[[Any], None]) -> None:
