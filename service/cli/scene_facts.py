@@ -49,7 +49,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
     if not info.up_in_world:
-        warnings.append("up is unknown: z is assumed where views are placed or shown")
+        warnings.append("up is unknown: views are placed upright by z and by -y, and shown by z")
     if not info.background_is_known:
         warnings.append("the background is unknown: black is assumed, white for photos with a white border")
     return facts | {"warnings": warnings}

@@ -29,7 +29,7 @@ from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 8
+VERSION = 9
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
