@@ -107,7 +107,7 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "floaters": f"{facts['floaters']:.1%} of the opaque Gaussians",
         "up": _point(facts["up"]) if facts["up"] else "unknown",
         "metres per unit": str(facts["metres_per_unit"] or "unknown"),
-        "on Earth": "yes" if facts["on_earth"] else "no",
+        "geo anchor": "yes" if facts["on_earth"] else "no",
         "training cameras": str(facts["training_cameras"]),
         "training size": f"{size['px']} px (from the {size['source']})" if size["px"] else size["source"],
         "index": placed,
