@@ -25,9 +25,9 @@ class UntoldBackgroundConfig:
     border_share: float = 0.02
     """Width of a photo's border, of its long side."""
     white_from: int = 250
-    """Grey level (0..255) of each channel from which on a pixel is white: JPEG leaves 252 and more of 255."""
+    """Grey level (0..255) of each channel from which on a pixel is white: JPEG changes it a little."""
     min_white_share: float = 0.5
-    """Of the border: of test photos of objects on white 0.95 to 1 are, of others less than 0.1."""
+    """Of the border: an object may reach it on some sides."""
     render_px: int = 64
     views: int = 8
     """Renders, and their long side, that show whether the scene leaves any background uncovered."""
@@ -50,8 +50,8 @@ def has_white_border(
     border[width:-width, width:-width] = False
     if valid is not None:
         border &= valid
-    white = (rgb[border] >= config.white_from).all(1)
-    return bool(len(white) and white.mean() >= config.min_white_share)
+    white = border & np.all(rgb >= config.white_from, axis=2)
+    return bool(border.any() and white.sum() >= config.min_white_share * border.sum())
 
 
 def shows_background(
