@@ -373,3 +373,52 @@ def test_bench_paper_shows_how_far_it_is():
     assert re.search(r"mc_do/hard .*2 / 3 / 5 .*0 / 0 / 5", told)
     assert "table5" not in told
     assert "4 of 30 queries, 13 minutes to go" in told
+
+
+@pytest.mark.parametrize(
+    ("flags", "bench", "asked"),
+    [
+        ("scale S", "scale", {"others": (), "sizes": (100_000, 300_000, 1_000_000, 3_000_000), "compressed": False}),
+        ("scale S --size 2000 --size 3000 --compressed", "scale", {"sizes": [2000, 3000], "compressed": True}),
+        ("scale S --around A --cameras given", "scale", {"others": [Path("A")], "cameras": "given"}),
+        ("render", "render", {"repeats": 30}),
+        ("render --repeats 2", "render", {"repeats": 2}),
+        ("ablation S T", "ablation", {"parts": (), "": [Path("S"), Path("T")]}),
+        ("ablation S T --part mirror", "ablation", {"parts": ["mirror"]}),
+        ("gate S", "gate", {"seed": 0, "": [Path("S")]}),
+        ("gate S --seed 4", "gate", {"seed": 4}),
+        ("track S", "track", {"frames": 300, "seed": 0, "intrinsics": "given"}),
+        ("track S --frames 7 --seed 2 --intrinsics withheld", "track", {"frames": 7, "seed": 2}),
+    ],
+)
+def test_every_bench_is_handed_its_flags_and_writes_what_it_returns(
+    splatfix, monkeypatch, tmp_path, flags, bench, asked
+):
+    """And says on which processor: without that times mean nothing."""
+    rows = [{"part": "whole", "seconds": 1.23456}]
+    outcome = {"with_matches": {"scenes": 1}, "photometric": {}, "tracked": {}} if bench == "gate" else rows
+    outcome = {"localized": 7, "per_frame": []} if bench == "track" else outcome
+    given: dict = {}
+
+    def run(*positional, progress, **options):
+        given.update(options | {"": positional[0] if positional else None})
+        progress(1, 2)
+        return outcome
+
+    monkeypatch.setattr(f"service.bench.{bench}.run", run)
+    monkeypatch.setattr("service.bench.ablation.table", lambda rows: f"| {rows[0]['part']} |")
+    code, told, complaints = splatfix("bench", *flags.split(), "--json", tmp_path / "o.json")
+    assert code == 0
+    assert given | asked == given
+    assert json.loads((tmp_path / "o.json").read_text()) == outcome
+    assert re.search(
+        {"gate": "scenes +1", "track": "localized +7", "ablation": r"\| whole \|"}.get(bench, "1.235"), told
+    )
+    assert "per_frame" not in told
+    assert "core" in complaints
+
+
+def test_an_ablation_needs_two_scenes(splatfix):
+    code, _, complaint = splatfix("bench", "ablation", "S")
+    assert code == 2
+    assert "needs two scenes" in complaint

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import re
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
+import numpy as np
 import pytest
-from fake_service import PHOTO, orbit, records
+from fake_service import PHOTO, jpeg, orbit, records
 
 from service.types import Camera
-from viewer import job_display
+from viewer import charts, job_display
 from viewer.action_queue import ActionQueue
+from viewer.background_render import BackgroundRender, _same_view
 from viewer.controls import NEXT, PLAY, PREVIOUS, Controls
 from viewer.job_display import FOLLOW_AFTER_OPEN_S, JobDisplay
 from viewer.job_selection import JobSelection
@@ -334,3 +338,161 @@ def test_actions_run_in_order_and_the_last_of_a_key_wins() -> None:
     queue.close()
     assert queue.closed
     assert queue.take(None) is None
+
+
+# ------------------------------------------------------------------ the service's render behind the view
+
+
+def background(*, scene: str | None = "ball", width: int = 1600, height: int = 1200) -> tuple[Any, list[Any], Any]:
+    """A render behind the view of one browser, the images that it shows, and the service's answers."""
+    shown: list[Any] = []
+    camera = SimpleNamespace(
+        image_width=width, image_height=height, fov=1.0, wxyz=np.array([1.0, 0, 0, 0]), position=np.zeros(3)
+    )
+    service = Mock()
+    service.render.return_value = jpeg((9, 99, 199))
+    found = BackgroundRender(SimpleNamespace(camera=camera, client_id=1), service, shown.append)  # type: ignore[arg-type]
+    found._scene_id = scene
+    return found, shown, service
+
+
+@pytest.mark.parametrize(("showing", "enabled", "without"), [*itertools.product(*3 * [[False, True]])])
+def test_a_movement_shows_the_splats_where_there_are_some(showing: bool, enabled: bool, without: bool) -> None:
+    found, shown, _ = background()
+    found._showing, found._enabled, found._without_splats = showing, enabled, without
+    found.moved()
+    hidden = showing and not (without and enabled)
+    assert shown == ([None] if hidden else [])
+    assert found._showing is (showing and not hidden)
+
+
+def test_whatever_is_set_has_the_view_rendered_again() -> None:
+    found, _, _ = background()
+    for k, change in enumerate((
+        lambda: found.set_scene("copy"), lambda: found.set_enabled(False), lambda: found.set_without_splats(False),
+    )):  # fmt: skip
+        change()
+        assert found._moves == k + 1
+    assert (found._scene_id, found._enabled, found._without_splats) == ("copy", False, False)
+
+
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("before", [False, True])
+@pytest.mark.parametrize("after", [False, True])
+def test_a_render_of_a_moment_ago_is_shown_where_there_is_nothing_else(before: bool, after: bool, moved: bool) -> None:
+    found, shown, service = background()
+    found._without_splats = before
+
+    def meanwhile(*_: Any, **__: Any) -> bytes:
+        found._without_splats = after
+        found._moves += moved
+        return jpeg((9, 99, 199))
+
+    service.render.side_effect = meanwhile
+    found._render(found._moves, 480)
+    assert len(shown) == (not moved or (before and after))
+    assert found._showing is bool(shown)
+
+
+def test_nothing_is_rendered_or_shown_that_is_not_wanted() -> None:
+    for spoil in ("no scene", "off", "closed", "another scene"):
+        found, shown, service = background(scene=None if spoil == "no scene" else "ball")
+        found._enabled = spoil != "off"
+
+        def meanwhile(*_: Any, found: Any = found, spoil: str = spoil, **__: Any) -> bytes:
+            found._closed = spoil == "closed"
+            found._scene_id = "copy" if spoil == "another scene" else "ball"
+            return jpeg((9, 99, 199))
+
+        service.render.side_effect = meanwhile
+        found._render(0, 480)
+        assert shown == []
+        assert bool(service.method_calls) is (spoil in ("closed", "another scene"))
+
+
+@pytest.mark.parametrize(
+    ("size", "limit", "expected"),
+    [((1600, 1200), 480, (480, 360)), ((1600, 1200), 1280, (1280, 960)), ((300, 200), 480, (300, 200)),
+     ((600, 1200), 480, (240, 480)), ((0, 0), 480, (1, 1))],
+)  # fmt: skip
+def test_a_render_is_no_larger_than_the_browsers_view(
+    size: tuple[int, int], limit: int, expected: tuple[int, int]
+) -> None:
+    lens = background(width=size[0], height=size[1])[0]._camera(limit).intrinsics
+    assert (lens.width, lens.height) == expected
+    assert 2 * np.arctan(0.5 * lens.height / lens.fy) == pytest.approx(1.0)
+    assert (lens.cx, lens.cy) == (lens.width / 2, lens.height / 2)
+
+
+def test_views_are_the_same_up_to_rounding() -> None:
+    found = background()[0]
+    now = found._camera()
+    assert not _same_view(None, now)
+    for change, same in ((1e-6, True), (1e-3, False)):
+        found._client.camera.position = np.array([change, 0, 0])
+        assert _same_view(now, found._camera()) is same
+    found._client.camera.position = np.zeros(3)
+    for fov, same in ((1 + 1e-6, True), (1 + 1e-3, False)):
+        found._client.camera.fov = fov
+        assert _same_view(now, found._camera()) is same
+    found._client.camera.fov = 1.0
+    found._client.camera.image_width = 1500
+    assert not _same_view(now, found._camera())
+
+
+# ------------------------------------------------------------------ charts
+
+
+def test_a_curve_goes_through_its_values_and_the_step_is_marked_there() -> None:
+    """Read back from the SVG: places on both axes are where the ticks' texts say."""
+    shown = [replace(r, step_deg=10.0 * r.index, stage="a" if r.index < 2 else "b") for r in records(5)]
+    drawn = charts.curves_html(shown, None, 3)
+    chart = next(part for part in drawn.split("</svg>") if "turned by the step" in part)
+    ticks = {float(text): float(y) for y, text in re.findall(r"y='([\d.]+)' text-anchor='end'[^>]*>([\d.]+)<", chart)}
+    steps = {int(text): float(x) for x, text in re.findall(r"x='([\d.]+)' y='102.0'[^>]*>(\d+)<", chart)}
+    (mark,) = re.findall(r"M([\d.]+) 6V", chart)
+    assert set(steps) == {0, 4}
+    at = {step: steps[0] + (steps[4] - steps[0]) * step / 4 for step in range(5)}
+    assert float(mark) == pytest.approx(at[3], abs=0.1)
+    # Texts stand 3 units below their line.
+    unit = (ticks[40] - ticks[0]) / 40
+    expected = [(at[k], ticks[0] - 3 + 10 * k * unit) for k in range(5)]
+    (line,) = re.findall(r"<path d='(M[^']*)' fill='none'", chart)
+    points = [tuple(map(float, point)) for point in re.findall(r"([\d.]+) ([\d.]+)", line)]
+    assert np.allclose(points, expected, atol=0.11)
+    width, height = map(float, re.findall(r"viewBox='0 0 (\d+) (\d+)'", chart)[0])
+    assert all(0 < x < width and 0 < y < height for x, y in points)
+
+
+def test_the_strip_of_stages_names_each_and_marks_the_step() -> None:
+    shown = [replace(r, stage="first" if r.index < 2 else "second") for r in records(5)]
+    strip = charts.stages_html(shown, 1)
+    spans = [tuple(map(float, span)) for span in re.findall(r"left:([\d.]+)%;width:([\d.]+)%", strip)]
+    assert spans == [(0, 37.5), (37.5, 62.5)]
+    assert "calc(25.00% - 1.5px)" in strip
+    for name, colour in charts.stage_colours(shown).items():
+        assert f">{name}<" not in strip.partition("</div></div>")[0].partition("flex")[0]
+        assert re.search(rf"background:{colour};margin-right:.3em'></i>{name}</span>", strip)
+    assert "first: 2 steps" in strip
+    assert "second: 3 steps" in strip
+    assert charts.stages_html([], 0) == ""
+
+
+@pytest.mark.parametrize(
+    ("values", "log", "ends", "ticks"),
+    [
+        ([0.2, 0.9], False, (0, 0.9), [0, 0.2, 0.4, 0.6, 0.8]),
+        ([3.0, 4.5], False, (0, 4.5), [0, 1, 2, 3, 4]),
+        ([-1.0, 1.0], False, (-1, 1), [-1, -0.5, 0, 0.5, 1]),
+        ([0.0], False, (0, 1), [0, 0.2, 0.4, 0.6, 0.8, 1]),
+        ([80.0], False, (0, 80), [0, 20, 40, 60, 80]),
+        ([0.02, 3.0], True, (0.01, 10), [0.01, 0.1, 1, 10]),
+        ([1e-6, 3.0], True, (1e-6, 10), [1e-6, 1e-4, 1e-2, 1]),
+    ],
+)
+def test_axes_have_a_few_round_ticks(
+    values: list[float], log: bool, ends: tuple[float, float], ticks: list[float]
+) -> None:
+    low, high, found = charts._axis(np.array(values), log=log)
+    assert (low, high) == pytest.approx(ends)
+    assert found == pytest.approx(ticks)
