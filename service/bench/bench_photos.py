@@ -17,7 +17,7 @@ from service.errors import CorruptScene, SceneNotFound, SplatfixError
 from service.photos.images import encode_image, read_query
 from service.photos.intrinsics import intrinsics_from
 from service.scene_formats.colmap import read_cameras
-from service.scene_formats.folder import COLMAP_FOLDER
+from service.scene_formats.layouts import COLMAP_FOLDER
 from service.scene_formats.manifest import read_manifest
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
 from service.scene_formats.similarity import moved_pose

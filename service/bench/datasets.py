@@ -25,7 +25,7 @@ from service.bench.bench_photos import HOLD_OUT_EVERY, BenchPhoto, find_photos, 
 from service.errors import CorruptScene, InvalidImage, InvalidPrior, SceneNotFound, UnknownName
 from service.photos.images import photo_size
 from service.scene_formats.colmap import read_cameras
-from service.scene_formats.folder import COLMAP_FOLDER
+from service.scene_formats.layouts import COLMAP_FOLDER
 from service.scene_formats.manifest import MANIFEST, read_manifest
 from service.scene_formats.nerfstudio import TransformsFile
 from service.types import Camera, Intrinsics, NamedCamera, Pose

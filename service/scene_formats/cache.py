@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from service.scene_formats.folder import load_scene
+from service.scene_formats.layouts import files_of
 from service.types import Camera, GaussianScene, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
 
 _VERSION = 2
@@ -62,8 +63,7 @@ def release(scene: GaussianScene) -> None:
 
 def _key(path: Path) -> str:
     """Hash the stamps of all files that `load_scene` may read."""
-    files = [path] if path.is_file() else [*path.iterdir(), *(path / "sparse" / "0").glob("*")]
-    stamps = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(files) if f.is_file()]
+    stamps = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(set(files_of(path)))]
     return hashlib.sha256(repr((_VERSION, str(path.resolve()), stamps)).encode()).hexdigest()[:32]
 
 

@@ -21,10 +21,14 @@ from service.types import Camera, Intrinsics, NamedCamera, Pose
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
     5: ("OPENCV_FISHEYE", 8), 6: ("FULL_OPENCV", 12), 7: ("FOV", 5), 8: ("SIMPLE_RADIAL_FISHEYE", 4),
-    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12),
+    9: ("RADIAL_FISHEYE", 5), 10: ("THIN_PRISM_FISHEYE", 12), 11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4), 13: ("DIVISION", 5), 14: ("SIMPLE_FISHEYE", 3), 15: ("FISHEYE", 4), 16: ("EUCM", 6),
 }  # fmt: skip
 """COLMAP's number of a camera model -> its name and number of parameters."""
-_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+_ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_DIVISION",
+              "SIMPLE_FISHEYE"}  # fmt: skip
+_NO_PINHOLE = {17: " (EQUIRECTANGULAR)"}
+"""Models without a focal length."""
 MAX_FILE_BYTES = 2 * 1024**3
 
 
@@ -62,6 +66,8 @@ def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
     result = {}
     for _ in range(struct.unpack_from("<Q", data)[0]):
         number, model, width, height = struct.unpack_from("<iiQQ", data, at)
+        if model not in _MODELS:
+            raise ValueError(f"camera {number} has the camera model {model}{_NO_PINHOLE.get(model, '')}, not read here")
         name, count = _MODELS[model]
         result[number] = _intrinsics(name, width, height, list(struct.unpack_from(f"<{count}d", data, at + 24)))
         at += 24 + 8 * count
@@ -86,23 +92,37 @@ def _binary_images(path: Path) -> list[_Image]:
 
 def _text_cameras(path: Path) -> dict[int, Intrinsics]:
     result = {}
-    for line in path.read_text("utf-8-sig").splitlines():
-        if line.strip() and not line.startswith("#"):
+    known = {name for name, _ in _MODELS.values()}
+    for line in _lines(path):
+        if line.strip():
             number, model, width, height, *parameters = line.split()
+            if model not in known:
+                raise ValueError(f"camera {number} has the camera model {model[:40]}, not read here")
             result[int(number)] = _intrinsics(model, int(width), int(height), [float(p) for p in parameters])
     return result
 
 
 def _text_images(path: Path) -> list[_Image]:
-    """Parse images.txt: two lines an image; the second one, its points, may be empty."""
-    lines = [line for line in path.read_text("utf-8-sig").splitlines() if not line.startswith("#")]
-    result = []
-    for line in lines[::2]:
-        if line.strip():
-            words = line.split(maxsplit=9)  # a file name may contain spaces
-            pose = tuple(float(word) for word in words[1:8])
-            result.append(_Image(words[9].strip(), int(words[8]), pose))
+    """Parse images.txt: two lines an image; the second one, its points, may be empty. Other blank lines don't count."""
+    lines, result = iter(_lines(path)), []
+    for line in lines:
+        if not line.strip():
+            continue
+        words = line.split(maxsplit=9)  # a file name may contain spaces
+        pose = tuple(float(word) for word in words[1:8])
+        result.append(_Image(words[9].strip(), int(words[8]), pose))
+        if len(next(lines, "").split()) % 3:
+            raise ValueError(f"no line of points (x y id ..., or empty) follows '{words[9].strip()}' in {path.name}")
     return result
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the lines that are no comments. Raises CorruptScene for another encoding than UTF-8."""
+    try:
+        text = path.read_text("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise CorruptScene(f"not UTF-8: {error}.", where=path.name, hint="Save it as UTF-8.") from None
+    return [line for line in text.splitlines() if not line.startswith("#")]
 
 
 def _intrinsics(model: str, width: int, height: int, parameters: list[float]) -> Intrinsics:

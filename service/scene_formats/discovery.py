@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from service.errors import SceneNotFound
-from service.scene_formats.formats import is_scene_file
-from service.scene_formats.manifest import MANIFEST
+from service.scene_formats.layouts import is_scene_folder
 
 
 def find_scenes(path: Path) -> list[Path]:
@@ -14,15 +13,10 @@ def find_scenes(path: Path) -> list[Path]:
 
     Raises SceneNotFound if there are none.
     """
-    if path.is_file() or (path.is_dir() and _is_scene(path)):
+    if path.is_file() or (path.is_dir() and is_scene_folder(path)):
         return [path]
     # One level only: a scene folder may hold photos and other files in folders of its own.
-    found = sorted(p for p in path.iterdir() if p.is_dir() and _is_scene(p)) if path.is_dir() else []
+    found = sorted(p for p in path.iterdir() if p.is_dir() and is_scene_folder(p)) if path.is_dir() else []
     if not found:
         raise SceneNotFound("there is no scene.", where=str(path))
     return found
-
-
-def _is_scene(folder: Path) -> bool:
-    """Whether a folder has a manifest or a scene file; a broken scene counts: it is refused by name, not overlooked."""
-    return (folder / MANIFEST).is_file() or any(is_scene_file(p) for p in folder.iterdir())

@@ -11,17 +11,17 @@ from types import ModuleType
 
 import numpy as np
 
-from service.errors import CorruptScene, SceneNotFound, UnsupportedFormat
-from service.scene_formats.colmap import read_cameras
-from service.scene_formats.formats import SCENE_FORMATS, is_scene_file, readable_suffixes, reader_for
+from service.errors import SceneNotFound
+from service.scene_formats import colmap, inria
 from service.scene_formats.gaussians import checked
+from service.scene_formats.layouts import COLMAP_FOLDER, scene_file
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
 from service.scene_formats.similarity import moved_gaussians, moved_pose
 from service.types import GaussianScene, NamedCamera, SceneInfo
 
-COLMAP_FOLDER = Path("sparse", "0")
-_HEAD_BYTES = 4096
+_ELSEWHERE = (".", "sparse", "sparse/*", "colmap/sparse/*", "dense/sparse", "dense/sparse/*", "distorted/sparse/*")
+"""Where other programs put COLMAP models."""
 log = logging.getLogger(__name__)
 
 
@@ -42,7 +42,7 @@ def load_scene(
     if not path.exists():
         raise SceneNotFound("there is no such file or folder.", where=str(path))
     manifest = read_manifest(path) if path.is_dir() else Manifest()
-    file, reader = _scene_file(path, manifest)
+    file, reader = scene_file(path, manifest)
     raw = checked(reader.read(file), file.name)
     mode = require_render_mode(manifest.render_mode or raw.render_mode or "default", file.name)
     # A bare file has neither manifest nor cameras: what lies beside it may belong to another scene.
@@ -57,16 +57,16 @@ def load_scene(
     info = SceneInfo(
         id=_scene_id(path),
         name=manifest.name or _scene_id(path),
-        sha256=_digest(file, path, used, (found.background, size, focal_px)),
+        sha256=_digest([file, *_parts_of(reader, file)], path, used, (found.background, size, focal_px)),
         format=reader.__name__.rsplit(".", 1)[-1],
         background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
-        background_is_known=bool(manifest.background or found.background),
-        up_in_world=manifest.up,
+        up_in_world=manifest.up or _up(raw.up, manifest),
         metres_per_unit=manifest.metres_per_unit,
         render_mode=mode,
         training_focal_px=focal_px,
         training_long_side_px=max(size) if size else None,
         geo_anchor=manifest.geo_anchor,
+        warnings=(*raw.warnings, *found.warnings),
     )
     log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)
@@ -98,56 +98,48 @@ class _Training:
 
     cameras: tuple[NamedCamera, ...] = ()
     background: tuple[float, float, float] | None = None
+    warnings: tuple[str, ...] = ()
 
 
 def _training(folder: Path, manifest: Manifest, without_photos: Collection[str]) -> _Training:
-    """Read the training cameras; transforms*.json before sparse/0, from which it was converted where both exist."""
+    """Read the training cameras: transforms*.json, else sparse/0, of which it is made, else Inria's cameras.json."""
 
     def keep(name: str) -> bool:
         return not any(same_photo(name, photo) for photo in without_photos)
 
+    arguments = folder / inria.ARGUMENTS
+    background = inria.background(arguments) if arguments.is_file() else None
     transforms = transforms_path(folder)
     if transforms is not None:
         file = TransformsFile.open(transforms)
         photos = [photo for photo in file.training_photos() if keep(photo)]
-        return _Training(tuple(file.camera(photo, manifest) for photo in photos), file.background())
+        return _Training(tuple(file.camera(photo, manifest) for photo in photos), file.background() or background)
     if any((folder / COLMAP_FOLDER / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return _Training(read_cameras(folder / COLMAP_FOLDER, keep))
-    return _Training()
+        return _Training(colmap.read_cameras(folder / COLMAP_FOLDER, keep), background)
+    if (folder / inria.CAMERAS).is_file():
+        return _Training(inria.read_cameras(folder / inria.CAMERAS, keep), background)
+    return _Training(background=background, warnings=_models_elsewhere(folder))
 
 
-def _scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
-    """Find the scene file and its reader. Raises SceneNotFound, UnsupportedFormat, CorruptScene."""
-    if path.is_file():
-        candidates = [path]
-    elif manifest.file:
-        candidates = [path / manifest.file]
-        if not candidates[0].is_file():
-            raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
-    else:
-        files = sorted(p for p in path.iterdir() if p.is_file() and is_scene_file(p))
-        # A file that can't be read here doesn't make another one ambiguous.
-        candidates = [p for p in files if p.suffix.lower() in readable_suffixes()] or files
-    if not candidates:
-        raise SceneNotFound(f"the folder has no scene file ({', '.join(readable_suffixes())}).", where=str(path))
-    if len(candidates) > 1:
-        raise CorruptScene(
-            f"several scene files: {', '.join(p.name for p in candidates[:5])}.",
-            where=str(path),
-            hint=f'Name one in {MANIFEST}: {{"file": "{candidates[0].name}"}}.',
-        )
-    # Formats are recognized by their first bytes: the suffix .ply stands for two.
-    with candidates[0].open("rb") as file:
-        head = file.read(_HEAD_BYTES)
-    if not head:
-        raise CorruptScene("the file is empty (0 bytes).", where=candidates[0].name)
-    reader = reader_for(head, candidates[0].suffix.lower())
-    if reader:
-        return candidates[0], reader
-    raise UnsupportedFormat(
-        f"not a scene file that is read here; known: {', '.join(SCENE_FORMATS.names())}.",
-        where=candidates[0].name,
-    )
+def _models_elsewhere(folder: Path) -> tuple[str, ...]:
+    """Return a warning for each COLMAP model in a place where it is not looked for."""
+    files = [file for place in _ELSEWHERE for file in sorted(folder.glob(f"{place}/images.*"))]
+    places = dict.fromkeys(f.parent.relative_to(folder).as_posix() for f in files if f.suffix in (".bin", ".txt"))
+    return tuple(f"A COLMAP model in '{place}' is not read: move it to sparse/0." for place in places)
+
+
+def _parts_of(reader: ModuleType, file: Path) -> list[Path]:
+    """Return the files beside the scene file that its format consists of."""
+    return reader.parts(file) if hasattr(reader, "parts") else []
+
+
+def _up(up: tuple[float, float, float] | None, manifest: Manifest) -> tuple[float, float, float] | None:
+    """Return the file's up axis in the world frame."""
+    if up is None or manifest.world_from_scene is None:
+        return up
+    turned = manifest.world_from_scene[:3, :3] @ np.array(up)
+    x, y, z = (float(v) for v in turned / np.linalg.norm(turned))
+    return x, y, z
 
 
 def _median_size(cameras: tuple[NamedCamera, ...]) -> tuple[int, int] | None:
@@ -170,10 +162,12 @@ def _moved(camera: NamedCamera, world_from_scene: np.ndarray) -> NamedCamera:
     return replace(camera, camera=replace(camera.camera, pose=moved_pose(camera.camera.pose, world_from_scene)))
 
 
-def _digest(file: Path, path: Path, cameras: tuple[NamedCamera, ...], *facts: object) -> str:
+def _digest(files: Sequence[Path], path: Path, cameras: tuple[NamedCamera, ...], *facts: object) -> str:
     """Return the sha256 of everything that a render or an index of the scene depends on."""
-    with file.open("rb") as stream:
+    with files[0].open("rb") as stream:
         digest = hashlib.file_digest(stream, "sha256")
+    for part in files[1:]:
+        digest.update(part.read_bytes())
     if (path / MANIFEST).is_file():
         digest.update((path / MANIFEST).read_bytes())
     digest.update(repr(facts).encode())

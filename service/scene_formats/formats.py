@@ -7,10 +7,9 @@ from pathlib import Path
 from types import ModuleType
 
 from service.plugins import PluginRegistry
+from service.scene_formats.unread import UNREAD_SUFFIXES
 
 SCENE_FORMATS = PluginRegistry("service.scene_formats", "splatfix.scene_formats", ("read", "accepts", "SUFFIXES"))
-_UNREAD_SUFFIXES = (".spz", ".ksplat", ".sog")
-"""Of scene formats without a reader here: such a file is refused by name, not overlooked."""
 log = logging.getLogger(__name__)
 
 
@@ -19,9 +18,30 @@ def readable_suffixes() -> tuple[str, ...]:
     return tuple(dict.fromkeys(suffix for reader in SCENE_FORMATS.available() for suffix in reader.SUFFIXES))
 
 
+def readable_names() -> tuple[str, ...]:
+    """Return the file names that formats of several files have for the one that is opened, e.g. `meta.json`."""
+    return tuple(name for reader in SCENE_FORMATS.available() for name in getattr(reader, "NAMES", ()))
+
+
 def is_scene_file(path: Path) -> bool:
-    """Whether a file's name has the suffix of a scene format, readable or not; the file itself is not opened."""
-    return path.suffix.lower() in (*readable_suffixes(), *_UNREAD_SUFFIXES)
+    """Whether a file's name is that of a scene, readable or known to be not; the file itself is not opened.
+
+    Names that begin with a dot are none: macOS writes `._scene.ply` beside `scene.ply`.
+    """
+    return not path.name.startswith(".") and (suffix_of(path) in all_kinds() or path.name in readable_names())
+
+
+def all_kinds() -> tuple[str, ...]:
+    """Return the suffixes of scene files, readable or not."""
+    return (*readable_suffixes(), *UNREAD_SUFFIXES)
+
+
+def suffix_of(path: Path) -> str:
+    """Return what a file's format is told by: a format's own name or suffix (`.ply.gz`), else the last suffix."""
+    name = path.name.lower()
+    if name in readable_names():
+        return name
+    return next((suffix for suffix in all_kinds() if name.endswith(suffix)), path.suffix.lower())
 
 
 def reader_for(head: bytes, suffix: str) -> ModuleType | None:

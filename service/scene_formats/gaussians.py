@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from service.errors import CorruptScene
 from service.types import SH_C0
@@ -15,6 +14,12 @@ MAX_GAUSSIANS = 20_000_000
 """More than any published scene; with SH degree 3 they would fill 5 GB."""
 MAX_COORDINATE = 1e9
 """Scene units. Squares of larger numbers exceed the range of float32 renderers."""
+MAX_BAD_SHARE = 0.5
+"""Of a file's Gaussians: trainers leave a few NaN, another layout makes nearly all of them."""
+MAX_COEFFICIENTS = 16
+"""Of SH degree 3, the highest that the renderers evaluate."""
+SH_CUT = "Spherical harmonics of degree 4 are left out; those of degree 0 to 3 are used."
+_ARRAYS = ("means", "scales", "opacities", "sh", "quats")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +34,10 @@ class RawGaussians:
     sh: Float32[np.ndarray, "n k 3"]
     render_mode: str | None = None
     """How the scene was trained, if the file has it: default, antialiased, or a mode that is not supported."""
+    up: tuple[float, float, float] | None = None
+    """Unit vector in the file's frame, where its format or its header says so."""
+    warnings: tuple[str, ...] = ()
+    """What of the file is not in these arrays."""
 
 
 def require_count(count: int, where: str) -> None:
@@ -40,33 +49,55 @@ def require_count(count: int, where: str) -> None:
 
 
 def checked(raw: RawGaussians, where: str) -> RawGaussians:
-    """Check the Gaussians and normalize their quaternions. Raises CorruptScene with the first bad one.
+    """Return the usable Gaussians with unit quaternions, and a warning that counts those that were left out.
 
-    Strict on purpose: one NaN makes every pixel that it reaches NaN, and dropping Gaussians silently would hide a
-    broken export.
+    Not usable are non-finite values (one NaN makes every pixel that it reaches NaN), quaternions of length zero,
+    negative scales, and lengths beyond 1e9. Raises CorruptScene with the first one if they are half or more: a file
+    like that is broken, or in another layout than it says.
     """
-    # NaN first: the comparisons below are False for it.
-    for name in ("means", "scales", "opacities", "sh", "quats"):
-        values = getattr(raw, name)
-        _require_none(~np.isfinite(values.reshape(len(values), -1)).all(1), f"non-finite {name}", where)
-    _require_none((np.abs(raw.means) > MAX_COORDINATE).any(1), f"means beyond {MAX_COORDINATE:g} units", where)
-    _require_none((raw.scales > MAX_COORDINATE).any(1), f"scales beyond {MAX_COORDINATE:g} units", where)
-    _require_none((raw.scales < 0).any(1), "negative scales", where)
-    # float64: squares of tiny components would vanish in float32.
-    lengths = np.linalg.norm(raw.quats.astype(np.float64), axis=1)
-    _require_none(lengths < 1e-12, "quaternions of length zero", where)
-    return replace(raw, quats=(raw.quats / lengths[:, None]).astype(np.float32))
-
-
-def _require_none(bad: Any, what: str, where: str) -> None:
-    """Raise CorruptScene if any Gaussian is bad; `bad` has one bool each, which numpy's stubs don't express."""
+    lengths = np.linalg.norm(raw.quats.astype(np.float64), axis=1)  # squares of tiny components vanish in float32
+    faults = {f"non-finite {name}": _non_finite(getattr(raw, name)) for name in _ARRAYS}
+    with np.errstate(invalid="ignore"):
+        faults |= {
+            f"means beyond {MAX_COORDINATE:g} units": (np.abs(raw.means) > MAX_COORDINATE).any(1),
+            f"scales beyond {MAX_COORDINATE:g} units": (raw.scales > MAX_COORDINATE).any(1),
+            "negative scales": (raw.scales < 0).any(1),
+            "quaternions of length zero": lengths < 1e-12,
+        }
+    bad = np.logical_or.reduce(list(faults.values()))
     count = int(np.count_nonzero(bad))
-    if count:
-        raise CorruptScene(
-            f"{count} of {len(bad)} Gaussians have {what}, the first is number {int(np.argmax(bad))}.",
-            where=where,
-            hint="Remove them in an editor, or export the scene again.",
-        )
+    if not count:
+        return replace(raw, quats=(raw.quats / lengths[:, None]).astype(np.float32))
+    what, first = next((what, int(np.argmax(each))) for what, each in faults.items() if each.any())
+    text = f"{count} of {len(bad)} Gaussians have {what} or the like, the first is number {first}"
+    if count >= MAX_BAD_SHARE * len(bad):
+        raise CorruptScene(f"{text}.", where=where, hint="Remove them in an editor, or export the scene again.")
+    good = ~bad
+    kept = {name: getattr(raw, name)[good] for name in _ARRAYS}
+    kept["quats"] = (kept["quats"] / lengths[good, None]).astype(np.float32)
+    return replace(raw, **kept, warnings=(*raw.warnings, f"{text}; they are left out."))
+
+
+def _non_finite(values: np.ndarray) -> Bool[np.ndarray, "n"]:
+    return ~np.isfinite(values.reshape(len(values), -1)).all(1)
+
+
+def cut_sh(sh: Float32[np.ndarray, "n k 3"]) -> tuple[Float32[np.ndarray, "n m 3"], tuple[str, ...]]:
+    """Return the coefficients up to degree 3, and a warning if there were more."""
+    if sh.shape[1] <= MAX_COEFFICIENTS:
+        return sh, ()
+    return np.ascontiguousarray(sh[:, :MAX_COEFFICIENTS]), (SH_CUT,)
+
+
+def joined(parts: list[RawGaussians]) -> RawGaussians:
+    """Return the Gaussians of several parts of one file; those of a lower SH degree than others get zeros."""
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh.shape[1] for part in parts)
+    sh = [np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0))) for part in parts]
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS if name != "sh"}
+    warnings = tuple(dict.fromkeys(text for part in parts for text in part.warnings))
+    return replace(parts[0], **arrays, sh=np.concatenate(sh), warnings=warnings)
 
 
 def sh_from_rgb(rgb: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n 1 3"]:

@@ -18,6 +18,8 @@ from service.photos.images import photo_size
 from service.scene_formats.manifest import Manifest, colour, numbers, read_json
 from service.types import Camera, Intrinsics, NamedCamera, Pose
 
+DATAPARSER = "dataparser_transforms.json"
+"""What nerfstudio writes beside its models: how its trainer moved and scaled the cameras."""
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Of camera axes; its own inverse."""
 _SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".webp")

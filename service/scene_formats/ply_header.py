@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from io import BufferedReader
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from service.errors import CorruptScene, UnsupportedFormat
 
-MAX_HEADER_BYTES = 64 * 1024
+MAX_HEADER_BYTES = 256 * 1024
 """A 3DGS header has 2 KB."""
-MAX_PROPERTIES = 512
+MAX_PROPERTIES = 4096
+"""Feature fields add hundreds of properties to each Gaussian."""
+MAX_LIST = 65_536
+"""Entries of a list property; a face has three or four."""
 BLOCK = 16_384
 """Records read at once: 4 MB at SH degree 3, which fit a processor's cache."""
 _TYPES = {
@@ -21,7 +26,7 @@ _TYPES = {
     "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
     "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
 }  # fmt: skip
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +35,8 @@ class PlyElement:
     count: int
     dtype: np.dtype | None
     """Of one record, with the properties as fields; None if it has a list property."""
+    lists: tuple[tuple[str, str], ...] = ()
+    """Of an element with a list property: for each property the type of its length ("" of a plain one) and values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +44,8 @@ class PlyHeader:
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
     data_offset: int
+    text: bool = False
+    """Numbers are written as text, a record a line."""
 
     def element(self, name: str) -> PlyElement | None:
         """Return the element of this name, if there is one."""
@@ -44,7 +53,7 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Parse the header. Raises CorruptScene, or UnsupportedFormat for a text PLY."""
+    """Parse the header. Raises CorruptScene."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_BYTES)
     # The data begin after the line's end, whatever stands behind end_header (a "\r").
@@ -55,7 +64,7 @@ def read_header(path: Path) -> PlyHeader:
     lines = head[:end].decode("ascii", "replace").splitlines()
     comments = tuple(line[8:].strip() for line in lines if line.startswith("comment "))
     order = _byte_order(lines, path)
-    return PlyHeader(_elements(lines, order, path), comments, newline + 1)
+    return PlyHeader(_elements(lines, order, path), comments, newline + 1, text=order == "=")
 
 
 def _byte_order(lines: list[str], path: Path) -> str:
@@ -63,8 +72,6 @@ def _byte_order(lines: list[str], path: Path) -> str:
     if len(formats) != 1 or len(formats[0]) != 3:
         raise CorruptScene("the header needs exactly one 'format' line.", where=path.name)
     kind = formats[0][1]
-    if kind == "ascii":  # parsing millions of numbers as text would take minutes
-        raise UnsupportedFormat("a text PLY is not read.", where=path.name, hint="Save it as binary.")
     if kind not in _BYTE_ORDERS:
         raise CorruptScene(f"unknown PLY format '{kind[:40]}'.", where=path.name)
     return _BYTE_ORDERS[kind]
@@ -83,7 +90,15 @@ def _elements(lines: list[str], order: str, path: Path) -> tuple[PlyElement, ...
             if not found or len(words) < 3:
                 raise CorruptScene(f"a property out of place: '{line[:80]}'.", where=f"{path.name}:{number}")
             found[-1][2].append(words[1:])
-    return tuple(PlyElement(name, count, _dtype(name, p, order, path)) for name, count, p in found)
+    return tuple(PlyElement(name, count, _dtype(name, p, order, path), _lists(p, order)) for name, count, p in found)
+
+
+def _lists(properties: list[list[str]], order: str) -> tuple[tuple[str, str], ...]:
+    """Return the types of an element's properties if one is a list, as `PlyElement.lists`; () where one is unknown."""
+    kinds = [p[1:3] if p[0] == "list" else ["", p[0]] for p in properties]
+    if not any(p[0] == "list" for p in properties) or any(set(k) - {"", *_TYPES} or len(k) < 2 for k in kinds):
+        return ()
+    return tuple((order + _TYPES[k[0]] if k[0] else "", order + _TYPES[k[1]]) for k in kinds)
 
 
 def _dtype(element: str, properties: list[list[str]], order: str, path: Path) -> np.dtype | None:
@@ -103,45 +118,92 @@ def _dtype(element: str, properties: list[list[str]], order: str, path: Path) ->
 
 
 def element_records(path: Path, header: PlyHeader, name: str) -> np.ndarray:
-    """Read an element's records. Raises CorruptScene, before it allocates, if the file has another size."""
-    element, offset = _located(path, header, name)
-    return np.fromfile(path, element.dtype, element.count, offset=offset)
+    """Read an element's records. Raises CorruptScene, before it allocates, if the file is too short."""
+    return np.concatenate([block for _, block in element_blocks(path, header, name)])
 
 
 def element_blocks(path: Path, header: PlyHeader, name: str) -> Iterator[tuple[slice, np.ndarray]]:
-    """Yield an element's records in blocks that fit a cache, each with its slice. Raises as `element_records`."""
-    element, offset = _located(path, header, name)
+    """Yield an element's records in blocks that fit a cache, each with its slice. Raises as `element_records`.
+
+    What follows the last element is passed over: other readers do, and some programs write a newline there.
+    """
     with path.open("rb") as file:
-        file.seek(offset)
+        element = _seek(file, path, header, name)
+        dtype = element.dtype
+        assert dtype is not None
         for start in range(0, element.count, BLOCK):
-            block = np.fromfile(file, element.dtype, min(BLOCK, element.count - start))
-            yield slice(start, start + len(block)), block
+            rows = min(BLOCK, element.count - start)
+            block = _text_block(file, dtype, rows, path, start) if header.text else np.fromfile(file, dtype, rows)
+            yield slice(start, start + rows), block
 
 
-def _located(path: Path, header: PlyHeader, name: str) -> tuple[PlyElement, int]:
-    """Return the element and its first byte. Raises CorruptScene unless the file's size fits the header."""
-    # Elements follow one another in the header's order, records without padding.
-    offset = header.data_offset
+def _text_block(file: BufferedReader, dtype: np.dtype, rows: int, path: Path, start: int) -> np.ndarray:
+    lines = list(islice(file, rows))
+    try:
+        values = np.array([line.split() for line in lines], np.float64)
+    except ValueError:  # a word that is no number, or lines of different lengths
+        values = np.empty((0, 0))
+    if values.shape != (rows, len(dtype.names or ())):
+        raise CorruptScene(
+            f"needs {len(dtype.names or ())} numbers on each of {rows} lines.",
+            where=f"{path.name}, records {start} to {start + rows}",
+        )
+    block = np.empty(rows, dtype)
+    with np.errstate(over="ignore", invalid="ignore"):
+        for column, field in enumerate(dtype.names or ()):
+            block[field] = values[:, column]
+    return block
+
+
+def _seek(file: BufferedReader, path: Path, header: PlyHeader, name: str) -> PlyElement:
+    """Move to an element's first record and return it. Raises CorruptScene unless the file can hold the header's."""
+    file.seek(header.data_offset)
     for element in header.elements:
-        if element.dtype is None:
-            raise UnsupportedFormat(f"element '{element.name}' has a list property.", where=path.name)
         if element.name == name:
             break
-        offset += element.count * element.dtype.itemsize
+        _skip(file, element, header.text, path)
     else:
         raise CorruptScene(f"the header has no element '{name}'.", where=path.name)
-    there = path.stat().st_size - offset
-    needed = element.count * element.dtype.itemsize
-    if there < needed:
-        whole = max(0, there // max(element.dtype.itemsize, 1))
+    if element.dtype is None:
+        raise UnsupportedFormat(f"element '{element.name}' has a list property.", where=path.name)
+    there = path.stat().st_size - file.tell()
+    # Text takes at least a digit and a blank a number.
+    size = 2 * len(element.dtype.names or ()) if header.text else element.dtype.itemsize
+    if there < element.count * size - header.text:
+        whole = max(0, there // max(size, 1))
         raise CorruptScene(
             f"truncated: the header has {element.count} of '{name}', the file ends after {whole}.",
             where=f"{path.name}, byte {path.stat().st_size}",
             hint="Copy or export it again.",
         )
-    if element is header.elements[-1] and there > needed:
-        raise CorruptScene(
-            f"{there - needed} bytes follow the {element.count} of '{name}' in the header.",
-            where=f"{path.name}, byte {offset + needed}",
-        )
-    return element, offset
+    return element
+
+
+def _skip(file: BufferedReader, element: PlyElement, text: bool, path: Path) -> None:
+    """Pass over an element's records; those with lists (faces) have to be walked through."""
+    if element.dtype is not None and not text:
+        file.seek(element.count * element.dtype.itemsize, 1)
+        return
+    if element.count and not element.lists and element.dtype is None:
+        raise UnsupportedFormat(f"element '{element.name}' has a list of unknown type.", where=path.name)
+    types = [(np.dtype(length) if length else None, np.dtype(value).itemsize) for length, value in element.lists]
+    for number in range(element.count):
+        if text:
+            whole = bool(file.readline())
+        else:
+            whole = all(_skip_property(file, length, size) for length, size in types)
+        if not whole:
+            raise CorruptScene(f"truncated within '{element.name}'.", where=f"{path.name}, record {number}")
+
+
+def _skip_property(file: BufferedReader, length: np.dtype | None, size: int) -> bool:
+    """Pass over one property; False at the file's end."""
+    if length is None:
+        return len(file.read(size)) == size
+    head = file.read(length.itemsize)
+    if len(head) < length.itemsize:
+        return False
+    values = int(np.frombuffer(head, length)[0])
+    if not 0 <= values <= MAX_LIST:
+        return False
+    return len(file.read(values * size)) == values * size

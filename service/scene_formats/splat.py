@@ -15,7 +15,7 @@ SUFFIXES = (".splat",)
 
 def accepts(head: bytes, suffix: str) -> bool:
     """Whether the suffix is the format's, which has no header to recognize it by."""
-    return suffix in SUFFIXES
+    return suffix in SUFFIXES and not head.startswith(b"PK\x03\x04")  # a ZIP, of whatever
 
 
 def read(path: Path) -> RawGaussians:

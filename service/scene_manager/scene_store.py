@@ -1,8 +1,7 @@
 """The catalogue of scenes: which there are, where their files lie, and what was added to them over HTTP.
 
-An upload is streamed to disk, checked, and only then becomes visible under its name. An archive is a ZIP of a scene
-folder (or of what is in it). Only files that a scene is read from are taken out of it, under their own names; what the
-archive says of paths, links and sizes is not trusted.
+An upload is streamed to disk, checked, and only then becomes visible under its name. It is a scene file, or a ZIP of a
+scene folder or of what is in it (`scene_archive`). Some scene files are ZIPs themselves.
 """
 
 from __future__ import annotations
@@ -12,13 +11,12 @@ import os
 import re
 import shutil
 import zipfile
-import zlib
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import TracebackType
-from typing import IO, Protocol, Self, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 from service.errors import (
     BadInput,
@@ -32,17 +30,15 @@ from service.errors import (
 )
 from service.scene_formats import load_scene
 from service.scene_formats.discovery import find_scenes
-from service.scene_formats.folder import COLMAP_FOLDER
-from service.scene_formats.formats import is_scene_file, readable_suffixes
-from service.scene_formats.manifest import MANIFEST
+from service.scene_formats.formats import all_kinds, readable_suffixes, reader_for, suffix_of
+from service.scene_formats.layouts import is_scene_folder, scene_file
+from service.scene_formats.manifest import read_manifest
+from service.scene_manager.scene_archive import unpack
 from service.scene_manager.status import AUTO, StoredScene
 
 _log = logging.getLogger(__name__)
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
-_MAX_MEMBERS = 20_000
-_COPY_BYTES = 1 << 20
-_MAX_NAME_BYTES = 255
-"""On all usual file systems."""
+_HEAD_BYTES = 4096
 
 
 @runtime_checkable
@@ -118,7 +114,10 @@ def _free_id(wanted: str, taken: Container[str]) -> str:
 class FolderSceneStore:
     """Scenes that the operator names, and one folder of uploads; `.incoming` in it holds what is not checked yet."""
 
-    def __init__(self, named: Sequence[StoredScene], folder: Path, max_bytes: int) -> None:
+    def __init__(
+        self, named: Sequence[StoredScene], folder: Path, max_bytes: int, *, allow_checkpoints: bool = False
+    ) -> None:
+        self._allow_checkpoints = allow_checkpoints
         self._named = {scene.id: scene for scene in named}
         self._folder, self._max_bytes = folder, max_bytes
         self._incoming = folder / ".incoming"
@@ -139,7 +138,10 @@ class FolderSceneStore:
         if scene_id in self._named or (self._folder / scene_id).exists():
             raise _exists(scene_id)
         return FolderDraft(
-            self._incoming / f"{scene_id}.{os.urandom(4).hex()}", self._folder / scene_id, self._max_bytes
+            self._incoming / f"{scene_id}.{os.urandom(4).hex()}",
+            self._folder / scene_id,
+            self._max_bytes,
+            self._allow_checkpoints,
         )
 
     def delete(self, scene_id: str) -> None:
@@ -158,8 +160,9 @@ class FolderSceneStore:
 class FolderDraft:
     """A folder that becomes the scene's when all is well."""
 
-    def __init__(self, folder: Path, target: Path, max_bytes: int) -> None:
+    def __init__(self, folder: Path, target: Path, max_bytes: int, allow_checkpoints: bool) -> None:
         self._folder, self._target, self._max_bytes = folder, target, max_bytes
+        self._allow_checkpoints = allow_checkpoints
         with _storing(target):
             folder.mkdir()
             self._file = (folder / "upload").open("wb")
@@ -190,25 +193,39 @@ class FolderDraft:
     def _check(self, file_name: str) -> None:
         """Make a scene folder of what was sent, and read it once."""
         upload = self._folder / "upload"
-        if zipfile.is_zipfile(upload):
-            _unpack(upload, self._folder, self._max_bytes)
+        suffix = suffix_of(Path(file_name))
+        with upload.open("rb") as file:
+            named = suffix != ".ply" and reader_for(file.read(_HEAD_BYTES), suffix) is not None
+        if not named and zipfile.is_zipfile(upload):
+            unpack(upload, self._folder, self._max_bytes)
             upload.unlink()
-            if not any(is_scene_file(path) for path in self._folder.iterdir()):
+            if not is_scene_folder(self._folder):
                 raise UnsupportedFormat(
                     f"the archive holds no scene file ({', '.join(readable_suffixes())}).", where="archive"
                 )
         else:
-            if not is_scene_file(Path(file_name)):
+            if suffix not in all_kinds():
                 names = " or ".join(f"`scene{suffix}`" for suffix in readable_suffixes())
                 raise InvalidRequest(f"say what kind of file it is: {names}, or send a ZIP.", where="query.file")
-            upload.rename(self._folder / f"scene{Path(file_name).suffix.lower()}")
+            upload.rename(self._folder / f"scene{suffix}")
         try:
+            self._require_allowed()
             # Read once, so that a broken file is refused at the upload, not at the first job.
             load_scene(self._folder)
         except SceneError as error:
             # Clients must not learn where the service keeps its files.
             error.where = error.where.replace(str(self._folder), "archive")
             raise CorruptScene(str(error), where="archive") if isinstance(error, SceneNotFound) else error from None
+
+    def _require_allowed(self) -> None:
+        """Raise UnsupportedFormat for a checkpoint unless the operator allows them: they are pickles."""
+        _, reader = scene_file(self._folder, read_manifest(self._folder))
+        if getattr(reader, "UNPICKLES", False) and not self._allow_checkpoints:
+            raise UnsupportedFormat(
+                "checkpoints can't be uploaded to this service.",
+                where="archive",
+                hint="Export the scene as .ply, or have the operator set upload_checkpoints.",
+            )
 
 
 @contextmanager
@@ -222,38 +239,6 @@ def _storing(target: Path) -> Iterator[None]:
         raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
 
 
-def _unpack(archive: Path, folder: Path, max_bytes: int) -> None:
-    """Take a scene's files out of an archive. Raises CorruptScene, UnsupportedFormat, OSError."""
-    left = max_bytes
-    with _reading():
-        opened = zipfile.ZipFile(archive)
-    with opened:
-        members = [m for m in opened.infolist() if not m.filename.endswith("/")]
-        if len(members) > _MAX_MEMBERS:
-            raise CorruptScene(f"the archive holds more than {_MAX_MEMBERS} files.", where="archive")
-        paths = [PurePosixPath(m.filename.lstrip("/")) for m in members]
-        top = _common_top(paths)
-        for member, path in zip(members, paths, strict=True):
-            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                # LZMA takes as much memory as the archive says, up to 4 GB.
-                raise UnsupportedFormat("only stored and deflated files are read.", where="archive")
-            name = _wanted(path.relative_to(top))
-            if name is not None:
-                with _reading():
-                    source = opened.open(member)
-                with source:
-                    left = _copied(source, folder / name, left)
-
-
-@contextmanager
-def _reading() -> Iterator[None]:
-    """Blame the archive, not our disk. Raises CorruptScene."""
-    try:
-        yield
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, RuntimeError, ValueError, OSError) as error:
-        raise CorruptScene(f"the archive can't be read: {str(error)[:200]}.", where="archive") from error
-
-
 def _exists(scene_id: str) -> SceneExists:
     return SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
 
@@ -264,45 +249,3 @@ def check_scene_id(scene_id: str) -> None:
         raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
     if scene_id == AUTO:
         raise InvalidRequest(f"no scene can be called '{AUTO}': it stands for all.", where="path.scene_id")
-
-
-def _common_top(paths: list[PurePosixPath]) -> PurePosixPath:
-    """Return the folder that all files are in, if there is one: many pack the folder, others what is in it."""
-    tops = {path.parts[:1] for path in paths}
-    nested = all(len(path.parts) > 1 for path in paths)
-    if len(tops) == 1 and nested and tops != {COLMAP_FOLDER.parts[:1]}:
-        return PurePosixPath(*tops.pop())
-    return PurePosixPath()
-
-
-def _wanted(path: PurePosixPath) -> str | None:
-    """Return under what name a member is stored, None for what a scene isn't read from."""
-    name = path.name
-    if path.parts == (name,) and (
-        is_scene_file(Path(name)) or name == MANIFEST or re.fullmatch(r"transforms\w*\.json", name)
-    ):
-        return name if re.fullmatch(r"[\w. -]+", name) and len(name.encode()) <= _MAX_NAME_BYTES else None
-    if path.parent == PurePosixPath(*COLMAP_FOLDER.parts) and re.fullmatch(r"[a-z]{1,40}\.(bin|txt)", name):
-        return str(path)
-    return None
-
-
-def _copied(source: IO[bytes], path: Path, left: int) -> int:
-    """Copy at most `left` bytes into a new file; return how many more there may be. Raises CorruptScene, OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        # Two members may have one name, and on some file systems names differ in case only.
-        target = path.open("xb")
-    except FileExistsError as error:
-        raise CorruptScene("two files of the archive have the same name.", where="archive") from error
-    with target:
-        while True:
-            with _reading():
-                chunk = source.read(_COPY_BYTES)
-            if not chunk:
-                return left
-            # The size in the archive is not trusted: small files can unpack to any size.
-            left -= len(chunk)
-            if left < 0:
-                raise CorruptScene("the archive holds more than the service takes.", where="archive")
-            target.write(chunk)

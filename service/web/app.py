@@ -119,7 +119,9 @@ async def _start(
     """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
     folder = stack.enter_context(data_folder(settings.data_dir))
     keys.keep_sessions(folder / "sessions.key")
-    scene_store = FolderSceneStore(named, folder / "scenes", settings.max_scene_bytes)
+    scene_store = FolderSceneStore(
+        named, folder / "scenes", settings.max_scene_bytes, allow_checkpoints=settings.upload_checkpoints
+    )
     for scene in scene_store.scenes():
         if scene.uploaded:
             engine.add(scene)

@@ -76,6 +76,8 @@ class Settings(BaseSettings):
     """Memory limit of all loaded scenes; the least recently used one is dropped to make room. None: no limit."""
     max_scene_bytes: int = Field(default=2_000_000_000, ge=1)
     """Largest scene file or archive that can be uploaded; also the limit of an archive's unpacked files together."""
+    upload_checkpoints: bool = False
+    """Whether checkpoints of trainers (.pt, .ckpt) can be uploaded: pickles, loaded in a process of their own."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: int = Field(default=8000, ge=0, lt=65536)

@@ -1,0 +1,85 @@
+"""Write the Gaussians of a checkpoint as plain arrays, in a process of its own, since the file is pickled.
+
+    python -I checkpoint_process.py FILE FOLDER MAX_GAUSSIANS
+
+Writes FOLDER/NAME.npy and a line of JSON: {"error"}, {"unsupported"}, or {"rgb_logits"}: whether colours are logits of
+RGB. Started by `checkpoint` only; imports nothing of the service.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+_CPU_S = 240
+_LIBRARIES_BYTES = 24 << 30
+"""Address space that PyTorch with CUDA reserves without using it."""
+_MINIMUM = (2, 10)
+"""PyTorch before has a heap corruption in `weights_only` loading."""
+_GSPLAT = {name: name for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+_NERFSTUDIO = {**{name: name for name in ("means", "quats", "scales", "opacities")},
+               "sh0": "features_dc", "shN": "features_rest"}  # fmt: skip
+_PREFIXES = ("_model.gauss_params.", "_model.")
+
+
+def main() -> None:
+    """Load the file within limits that a hostile one can't lift."""
+    path, folder, most = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
+    memory = _LIBRARIES_BYTES + 3 * path.stat().st_size
+    for limit, value in (
+        *((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, _CPU_S), (resource.RLIMIT_CORE, 0)),
+        (resource.RLIMIT_FSIZE, most * 240),
+    ):
+        resource.setrlimit(limit, (value, value))
+    warnings.simplefilter("ignore")
+    sys.stdout.write(json.dumps(extracted(path, folder, most)))
+
+
+def extracted(path: Path, folder: Path, most: int) -> dict[str, object]:
+    """Write the arrays and return what is told."""
+    version = tuple(int(part) for part in torch.__version__.split(".")[:2])
+    if version < _MINIMUM:
+        return {"unsupported": f"checkpoints need PyTorch 2.10 or later; this is {torch.__version__}."}
+    try:
+        # Not memory-mapped, so that the limit of memory holds.
+        data = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a broken or hostile file raises almost anything
+        return {"error": f"the checkpoint can't be loaded: {str(error).splitlines()[0][:200]}"}
+    tensors, names = _tensors(data)
+    missing = [names[name] for name in _GSPLAT if name != "shN" and name not in tensors]
+    if missing:
+        return {"unsupported": f"a checkpoint of another method: it has no {', '.join(missing[:3])}."}
+    for name, tensor in tensors.items():
+        if len(tensor) > most or tensor.numel() > most * 75 or not tensor.is_floating_point():
+            return {"error": f"'{names[name]}' has the shape {tuple(tensor.shape)} of {tensor.dtype}."}
+        np.save(folder / f"{name}.npy", tensor.float().contiguous().numpy(), allow_pickle=False)
+    flat = "shN" not in tensors or 0 in tensors["shN"].shape
+    return {"rgb_logits": names is _NERFSTUDIO and flat}
+
+
+def _tensors(data: Any) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Return the tensors by gsplat's names, and the names that they have in the file."""
+    splats = data.get("splats") if isinstance(data, dict) else None
+    if isinstance(splats, dict):
+        return _named(splats, _GSPLAT, ""), _GSPLAT
+    pipeline = data.get("pipeline") if isinstance(data, dict) else None
+    if not isinstance(pipeline, dict):
+        return {}, _GSPLAT
+    prefix = next((p for p in _PREFIXES if f"{p}means" in pipeline), _PREFIXES[0])
+    return _named(pipeline, _NERFSTUDIO, prefix), _NERFSTUDIO
+
+
+def _named(values: dict[str, Any], names: dict[str, str], prefix: str) -> dict[str, torch.Tensor]:
+    found = {name: values.get(prefix + stored) for name, stored in names.items()}
+    return {name: value for name, value in found.items() if isinstance(value, torch.Tensor) and value.ndim}
+
+
+if __name__ == "__main__":
+    main()
