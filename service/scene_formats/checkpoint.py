@@ -7,9 +7,7 @@ and writes plain arrays, which are read here.
 from __future__ import annotations
 
 import json
-import os
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from service.errors import CorruptScene, UnsupportedFormat
+from service.operating_system import child_environment, limited_command
 from service.scene_formats.gaussians import MAX_GAUSSIANS, RawGaussians, cut_sh, require_count
 from service.types import SH_C0
 
@@ -25,7 +24,9 @@ SUFFIXES = (".pt", ".ckpt")
 UNPICKLES = True
 """Uploads of this format are refused unless a setting allows them."""
 _PROGRAM = Path(__file__).with_name("checkpoint_process.py")
-_MAX_S = 300
+_MAX_S, _CPU_S = 300, 240
+_LIBRARIES_BYTES = 24 << 30
+"""Address space that PyTorch with CUDA reserves without using it."""
 _WIDTHS = {"means": 3, "quats": 4, "scales": 3, "opacities": 1, "sh0": 3}
 
 
@@ -51,10 +52,13 @@ def read(path: Path) -> RawGaussians:
 
 def _extracted(path: Path, folder: Path) -> dict[str, Any]:
     """Have the other process write the arrays into the folder. Raises CorruptScene, UnsupportedFormat."""
-    command = [sys.executable, "-I", str(_PROGRAM), str(path.resolve()), str(folder), str(MAX_GAUSSIANS)]
-    kept = {name: os.environ[name] for name in ("PATH", "LD_LIBRARY_PATH") if name in os.environ}
+    memory = _LIBRARIES_BYTES + 3 * path.stat().st_size
+    arguments = (path.resolve(), folder, MAX_GAUSSIANS)
+    command = limited_command(_PROGRAM, *arguments, memory_bytes=memory, cpu_s=_CPU_S)
     try:
-        done = subprocess.run(command, capture_output=True, timeout=_MAX_S, check=True, env=kept, cwd=folder)
+        done = subprocess.run(
+            command, capture_output=True, timeout=_MAX_S, check=True, env=child_environment(), cwd=folder
+        )
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         raise CorruptScene(
             f"its loader crashed or took too long or too much memory ({type(error).__name__}).", where=path.name

@@ -3,13 +3,12 @@
     python -I checkpoint_process.py FILE FOLDER MAX_GAUSSIANS
 
 Writes FOLDER/NAME.npy and a line of JSON: {"error"}, {"unsupported"}, or {"rgb_logits"}: whether colours are logits of
-RGB. Started by `checkpoint` only; imports nothing of the service.
+RGB. Started by `checkpoint` only, within limits that a hostile file can't lift; imports nothing of the service.
 """
 
 from __future__ import annotations
 
 import json
-import resource
 import sys
 import warnings
 from pathlib import Path
@@ -18,9 +17,6 @@ from typing import Any
 import numpy as np
 import torch
 
-_CPU_S = 240
-_LIBRARIES_BYTES = 24 << 30
-"""Address space that PyTorch with CUDA reserves without using it."""
 _MINIMUM = (2, 10)
 """PyTorch before has a heap corruption in `weights_only` loading."""
 _GSPLAT = {name: name for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
@@ -30,14 +26,8 @@ _PREFIXES = ("_model.gauss_params.", "_model.")
 
 
 def main() -> None:
-    """Load the file within limits that a hostile one can't lift."""
+    """Load the file and tell what was found."""
     path, folder, most = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-    memory = _LIBRARIES_BYTES + 3 * path.stat().st_size
-    for limit, value in (
-        *((resource.RLIMIT_AS, memory), (resource.RLIMIT_CPU, _CPU_S), (resource.RLIMIT_CORE, 0)),
-        (resource.RLIMIT_FSIZE, most * 240),
-    ):
-        resource.setrlimit(limit, (value, value))
     warnings.simplefilter("ignore")
     sys.stdout.write(json.dumps(extracted(path, folder, most)))
 
