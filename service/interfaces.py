@@ -59,6 +59,10 @@ class Rasterizer(Protocol):
         """Return a rasterizer of the same Gaussians, in the same memory, as if trained on photos of this size."""
         ...
 
+    def over(self, background_rgb: tuple[float, float, float]) -> Rasterizer:
+        """Return a rasterizer of the same Gaussians, in the same memory, over another background (sRGB, 0..1)."""
+        ...
+
     def render(
         self,
         cameras: Sequence[Camera],

@@ -30,6 +30,7 @@ from service.matchers import MATCHERS
 from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
+from service.pose.features.untold_background import WHITE, has_white_border, shows_background
 from service.pose.verification.gate import VERIFICATION, downgraded, verify
 from service.render import RASTERIZERS
 from service.render.render_counter import Counted
@@ -42,6 +43,10 @@ DEFAULT_ESTIMATOR = "view_index"
 RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
 """Where no rasterizer is named, the first one that can run here is used."""
 DEFAULT_MATCHER = "xfeat"
+WHITE_ASSUMED = (
+    "no file says which background the scene was trained on: white is assumed, for the photo's border is white; say "
+    '"background" in scene.json.'
+)
 
 
 class Cancelled(Exception):
@@ -64,6 +69,7 @@ class LoadedScene:
     warnings: tuple[str, ...] = ()
     """For every result."""
     _prepared: dict[str, Any] = field(default_factory=dict)
+    _over_white: LoadedScene | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @classmethod
@@ -119,6 +125,32 @@ class LoadedScene:
                 release(self.scene)
             return self._prepared[estimator]
 
+    def as_seen_by(self, query: Query) -> LoadedScene:
+        """Return this scene, over white where its background is untold, shows, and is white in the photo.
+
+        The first such photo has the scene's view index made again, over white.
+        """
+        info = self.scene.info
+        if info.background_is_known or info.background_rgb == WHITE:
+            return self
+        if not has_white_border(query.rgb, query.valid_mask):
+            return self
+        index = self.prepare(DEFAULT_ESTIMATOR)
+        with self._lock:
+            if self._over_white is None:
+                shown = shows_background(self.rasterizer, [view.camera for view in index.views])
+                self._over_white = self._over(WHITE) if shown else self
+            return self._over_white
+
+    def _over(self, background_rgb: tuple[float, float, float]) -> LoadedScene:
+        """Return the scene over an assumed background, in the same memory."""
+        scene = replace(self.scene, info=replace(self.scene.info, background_rgb=background_rgb))
+        said = (*self.warnings, WHITE_ASSUMED)
+        return replace(
+            self, scene=scene, rasterizer=self.rasterizer.over(background_rgb), warnings=said,
+            _prepared={}, _over_white=None, _lock=threading.Lock(),
+        )  # fmt: skip
+
 
 def choose_rasterizer() -> tuple[str, str]:
     """Return the rasterizer for scenes that name none, and why it isn't an earlier one of RASTERIZER_ORDER."""
@@ -170,6 +202,7 @@ def localize(
 ) -> PoseEstimate:
     """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing."""
     request = request or Request()
+    loaded = loaded.as_seen_by(query)
     plugin = ESTIMATORS.load(request.estimator)
     _require_matching(request.estimator, loaded)
     options = request.options if request.options is not None else plugin.Options()

@@ -128,6 +128,7 @@ class Tracker:
         """
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled
+        self._loaded = self._loaded.as_seen_by(query)
         # Equal intervals of 1: only their ratios matter.
         if time_s is None:
             time_s = self._past[-1][0] + 1.0 if self._past else 0.0

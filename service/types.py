@@ -230,6 +230,8 @@ class SceneInfo:
     """The reader's name: ply, compressed_ply, ply_gz, splat, ksplat, spz, sog, gltf, checkpoint."""
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Seen where alpha is 0; sRGB, 0..1."""
+    background_is_known: bool = True
+    """Whether a file says so; if not, black is assumed unless a photo shows white."""
     up_in_world: tuple[float, float, float] | None = None
     metres_per_unit: float | None = None
     render_mode: Literal["default", "antialiased"] = "default"

@@ -37,6 +37,7 @@ from service.web.schemas.conversion import intrinsics_out, named_camera_out, pos
 from service.web.schemas.job_results import FrameOut
 from service.web.schemas.jobs import JobLinks, JobOut, PhotoOut
 from service.web.schemas.scenes import SceneLinks, SceneOut
+from service.web.viewer_relay import Upstream
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 
@@ -238,7 +239,14 @@ class FakeService:
         self.jobs: list[FakeJob] = []
         self.scenes = ["ball"]
         """Ids; all have the same content."""
-        self.version = {"viser": "1"}
+        self.run = "first"
+        """Of the viewer."""
+        self.pending: list[str] = []
+        """What `/readyz` waits for."""
+        self.listed = 100
+        """Jobs on the first page of the list."""
+        self.unloaded = False
+        """The scene isn't in memory yet."""
         self.photos_kept = True
         self.loading_s = 0.0
         """How long splats take."""
@@ -247,6 +255,20 @@ class FakeService:
         self.renders: list[dict] = []
         """What was to be rendered on request."""
         self.transport = httpx.MockTransport(self._answer)
+
+    def upstream(self, port: int) -> Upstream:
+        """What a relay connects to."""
+        fake = self
+
+        class _Upstream:
+            def __init__(self) -> None:
+                self.port = port
+
+            @property
+            def run(self) -> str:
+                return fake.run
+
+        return _Upstream()
 
     def job(self, job_id: str, steps: int = 0, *, finished: bool = False) -> FakeJob:
         """Add a job, the newest from now on."""
@@ -262,11 +284,15 @@ class FakeService:
         path = request.url.path
         self.asked.append(path)
         if path == "/jobs":
-            return httpx.Response(200, json={"jobs": [j.out().model_dump(mode="json") for j in self.jobs]})
+            return httpx.Response(
+                200, json={"jobs": [j.out().model_dump(mode="json") for j in self.jobs[: self.listed]]}
+            )
         if path == "/scenes":
             scenes = [self._scene_out(name).model_dump(mode="json") for name in self.scenes]
             return httpx.Response(200, json={"scenes": scenes})
         _, kind, name, *rest = path.split("/", 3)
+        if kind == "scenes" and self.unloaded:
+            return httpx.Response(503, json={"code": "scene_not_ready", "detail": "scene 'ball' is loading."})
         if kind == "scenes" and not rest:
             return httpx.Response(200, json=self._scene_out(name).model_dump(mode="json"))
         if kind == "scenes" and rest == ["render"]:
@@ -317,6 +343,7 @@ class FakeService:
             sha256=info.sha256,
             format=info.format,
             background_rgb=list(info.background_rgb),
+            background_is_known=info.background_is_known,
             up_in_world=info.up_in_world and list(info.up_in_world),
             metres_per_unit=None,
             render_mode="default",

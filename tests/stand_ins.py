@@ -27,6 +27,9 @@ class FlatRasterizer(Rasterizer):
     name = "flat"
     nbytes = 1000
 
+    def over(self, background_rgb):
+        return self
+
     def trained_at(self, long_side_px):
         return self
 

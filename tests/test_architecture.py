@@ -25,7 +25,7 @@ FLOORS = {
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators"},
         {"localize"},
-        {"tracking", "multi_scene"},
+        {"tracking", "smoothing", "multi_scene"},
         {"scene_manager"},
         {"jobs"},
         {"web", "bench"},

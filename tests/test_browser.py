@@ -6,10 +6,10 @@ import io
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
 from fake_service import FakeService, records
 from fastapi import FastAPI
@@ -40,26 +40,32 @@ def fake() -> FakeService:
 def url(fake: FakeService) -> Iterator[str]:
     """A service that has nothing but the relay to a viewer of the fake service."""
     viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
-    relay = Relay(SimpleNamespace(port=viewer.server.get_port()))
+    relay = Relay(fake.upstream(viewer.server.get_port()))
     relay_only = FastAPI()
     relay_only.include_router(relay.router)
     relay_only.mount("/ui", StaticFiles(directory=PAGES))
-    relay_only.add_api_route("/version", lambda: fake.version)
+    relay_only.add_api_route("/readyz", lambda: {"pending": fake.pending})
     relay_only.router.add_event_handler("shutdown", relay.close)
     with served(relay_only) as url:
         yield f"{url}/viewer"
     viewer.stop()
 
 
-def test_an_open_page_loads_itself_anew_after_an_upgrade(browser: Browser, fake: FakeService, url: str) -> None:
+def test_an_open_page_loads_itself_anew_for_another_run_of_the_viewer(
+    browser: Browser, fake: FakeService, url: str
+) -> None:
     page = opened(browser, f"{url}/")
     page.evaluate("window.old = true")
     for _ in range(2):  # asked twice, and the same answer
-        page.wait_for_event("response", lambda response: response.url.endswith("/version"))
+        page.wait_for_event("response", lambda response: response.url.endswith("/viewer-run"))
     assert page.evaluate("window.old")
-    fake.version = {"viser": "9"}
+    expect(page.locator(".splatfix-lost")).to_have_count(0)
+    fake.run, fake.pending = "second", ["scene ball: loading"]
+    expect(page.locator(".splatfix-lost")).to_contain_text("scene ball: loading")
+    fake.pending = []
     page.wait_for_function("!window.old")
     page.get_by_text("no job", exact=True).wait_for()
+    expect(page.locator(".splatfix-lost")).to_have_count(0)
     page.close()
 
 
@@ -88,6 +94,11 @@ def test_a_replay_file_plays_from_disk(browser: Browser, fake: FakeService, url:
 
 def step_shown(page: Page) -> str:
     return page.get_by_role("slider").first.get_attribute("aria-valuenow") or ""
+
+
+def compare(page: Page, mode: str) -> None:
+    page.get_by_label("compare", exact=True).click()
+    page.get_by_role("option", name=mode, exact=True).click()
 
 
 def wait_for_step(page: Page, index: int) -> None:
@@ -139,16 +150,31 @@ def test_an_old_job_opens_by_its_address_and_can_be_stepped_through(
     wait_for_step(page, 2)
     wait_for_other_picture(page, first)
     second = picture(page)
-    page.get_by_role("button", name="difference").click()
+    compare(page, "difference")
     page.get_by_text("doubled").wait_for()
     wait_for_other_picture(page, second)
-    page.get_by_role("button", name="flicker").click()
+    compare(page, "flicker")
     above = page.locator(".splatfix-flicker img").last
     for opacity in ("1", "0", "1"):
         expect(above).to_have_css("opacity", opacity)
-    page.get_by_role("button", name="beside").click()
+    compare(page, "side by side")
     expect(page.locator("img[src^='blob:']").first).to_be_visible()
     expect(above).not_to_be_visible()
+    page.close()
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_the_3d_view_has_most_of_the_window(
+    browser: Browser, fake: FakeService, url: str, width: int, height: int
+) -> None:
+    fake.job("one", 3, finished=True)
+    page = opened(browser, f"{url}/jobs/one/", width, height)
+    page.get_by_text("localized", exact=True).wait_for()
+    box = page.locator("canvas").first.bounding_box()
+    assert box
+    assert box["width"] >= 0.6 * width
+    found = Axe().run(page, options={"runOnly": ["color-contrast"]})
+    assert not found.violations_count, found.generate_report()
     page.close()
 
 

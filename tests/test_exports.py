@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.cli.result_tables import write_frame_table
 from service.errors import NoGeoAnchor
 from service.geometry import look_at, rotation_from_quat
-from service.jobs.model import JobResult
+from service.geometry import moved as along
+from service.jobs.model import JobResult, SequenceFrame
 from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import GeoAnchor, Intrinsics, Pose
-from service.web.schemas.conversion import geopose_out, result_out
+from service.web.schemas.conversion import frame_out, geopose_out, result_out
 from service.web.schemas.exports import exported
 from service.web.schemas.geodesy import geographic
 from service.web.schemas.job_results import Result
@@ -38,6 +40,38 @@ def at(latitude: float, longitude: float, height: float = 0.0, enu_from_world: n
 
 
 # ------------------------------------------------------------------ files
+
+
+def test_a_smoothed_sequence_marks_what_is_interpolated(tmp_path):
+    """Of a camera that goes along a line with jitter, and one photo that was not localized."""
+    rng = np.random.default_rng(0)
+    frames = []
+    for i in range(12):
+        pose = along(POSE, np.r_[np.zeros(3), 0.1 * i, 0, 0])
+        seen = along(pose, 0.01 * rng.normal(size=6))
+        status = Status.NOT_LOCALIZED if i in (0, 6) else Status.LOCALIZED
+        answer = SequenceFrame(i, f"{i}.jpg", 0.1 * i, status, Reason.VERIFIED, 0.9, True, seen, 1e-4 * np.eye(6))
+        frames.append(frame_out(answer))
+    sequence = result().model_copy(update={"frames": frames})
+
+    def positions(text: str) -> np.ndarray:
+        return np.array([line.split()[1:4] for line in text.splitlines() if not line.startswith("#")], float)
+
+    plain, smooth = (exported("tum", "p", CREATED, sequence, smooth=smooth) for smooth in (False, True))
+    assert (len(positions(plain)), len(positions(smooth))) == (10, 11)
+    marked = smooth.splitlines()
+    assert marked[marked.index(next(line for line in marked if line.startswith("#"))) + 1].startswith("0.600000 ")
+    truth = np.array([along(POSE, np.r_[np.zeros(3), 0.1 * i, 0, 0]).position_in_world for i in range(12)])
+    raw = positions(plain) - np.delete(truth, [0, 6], 0)
+    # 0.5 of the jitter remains.
+    assert np.abs(positions(smooth) - truth[1:]).mean() < 0.8 * np.abs(raw).mean()
+    entries = json.loads(exported("nerfstudio", "p", CREATED, sequence, smooth=True))["frames"]
+    assert [entry["file_path"] for entry in entries if entry.get("interpolated")] == ["6.jpg"]
+    assert exported("colmap", "p", CREATED, sequence, smooth=True).count("# interpolated") == 1
+    write_frame_table(tmp_path / "a.csv", frames, smooth=True)
+    head, *rows = [line.split(",") for line in (tmp_path / "a.csv").read_text().splitlines()]
+    marks = [row[head.index("smoothed")] for row in rows]
+    assert marks == ["", *["smoothed"] * 5, "interpolated", *["smoothed"] * 5]
 
 
 def test_a_colmap_line_is_read_back_by_its_own_rules():

@@ -30,6 +30,9 @@ class Nothing:
 
     name = "nothing"
 
+    def over(self, background_rgb: tuple[float, float, float]) -> Nothing:
+        return self
+
     def trained_at(self, long_side_px: int) -> Nothing:
         self.assumed_px = long_side_px
         return self

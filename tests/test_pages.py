@@ -234,7 +234,7 @@ def test_the_viewer_shows_how_the_pose_was_found(page: Page, url: str) -> None:
     page.get_by_role("tab", name="match vectors").click()
     figures = [page.locator("figcaption").first.inner_text()]
     page.get_by_role("tab", name="curves").click()
-    page.get_by_text("error of position").wait_for()
+    page.get_by_text("position error").last.wait_for()  # the curve's title
     marks = [page.locator("svg[aria-label='loss by step'] path[stroke='#fff']").get_attribute("d")]
     page.keyboard.press("p")
     page.keyboard.press("p")

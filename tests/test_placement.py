@@ -122,6 +122,25 @@ def test_a_closed_room_is_seen_from_inside_whatever_its_unit(scale, shift) -> No
     assert seen > 0.9
 
 
+def test_views_without_an_up_direction_are_upright_by_z_and_by_minus_y() -> None:
+    """Every place has an image that is level with z up; where -y up rolls it by more than features bear, another."""
+    room = closed_room()
+    unknown = replace(room, info=replace(room.info, up_in_world=None))
+    known = replace(room, info=replace(room.info, up_in_world=(0.0, 0.0, 1.0)))
+    found = {
+        name: [c.pose.world_from_camera for c in find_views(s, CpuRasterizer(s), np.random.default_rng(0), FEW).cameras]
+        for name, s in (("unknown", unknown), ("known", known))
+    }
+    # An image is level if its x axis is horizontal.
+    assert all(abs(pose[2, 0]) < 1e-9 for pose in found["known"])
+    by_z = [pose for pose in found["unknown"] if abs(pose[2, 0]) < 1e-9]
+    by_y = [pose for pose in found["unknown"] if abs(pose[1, 0]) < 1e-9 and pose[1, 1] > 0]
+    assert np.array_equal(by_z, found["known"])
+    assert len(by_y) > 0.6 * len(by_z)
+    places = {tuple(pose[:3, 3]) for pose in by_z}
+    assert all(tuple(pose[:3, 3]) in places for pose in by_y)
+
+
 def test_two_rooms_get_views_each() -> None:
     room = closed_room()
     positions, seen, _ = places(joined(room, changed(room, 1.0, (9.0, 0, 0))))

@@ -52,6 +52,9 @@ class PaintedWalls:
     def scene_gradients(self, *args: object) -> SceneGradients:
         raise NotImplementedError
 
+    def over(self, background_rgb: tuple[float, float, float]) -> PaintedWalls:
+        return self
+
     def trained_at(self, long_side_px: int) -> PaintedWalls:
         return self
 

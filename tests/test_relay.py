@@ -36,6 +36,7 @@ PAGE = b"<html><head></head>the one page</html>"
 @dataclass
 class Upstream:
     port: int
+    run: str = "a run"
 
 
 class Viewer:
@@ -125,8 +126,14 @@ def test_every_path_gets_the_page_with_our_script(viewer, path):
     assert page.headers["content-type"].startswith("text/html")
 
 
-@pytest.mark.parametrize(("cookie", "seen"), [("software", "/jobs/abc?gl=software"), ("gpu", "/jobs/abc")])
-def test_the_viewer_hears_that_a_browser_has_no_gpu(viewer, cookie, seen):
+@pytest.mark.parametrize(
+    ("cookie", "seen"),
+    [
+        ("software", "/jobs/abc?gl=software"),
+        ("gpu; splatfix_zone=Europe%2FBerlin", "/jobs/abc?gl=gpu&zone=Europe%2FBerlin"),
+    ],
+)
+def test_the_viewer_hears_of_the_browsers_gpu_and_time_zone(viewer, cookie, seen):
     headers = {"Cookie": f"splatfix_gl={cookie}"}
     with (
         relaying(viewer.port) as address,

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from zoneinfo import ZoneInfo
 
 import cv2
 import fake_service
@@ -27,10 +28,10 @@ from viewer import camera_views, charts, colours, frusta, job_stream, match_geom
 from viewer import comparison_images as images
 from viewer.job_stream import JobStream
 from viewer.layers.splat_layer import full_covariances
-from viewer.panel_html import headline_html, record_html, scene_html
+from viewer.panel_html import headline_html, job_label, record_html, scene_html
 from viewer.playback import Playback
 from viewer.service_lists import ServiceLists
-from viewer.service_values import Job, JobOutcome, parse_splats, record_of
+from viewer.service_values import Job, JobOutcome, ListedJob, parse_splats, record_of
 from viewer.shared_data import SharedData
 
 # ---------------------------------------------------------------- what the service says
@@ -325,7 +326,7 @@ def test_better_scores_are_brighter() -> None:
 
 def test_texts_escape_what_others_wrote() -> None:
     answer = JobOutcome("not_localized", "few_features", "Take it <sharper>.", 0.1, 3)
-    job = Job("1", "succeeded", "<s>", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
+    job = Job("1", "succeeded", "<s>", "2026-01-01T00:00:00Z", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
     text = headline_html(job, 4, "")
     assert "not localized" in text
     assert "few features, score 0.10, 3 inliers" in text
@@ -333,6 +334,19 @@ def test_texts_escape_what_others_wrote() -> None:
     for html in (text, headline_html(job, 0, "<i>"), scene_html("<b>", 1, 2, 3)):
         assert not {"<b>", "<s>", "<i>", "<sharper>"} & {html[m:n] for m in range(len(html)) for n in (m + 3, m + 9)}
     assert "–" in record_html(replace(records(1)[0], loss=None))
+
+
+def test_lengths_are_in_metres_where_the_scene_has_a_scale() -> None:
+    record = replace(records(1)[0], step_units=0.5)
+    assert "moved by, units</div><div style='white-space:nowrap'>0.5<" in record_html(record)
+    assert "moved by, m</div><div style='white-space:nowrap'>1.25<" in record_html(record, None, 2.5)
+    assert "position error, m" in charts.curves_html(records(3), records(3)[2].pose, 1, 2.5)
+
+
+def test_a_jobs_time_is_that_of_the_browsers_zone() -> None:
+    job = ListedJob("0123456789", "running", "hall", "2026-01-31T23:30:00Z", None)
+    assert job_label(job, ZoneInfo("Asia/Tokyo")) == "2026-02-01 08:30:00 · hall · running · 01234567"
+    assert job_label(job, ZoneInfo("America/New_York")).startswith("2026-01-31 18:30:00")
 
 
 # ---------------------------------------------------------------- what matches say
@@ -398,7 +412,7 @@ def test_pose_errors_are_those_of_a_known_motion() -> None:
 def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
     shown = [replace(r, loss=None if r.index == 3 else r.loss, num_matches=None) for r in records(6)]
     drawn = charts.curves_html(shown, shown[-1].pose, 2)
-    titles = ("loss", "turned by the step", "moved by the step", "matches and inliers", "error of rotation")
+    titles = ("loss", "rotation step", "position step, units", "matches and inliers", "rotation error")
     assert all(title in drawn for title in titles)
     loss = drawn.split("</svg>")[0]
     # Scene3D `retrieve` has one value, `refine` those of the steps 1, 2, 4 and 5: a line begins anew after the gap.

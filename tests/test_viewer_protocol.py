@@ -33,8 +33,9 @@ from viewer import camera_views, job_display, step_display, viewer_server, viser
 from viewer import comparison_images as images
 from viewer.job_stream import JobStream
 from viewer.replay import replay_html
+from viewer.requested_page import requested_page
 from viewer.scene_cache import SceneCache
-from viewer.viewer_server import Viewer, job_id_in_path
+from viewer.viewer_server import Viewer
 
 LAST_NODES = {"/splats/splats", "/candidates/cloud", "/match vectors/points"}
 """What is drawn of a job when nothing else waits."""
@@ -72,8 +73,29 @@ def test_a_finished_job_is_shown_by_its_address(fake: FakeService, viewer: Viewe
         assert browser.nodes["/trajectory/final"]["props"]["color"] == [60, 180, 90]
         assert browser.nodes["/trajectory/current"]["props"]["_image_data"]
         assert not browser.nodes["/trajectory/initial"]["props"]["_image_data"]
-        assert browser.widget("follow newest")["value"] is False
+        assert browser.widget("follow newest job")["value"] is False
         browser.wait(lambda: "old" in browser.widget("job")["value"], "the job's line in the list")
+
+
+def test_a_job_that_is_not_listed_any_more_is_named(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("oldest", 2, finished=True)
+    for number in range(60):  # 50 are listed
+        fake.job(f"job{number}", 1, finished=True)
+    fake.listed = 50
+    with _browser(viewer, "/jobs/oldest?zone=Nowhere/Land") as browser:
+        browser.wait(lambda: len(browser.widget("job")["options"]) == 51, "the list")
+        browser.wait(lambda: "oldest" in browser.widget("job")["value"], "the job's line in the list")
+        browser.set("job", browser.widget("job")["options"][1])
+        browser.wait(lambda: "job59" in browser.widget("job")["value"], "the newest job")
+
+
+def test_a_job_is_shown_when_its_scene_is_loaded(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("one", 2, finished=True)
+    fake.scenes, fake.unloaded = [], True
+    with _browser(viewer, "/jobs/one") as browser:
+        browser.wait(lambda: "HTTP 503" in browser.text() or "loading" in browser.text(), "the reason")
+        fake.scenes, fake.unloaded = ["ball"], False
+        browser.wait(lambda: "localized" in browser.text() and "/trajectory/final" in browser.nodes, "the job")
 
 
 def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: FakeService, viewer: Viewer) -> None:
@@ -143,15 +165,15 @@ def test_steps_change_picture_pose_and_numbers(fake: FakeService, viewer: Viewer
         browser.set("compare", "difference")
         browser.wait(lambda: "doubled" in browser.text(), "the difference")
         browser.set("compare", "checker")
-        browser.wait(lambda: "tile to tile" in browser.text(), "the checkerboard")
+        browser.wait(lambda: "alternating tiles" in browser.text(), "the checkerboard")
         browser.set("compare", "flicker")
         browser.wait(lambda: browser.text().count("data:image/jpeg") == 2, "both pictures in turn")
         assert browser.widget("match lines")["visible"] is False
         browser.set("compare", "blend")
-        browser.wait(lambda: browser.widget("render's share")["visible"], "the blend")
-        browser.set("render's share", 1.0)
+        browser.wait(lambda: browser.widget("render opacity")["visible"], "the blend")
+        browser.set("render opacity", 1.0)
         browser.wait(lambda: shows(render_rgb(0, matched=False)), "nothing but the render")
-        browser.set("render's share", 0.0)
+        browser.set("render opacity", 0.0)
         browser.wait(lambda: shows((120, 160, 200)), "nothing but the photo")
 
 
@@ -161,7 +183,7 @@ def test_layers_can_be_hidden_and_stay_hidden(fake: FakeService, viewer: Viewer)
         browser.wait(lambda: "/trajectory/current" in browser.nodes, "the job")
         (client,) = viewer.server.get_clients().values()
         shown = lambda: {n: h.visible for n, h in client.scene._handle_from_node_name.items()}  # noqa: E731
-        browser.set("exact render at rest", False)  # it would hide the splats
+        browser.set("full-quality render when still", False)  # it would hide the splats
         browser.set("trajectory", False)
         browser.set("training cameras", False)
         browser.wait(lambda: not shown()["/trajectory/current"] and not shown()["/training cameras/cameras"], "hiding")
@@ -213,11 +235,11 @@ def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: 
         label = next(o for o in browser.widget("job")["options"] if "aaa" in o)
         browser.set("job", label)
         browser.wait(lambda: browser.widget("step")["max"] == 1, "the chosen job")
-        assert browser.widget("follow newest")["value"] is False
+        assert browser.widget("follow newest job")["value"] is False
         fake.job("ccc", 5)
         browser.wait(lambda: any("ccc" in o for o in browser.widget("job")["options"]), "the new job in the list")
         assert browser.widget("job")["value"] == label
-        browser.set("follow newest", True)
+        browser.set("follow newest job", True)
         browser.wait(lambda: browser.widget("step")["max"] == 4, "the newest job again")
 
 
@@ -322,9 +344,9 @@ def test_errors_are_shown_where_the_truth_is_known(fake: FakeService, viewer: Vi
     job.truth = records(3)[2].pose
     job.finish()
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: "error of position" in browser.text(), "the curve")
+        browser.wait(lambda: "position error" in browser.text(), "the curve")
         browser.wait(lambda: "/trajectory/truth" in browser.nodes, "the true camera")
-        browser.wait(lambda: "turned off" in browser.text(), "the numbers")
+        browser.wait(lambda: "rotation error" in browser.text(), "the numbers")
 
 
 def test_without_the_photo_the_render_is_shown(fake: FakeService, viewer: Viewer) -> None:
@@ -355,7 +377,7 @@ def test_the_view_at_rest_is_rendered_by_the_service(fake: FakeService, viewer: 
         browser.send(**{**CAMERA, "position": [5.0, 0.0, 0.0]})
         browser.wait(lambda: splats.visible, "the splats while it moves")
         browser.wait(lambda: not splats.visible and np.allclose(_rendered_from(fake), [5, 0, 0]), "the next picture")
-        browser.set("exact render at rest", False)
+        browser.set("full-quality render when still", False)
         browser.wait(lambda: splats.visible and _background(browser) == "ground", "the splats")
 
 
@@ -509,7 +531,7 @@ def test_a_scene_can_be_looked_at_without_a_job(fake: FakeService, viewer: Viewe
         browser.set("scene", "copy")
         browser.wait(lambda: "no job" in browser.text() and "/trajectory/final" not in browser.nodes, "the bare scene")
         assert browser.widget("step")["disabled"]
-        assert browser.widget("follow newest")["value"] is False
+        assert browser.widget("follow newest job")["value"] is False
 
 
 def test_play_has_the_chosen_speed(fake: FakeService, viewer: Viewer) -> None:
@@ -558,7 +580,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
 
 def test_a_viewer_that_stops_takes_leave_of_its_browsers(fake: FakeService) -> None:
     """viser reports them as gone while it stops, which ends their sessions."""
-    viewer, gone = Viewer(ServiceClient("http://fake", fake.transport), "127.0.0.1", 0), threading.Event()
+    viewer, gone = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0), threading.Event()
     viewer.server.on_client_disconnect(lambda client: gone.set())
     with _browser(viewer) as browser:
         browser.wait(lambda: "no job" in browser.text(), "the page")
@@ -579,7 +601,7 @@ def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     + [(p, None) for p in ("/jobs/../etc", "/jobs/a/b", "/jobs/%2e%2e", "/x/jobs/abc", "/jobs/" + 65 * "a")],
 )
 def test_only_plain_ids_are_taken_from_an_address(path: str, job: str | None) -> None:
-    assert job_id_in_path(path) == job
+    assert requested_page(path).job_id == job
 
 
 def test_an_unknown_path_means_the_newest_job(viewer: Viewer) -> None:
@@ -592,7 +614,7 @@ def test_a_missing_image_is_reported_and_the_rest_is_shown(
     fake.job("j", 3, finished=True)
     monkeypatch.setattr(JobStream, "render", _refused)
     with _browser(viewer, "/jobs/j") as browser:
-        browser.wait(lambda: "no picture of this step: The scene is loading." in browser.text(), "the message")
+        browser.wait(lambda: "no image: The scene is loading." in browser.text(), "the message")
         browser.set("step", 1)
         browser.wait(lambda: ">101<" in browser.text(), "the numbers")
         assert "verified" in browser.text()
@@ -610,7 +632,7 @@ def test_the_program_serves_until_sigterm(fake: FakeService) -> None:
         try:
             until(lambda: child.poll() is not None or _answers(port), "an answer", 60)
             with FakeBrowser(port) as browser:
-                browser.wait(lambda: browser.widget("follow newest"), "the widgets")
+                browser.wait(lambda: browser.widget("follow newest job"), "the widgets")
                 child.send_signal(signal.SIGTERM)
                 child.wait(10)
         finally:

@@ -20,6 +20,7 @@ from viewer.background_render import BackgroundRender, _same_view
 from viewer.controls import NEXT, PLAY, PREVIOUS, Controls
 from viewer.job_display import FOLLOW_AFTER_OPEN_S, JobDisplay
 from viewer.job_selection import JobSelection
+from viewer.requested_page import RequestedPage
 
 COUNTS = [0, 1, 3]
 
@@ -249,15 +250,15 @@ def selection(
     jobs: tuple[Any, ...] | None, *, asked: str | None = None, shown: str | None = None, scene: str | None = None
 ) -> JobSelection:
     lists = SimpleNamespace(jobs=jobs, scenes=("ball", "copy"))
-    job = Mock(stream=None if shown is None else SimpleNamespace(id=shown))
-    job.open.side_effect = lambda id: setattr(job, "stream", SimpleNamespace(id=id))
+    job = Mock(stream=None if shown is None else SimpleNamespace(id=shown, job=None))
+    job.open.side_effect = lambda id: setattr(job, "stream", SimpleNamespace(id=id, job=None))
     job.leave.side_effect = lambda: setattr(job, "stream", None)
-    return JobSelection(Mock(), lists, job, Mock(scene_id=scene), asked)  # type: ignore[arg-type]
+    return JobSelection(Mock(), lists, job, Mock(scene_id=scene), RequestedPage(asked, False, None))  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)
 def _labels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("viewer.job_selection.job_label", lambda job: f"job {job.id}")
+    monkeypatch.setattr("viewer.job_selection.job_label", lambda job, zone: f"job {job.id}")
 
 
 @pytest.mark.parametrize(
@@ -298,6 +299,7 @@ def test_the_job_that_was_asked_for_is_opened_or_the_newest(
 
 def test_a_chosen_job_or_scene_ends_following() -> None:
     found = selection(listed("b", "a"), shown="b", scene="ball")
+    found.sync()
     found.choose_job("job unknown")
     assert not found._job.open.called
     found.choose_job("job a")

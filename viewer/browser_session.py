@@ -25,6 +25,7 @@ from viewer.job_display import JobDisplay
 from viewer.job_selection import JobSelection
 from viewer.panel_html import headline_html
 from viewer.replay_download import ReplayDownload
+from viewer.requested_page import RequestedPage
 from viewer.scene_3d import Scene3D
 from viewer.scene_display import SceneDisplay
 from viewer.shared_data import SharedData
@@ -35,8 +36,9 @@ log = logging.getLogger(__name__)
 class BrowserSession:
     """Runs from `start` to `close`, which is called when the tab is closed and frees everything."""
 
-    def __init__(self, client: viser.ClientHandle, shared: SharedData, job_id: str | None, *, splats: bool) -> None:
-        """`job_id`: the job in the page's path; None: follow the newest. `splats`: whether they are shown at first."""
+    def __init__(self, client: viser.ClientHandle, shared: SharedData, page: RequestedPage) -> None:
+        """`page`: what the browser has opened. Where WebGL is drawn in software, splats are not shown at first."""
+        splats = not page.software
         self._client, self._shared = client, shared
         self._queue = ActionQueue()
         self._controls = Controls(client, splats=splats)
@@ -44,7 +46,7 @@ class BrowserSession:
         self._background = BackgroundRender(client, shared.client, self._show_background)
         self._scene_display = SceneDisplay(self._controls, self._scene, self._background, shared.scenes)
         self._job = JobDisplay(self._controls, self._scene, self._scene_display, shared.streams, self._stream_changed)
-        self._selection = JobSelection(self._controls, shared.lists, self._job, self._scene_display, job_id)
+        self._selection = JobSelection(self._controls, shared.lists, self._job, self._scene_display, page)
         self._replay = ReplayDownload(client, self._controls, self._queue)
 
     def start(self) -> None:
@@ -117,7 +119,7 @@ class BrowserSession:
     def _connect_player(self) -> None:
         controls, post = self._controls, self._queue.post
         controls.play.on_click(lambda event: post(partial(self._job.press, event.target.value)))
-        controls.mode.on_click(lambda event: post(partial(self._job.set_mode, cast(Mode, event.target.value))))
+        on_user_change(controls.mode, lambda mode: post(partial(self._job.set_mode, cast(Mode, mode))))
         controls.look_through.on_click(lambda _: post(self._job.look_through))
         controls.fly.on_click(lambda _: post(self._job.fly_to_result))
         controls.replay.on_click(lambda _: post(self._save_replay))

@@ -85,8 +85,11 @@ def stage_colours(records: Sequence[IterationRecord]) -> dict[str, str]:
     return {name: _SERIES_COLOURS[i % len(_SERIES_COLOURS)] for i, name in enumerate(names)}
 
 
-def curves_html(records: Sequence[IterationRecord], truth: Pose | None, index: int) -> str:
+def curves_html(
+    records: Sequence[IterationRecord], truth: Pose | None, index: int, metres_per_unit: float | None = None
+) -> str:
     """Return curves over the steps: loss, step size, matches and, given the true pose, errors. `index` is marked."""
+    unit, scale = ("m", metres_per_unit) if metres_per_unit else ("units", 1.0)
     loss = _column(records, "loss")
     # One curve per stage, as losses of different stages aren't comparable.
     losses = {stage: np.where([r.stage == stage for r in records], loss, np.nan) for stage in stage_colours(records)}
@@ -94,13 +97,13 @@ def curves_html(records: Sequence[IterationRecord], truth: Pose | None, index: i
     matches, inliers = _column(records, "num_matches"), _column(records, "num_inliers")
     charts = [
         ("loss", {name: values for name, values in losses.items() if np.isfinite(values).any()}),
-        ("turned by the step, degrees", {"": turned}),
-        ("moved by the step, units", {"": moved}),
+        ("rotation step, degrees", {"": turned}),
+        (f"position step, {unit}", {"": scale * moved}),
         ("matches and inliers", {"matches": matches, "inliers": inliers}),
     ]
     if truth is not None and records:
         errors = np.array([pose_error(r.pose, truth) for r in records]).T
-        charts += [("error of rotation, degrees", {"": errors[0]}), ("error of position, units", {"": errors[1]})]
+        charts += [("rotation error, degrees", {"": errors[0]}), (f"position error, {unit}", {"": scale * errors[1]})]
     drawn = [_curve_chart(title, series, records, index) for title, series in charts if _finite_values(series).size]
     return "".join(drawn) or _note("There is nothing to plot yet.")
 
@@ -248,4 +251,4 @@ def _figure(svg: str, caption: str) -> str:
 
 
 def _note(text: str) -> str:
-    return f"<div style='padding:.3em .6em;font-size:.8em;opacity:.75'>{escape(text)}</div>"
+    return f"<div style='padding:.3em .6em;font-size:.8em;opacity:.85'>{escape(text)}</div>"

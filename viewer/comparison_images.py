@@ -15,7 +15,7 @@ from jaxtyping import Float, Int32, UInt8
 from viewer.match_geometry import MatchView
 
 Overlay = Literal["blend", "checker", "difference"]
-Mode = Literal["beside", Overlay, "flicker"]
+Mode = Literal["side by side", Overlay, "flicker"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 
 _WIDTH_PX, _HEIGHT_PX = 800, 1160

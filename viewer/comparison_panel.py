@@ -23,7 +23,7 @@ class ComparisonPanel:
     """Composes the images as the widgets choose. Methods raise ServiceError or ValueError if an image is missing."""
 
     def __init__(self, controls: Controls) -> None:
-        self.mode: Mode = "beside"
+        self.mode: Mode = "side by side"
         self._controls = controls
         self._composed: dict[tuple[object, ...], UInt8[np.ndarray, "h w 3"]] = {}
         """Comparisons of the step that is shown and of its neighbours, by all that they depend on."""
@@ -40,7 +40,7 @@ class ComparisonPanel:
     def show_comparison(self, stream: JobStream, record: IterationRecord, view: MatchView | None) -> None:
         """Show photo and render in the chosen mode; without the photo, the render alone."""
         controls, mode = self._controls, self.mode
-        controls.match_lines.visible = mode == "beside"
+        controls.match_lines.visible = mode == "side by side"
         controls.weight.visible, controls.flicker.visible = mode == "blend", mode == "flicker"
         controls.comparison.visible = mode != "flicker"
         photo = photo_of(stream, record)
@@ -90,7 +90,7 @@ class ComparisonPanel:
         key = stream.id, stream.complete, record.index, mode, by, weight, self._with_lines
         if key not in self._composed:
             render = self._render(stream, record, view)
-            if mode == "beside":
+            if mode == "side by side":
                 lines = view if self._with_lines else None
                 image = side_by_side(photo, render, lines, None if lines is None else match_colours(lines, by))
             else:
@@ -107,7 +107,7 @@ class ComparisonPanel:
 
     @property
     def _with_lines(self) -> bool:
-        return self.mode == "beside" and self._controls.match_lines.value
+        return self.mode == "side by side" and self._controls.match_lines.value
 
 
 def photo_of(stream: JobStream, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:

@@ -15,8 +15,8 @@ from viewer.layers.layer import LayerName
 NO_JOB: str = "no job yet"
 NO_SCENE: str = "no scene yet"
 PLAY, PREVIOUS, NEXT = "play / pause", "◀ previous", "next ▶"
-_PANEL_WIDTH_PX = 340
-_WINDOW_WIDTH_PX = 420
+_COLUMN_WIDTH_PX = 430
+"""Both panels are one column: at 1280 px two thirds are left for the 3D view."""
 _REPLAY_LABEL = "save as replay file"
 _REPLAY_HINT = "One HTML file that plays this job from disk, without a service."
 _SPEEDS = ("1", "2", "5", "10", "20")
@@ -33,13 +33,13 @@ class Controls:
         self.flush = client.flush
         """Send pending changes to the browser at once."""
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(_PANEL_WIDTH_PX)
+        gui.main_panel.set_width(_COLUMN_WIDTH_PX)
         gui.add_html(
             # A script of the relay follows data-splatfix on a click; `href` would leave a service below a sub-path.
-            "<a href='/' data-splatfix='./' style='padding:0 .6em;font-size:.9em'>← localize another photo</a>"
+            "<a href='/' data-splatfix='./' style='padding:0 .6em;font-size:.9em'>← Start page</a>"
         )
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
-        self.newest = gui.add_checkbox("follow newest", True, hint="Change to every new job as soon as it appears.")
+        self.newest = gui.add_checkbox("follow newest job", True, hint="Switch to each new job as it appears.")
         self.scenes = gui.add_dropdown("scene", (NO_SCENE,), initial_value=NO_SCENE)
         self.headline = gui.add_html("")
         self.step = gui.add_slider("step", 0, 0, 1, 0, disabled=True)
@@ -54,10 +54,10 @@ class Controls:
             self.layers = {layer: gui.add_checkbox(layer, layer != "splats" or splats) for layer in get_args(LayerName)}
             self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
-                "exact render at rest",
+                "full-quality render when still",
                 True,
-                hint="When the view rests, the service's renderer draws it: what the estimator sees. Without splats it "
-                "also draws while the view moves.",
+                hint="When the view is still, the service renders it as the estimator sees it; without splats also "
+                "while it moves.",
             )
             self.legend = gui.add_html("")
             self.scene = gui.add_html("")
@@ -67,19 +67,18 @@ class Controls:
         # Hidden until there is an image to show.
         self.window = gui.add_panel(visible=False)
         with self.window.add_tab("photo and render"):
-            self.mode = gui.add_button_group("compare", MODES)
+            self.mode = gui.add_dropdown("compare", MODES)
             self.comparison = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88)
             self.flicker = gui.add_html("", visible=False)
             self.caption = gui.add_html("")
             self.match_lines = gui.add_checkbox("match lines", True)
-            self.weight = gui.add_slider("render's share", 0.0, 1.0, 0.05, 0.5, visible=False)
+            self.weight = gui.add_slider("render opacity", 0.0, 1.0, 0.05, 0.5, visible=False)
         with self.window.add_tab("match vectors"):
             self.vectors_image = gui.add_image(np.zeros((1, 1, 3), np.uint8), jpeg_quality=88, visible=False)
             self.vectors = gui.add_html("")
         with self.window.add_tab("curves"):
             self.curves = gui.add_html("")
-        self.window.dock_left()
-        self.window.set_width(_WINDOW_WIDTH_PX)
+        self.window.dock_below(gui.main_panel)
 
     def set_step_count(self, count: int) -> None:
         """Enable what needs records, for so many of them."""

@@ -81,6 +81,12 @@ class JobDisplay:
             self._scene.look_from_behind(stream.records[count - 1].pose)
         self._show()
 
+    def show_awaited_scene(self, loaded: Sequence[str]) -> None:
+        """Show the job's scene once it is in memory, where it wasn't when the job was opened."""
+        job = self.stream and self.stream.job
+        if job and job.scene != self._scene_display.scene_id and job.scene in loaded:
+            self.sync()
+
     @property
     def tick_in_s(self) -> float | None:
         """Time until playback moves on; None: it is paused."""

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from viewer.controls import NO_JOB, NO_SCENE, Controls
 from viewer.job_display import JobDisplay
 from viewer.panel_html import headline_html, job_label
+from viewer.requested_page import RequestedPage
 from viewer.scene_display import SceneDisplay
 from viewer.service_lists import ServiceLists
+from viewer.service_values import ListedJob
 
 
 class JobSelection:
     """All methods are called from the session's thread; they raise ServiceError or ValueError."""
 
     def __init__(
-        self, controls: Controls, lists: ServiceLists, job: JobDisplay, scene: SceneDisplay, job_id: str | None
+        self, controls: Controls, lists: ServiceLists, job: JobDisplay, scene: SceneDisplay, page: RequestedPage
     ) -> None:
-        """`job_id`: the job in the page's path; None: follow the newest."""
+        """`page`: what the browser has opened; without a job, the newest is followed."""
+        job_id = page.job_id
+        self._zone = page.zone
+        self._named: dict[str, str] = {}
+        """Ids of the listed jobs by their line in the list."""
         self._controls, self._lists, self._job, self._scene = controls, lists, job, scene
         self._follows_newest = job_id is None
         self._chosen = job_id
@@ -25,8 +33,6 @@ class JobSelection:
     def sync(self) -> None:
         """Update the lists of jobs and scenes, and open the newest job if it is followed."""
         jobs = self._lists.jobs or ()
-        if jobs:
-            self._controls.jobs.options = tuple(job_label(job) for job in jobs)
         if self._lists.scenes:
             self._controls.scenes.options = self._lists.scenes
         wanted = self._chosen if not self._follows_newest else jobs[0].id if jobs else None
@@ -36,15 +42,25 @@ class JobSelection:
         elif wanted is None and self._scene.scene_id is None and self._lists.jobs is not None:
             self._scene.show(next(iter(self._lists.scenes), None), None)
             self._controls.headline.content = headline_html(None, 0, "")
-        if self._job.stream is not None:
-            shown = self._job.stream.id
-            label = next((job_label(job) for job in jobs if job.id == shown), None)
-            if label is not None:
-                self._controls.jobs.value = label
+        self._job.show_awaited_scene(self._lists.scenes)
+        self._name_jobs(jobs)
+
+    def _name_jobs(self, jobs: Sequence[ListedJob]) -> None:
+        """Show the list of jobs, with the one that is shown, be it older than those of the list."""
+        stream = self._job.stream
+        shown = next((job for job in jobs if stream and job.id == stream.id), None)
+        if shown is None and stream is not None and stream.job is not None:
+            shown = stream.job.listed()
+            jobs = [shown, *jobs]
+        self._named = {job_label(job, self._zone): job.id for job in jobs}
+        if self._named:
+            self._controls.jobs.options = tuple(self._named)
+        if shown is not None:
+            self._controls.jobs.value = job_label(shown, self._zone)
 
     def choose_job(self, label: str) -> None:
         """Show the job with this line in the list of jobs."""
-        chosen = next((job.id for job in self._lists.jobs or () if job_label(job) == label), None)
+        chosen = self._named.get(label)
         if label != NO_JOB and chosen is not None:
             self._chosen, self._follows_newest = chosen, False
             self._controls.newest.value = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from html import escape
+from zoneinfo import ZoneInfo
 
 import numpy as np
 
@@ -29,20 +30,21 @@ from viewer.match_geometry import MatchView, pose_error
 from viewer.service_values import Job, JobOutcome, ListedJob
 
 
-def job_label(job: ListedJob) -> str:
-    """Return a job's line in the list of jobs; the id's first digits make it unique."""
-    started = datetime.fromisoformat(job.created).astimezone()
-    return f"{started:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"
+def job_label(job: ListedJob, zone: ZoneInfo | None = None) -> str:
+    """Return a job's line in the list of jobs, with the time in a zone; the id's first digits make it unique."""
+    created = datetime.fromisoformat(job.created).astimezone(zone)
+    day = "" if created.date() == datetime.now(zone).date() else f"{created:%Y-%m-%d} "
+    return f"{day}{created:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"
 
 
 def headline_html(job: Job | None, records: int, error: str) -> str:
     """Return status, reason and hint of a job, or its progress; instead, an error."""
     if error:
-        return _block(_badge("no connection", ERROR_COLOUR), error)
+        return _block(_badge("error", ERROR_COLOUR), error)
     if job is None:
         return _block(_badge("no job", PENDING_COLOUR), "Drop a photo on the start page, or choose a job above.")
     title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
-    link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>its result page</a>"
+    link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>result page</a>"
     if job.outcome is None:
         word = "queued" if not records else "running"
         return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title, link=link)
@@ -56,8 +58,12 @@ def headline_html(job: Job | None, records: int, error: str) -> str:
     )
 
 
-def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
-    """Return a record's numbers as a table, with its errors where the true pose is given."""
+def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_unit: float | None = None) -> str:
+    """Return a record's numbers as a table, with its errors where the true pose is given.
+
+    Lengths are in metres where the scene has a scale.
+    """
+    unit, scale = length_unit(metres_per_unit), metres_per_unit or 1.0
     error_deg, error_units = pose_error(record.pose, truth) if truth else (None, None)
     rows = [
         ("stage", escape(record.stage)),
@@ -67,24 +73,37 @@ def record_html(record: IterationRecord, truth: Pose | None = None) -> str:
         ("matches", _or_dash(record.num_matches, "d")),
         ("inliers", _or_dash(record.num_inliers, "d")),
         ("loss", _or_dash(record.loss, ".4g")),
-        ("turned", _or_dash(record.step_deg, ".3g", "°")),
-        ("moved, units", _or_dash(record.step_units, ".3g")),
+        ("rotated by", _or_dash(record.step_deg, ".3g", "°")),
+        (f"moved by, {unit}", _or_dash(scaled(record.step_units, scale), ".3g")),
     ]
     if truth:
-        rows += [("turned off", _or_dash(error_deg, ".3g", "°")), ("away, units", _or_dash(error_units, ".3g"))]
+        rows += [
+            ("rotation error", _or_dash(error_deg, ".3g", "°")),
+            (f"position error, {unit}", _or_dash(scaled(error_units, scale), ".3g")),
+        ]
     cells = "".join(
-        f"<div><div style='opacity:.6;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
+        f"<div><div style='opacity:.85;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
     )
     return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>")
 
 
+def length_unit(metres_per_unit: float | None) -> str:
+    """Return the unit in which lengths of a scene are shown."""
+    return "m" if metres_per_unit else "units"
+
+
+def scaled(length: float | None, scale: float) -> float | None:
+    """Return a length in another unit; None stays None."""
+    return None if length is None else length * scale
+
+
 _CAPTIONS: dict[Mode, str] = {
-    "beside": "photo, and render at this step's pose",
-    "blend": "photo and render at this step's pose on top of one another",
-    "checker": "photo and render at this step's pose, in turns: edges should run on from tile to tile",
+    "side by side": "photo, and render at this step's pose",
+    "blend": "photo and render at this step's pose blended",
+    "checker": "photo and render at this step's pose, in alternating tiles: edges should continue across them",
     "difference": "of photo and render at this step's pose, doubled: black is agreement",
-    "flicker": "photo and render at this step's pose, one after the other: what jumps is off",
+    "flicker": "photo and render at this step's pose, alternating: what jumps is misaligned",
 }
 
 
@@ -159,7 +178,7 @@ def _reason(outcome: JobOutcome) -> str:
 def _block(badge: str, text: str, title: str = "", hint: str = "", link: str = "") -> str:
     parts = [f"{badge} <span>{escape(text)}</span>"]
     if title:
-        parts.append(f"<div style='opacity:.7;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}; {link}</div>")
+        parts.append(f"<div style='opacity:.85;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}; {link}</div>")
     if hint:
         parts.append(f"<div style='margin-top:.3em'>{escape(hint)}</div>")
     return _padded("".join(parts))
@@ -180,7 +199,7 @@ def small_html(text: str) -> str:
 
 
 def _small(html: str) -> str:
-    return f"<div style='padding:0 .6em .2em;font-size:.8em;opacity:.75'>{html}</div>"
+    return f"<div style='padding:0 .6em .2em;font-size:.8em;opacity:.85'>{html}</div>"
 
 
 def _coloured(text: str, colour: RGB) -> str:

@@ -34,6 +34,11 @@ class Scene3D:
         self._camera = BrowserCamera(canvas)
         self._content: SceneContent | None = None
 
+    @property
+    def metres_per_unit(self) -> float | None:
+        """Of the scene that is drawn; None: unknown."""
+        return self._content.description.metres_per_unit if self._content else None
+
     def show_scene(self, content: SceneContent, pose: Pose | None) -> None:
         """Draw a scene but for its splats, seen from behind the camera `pose`, or from the scene's initial view."""
         self._content = content

@@ -24,6 +24,8 @@ class SceneDescription:
     background_rgb: tuple[float, float, float]
     """Colour of rays that meet no Gaussian; 0..1."""
     up_in_world: tuple[float, float, float] | None
+    metres_per_unit: float | None
+    """None: lengths are known in scene units only."""
     cameras: tuple[NamedCamera, ...]
 
 
@@ -71,6 +73,8 @@ class Job:
     id: str
     state: str
     scene: str
+    created: str
+    """ISO 8601, UTC."""
     estimator: str
     photo_name: str
     photo: Intrinsics
@@ -81,6 +85,10 @@ class Job:
     """None until the job has ended."""
     photo_step: int | None = None
     """Of several photos, the step whose photo `Client.photo` returns; None: one photo, or not known yet."""
+
+    def listed(self) -> ListedJob:
+        """Return the job as the list of jobs has it."""
+        return ListedJob(self.id, self.state, self.scene, self.created, self.outcome and self.outcome.status)
 
     def camera(self, record: IterationRecord) -> Camera:
         """Return the photo's camera as a record estimates it: its pose, and the intrinsics with its correction."""
@@ -101,6 +109,7 @@ def description_of(scene: api.Scene) -> SceneDescription:
         raw["gaussians"] or 0,
         cast("tuple[float, float, float]", tuple(raw["background_rgb"] or (0, 0, 0))),
         cast("tuple[float, float, float] | None", raw["up_in_world"] and tuple(raw["up_in_world"])),
+        raw["metres_per_unit"],
         tuple(NamedCamera(c["name"], _camera(c)) for c in raw["training_cameras"]),
     )
 
@@ -155,6 +164,7 @@ def job_of(job: api.Job) -> Job:
         raw["id"],
         raw["state"],
         raw["scene"],
+        raw["created"],
         raw["estimator"],
         raw["photo"]["name"],
         _intrinsics(raw["photo"]["intrinsics"]),

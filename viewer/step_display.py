@@ -74,7 +74,7 @@ class StepDisplay:
         if job is None:
             return
         self._controls.step.value = index
-        self._controls.numbers.content = record_html(record, job.truth)
+        self._controls.numbers.content = record_html(record, job.truth, self._scene.metres_per_unit)
         self._controls.stages.content = stages_html(stream.records, index)
         self._controls.flush()
         if self._shown != (stream.id, stream.attempt, index):
@@ -98,9 +98,9 @@ class StepDisplay:
             self._controls.flush()
             self._images.show_match_vectors(stream, record, view)
         except (ServiceError, ValueError) as error:
-            self._controls.caption.content = small_html(f"There is no picture of this step: {error}")
+            self._controls.caption.content = small_html(f"This step has no image: {error}")
         truth = stream.job.truth if stream.job else None
-        self._controls.curves.content = curves_html(stream.records, truth, index)
+        self._controls.curves.content = curves_html(stream.records, truth, index, self._scene.metres_per_unit)
         self._controls.flush()
         self._queue.insert(0, (time.monotonic() + _MESSAGE_GAP_S, partial(self._draw_3d, stream, record, view)))
 

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import logging
-import re
 import threading
 
 import viser
 
 from service.client import Client
 from viewer.browser_session import BrowserSession
+from viewer.requested_page import requested_page
 from viewer.shared_data import SharedData
 from viewer.viser_internals import disable_public_tunnels, requested_path
 
 log = logging.getLogger(__name__)
-
-_JOB_PATH = re.compile(r"/jobs/([A-Za-z0-9_-]{1,64})/?")
 
 
 class Viewer:
@@ -49,9 +47,7 @@ class Viewer:
         self.server.stop()
 
     def _open(self, client: viser.ClientHandle) -> None:
-        path = requested_path(self.server, client.client_id)
-        # The page reports its WebGL in software, where splats would take seconds a frame.
-        session = BrowserSession(client, self._shared, job_id_in_path(path), splats=not path.endswith("?gl=software"))
+        session = BrowserSession(client, self._shared, requested_page(requested_path(self.server, client.client_id)))
         with self._lock:
             self._sessions[client.client_id] = session
         session.start()
@@ -61,9 +57,3 @@ class Viewer:
             session = self._sessions.pop(client.client_id, None)
         if session is not None:
             session.close()
-
-
-def job_id_in_path(path: str) -> str | None:
-    """Return the id of the job in a page's path, `/jobs/ID/`; None: the path has none, and the newest job is shown."""
-    match = _JOB_PATH.fullmatch(path.partition("?")[0])
-    return match.group(1) if match else None

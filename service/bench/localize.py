@@ -221,10 +221,9 @@ def _load_scene(folder: Path, data_set: DataSet, background: str, cameras: bool 
     # The manifest of the scene knows better than the layout of the data set.
     if rgb is None and not (folder.is_dir() and read_manifest(folder).background):
         rgb = data_set.background_rgb
-    if rgb is None or rgb == scene.info.background_rgb:
+    if rgb is None:
         return scene
-    # The digest is the key of cached view indexes, whose views depend on the background.
-    return replace(scene, info=replace(scene.info, background_rgb=rgb, sha256=f"{scene.info.sha256}-{rgb}"))
+    return replace(scene, info=replace(scene.info, background_rgb=rgb, background_is_known=True))
 
 
 def make_trials(

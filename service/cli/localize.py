@@ -39,6 +39,7 @@ class _Output:
     as_json: bool
     csv_file: Path | None
     tum_file: Path | None
+    smooth: bool = False
 
 
 def localize(
@@ -59,6 +60,9 @@ def localize(
     times: Annotated[str, typer.Option(help="Of a sequence's photos: JSON list of seconds, or a file of it.")] = "",
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
     tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Of a sequence: filter jitter and join short gaps in --csv and --tum.")
+    ] = False,
     learn_lenses: Annotated[
         bool, typer.Option("--learn-lenses", help="Photos tell the lens of the same camera's next ones, by EXIF.")
     ] = False,
@@ -85,7 +89,7 @@ def localize(
     # A video is a sequence by itself; photos are one only on request.
     track_camera = sequence or any(is_sequence(data) for _, data in files)
     if not track_camera:
-        _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times})
+        _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times, "--smooth": smooth})
     elif learn_lenses:
         raise InvalidRequest("the photos of a sequence share a lens anyway.", where="--learn-lenses")
     paths = [path for given_path in scene for path in find_scenes(given_path)]
@@ -93,7 +97,7 @@ def localize(
         _require_one_scene(paths)
     # Last: faults of photos and fields are reported without waiting for it.
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
-    output = _Output(as_json, csv_file, tum_file)
+    output = _Output(as_json, csv_file, tum_file, smooth)
     if track_camera:
         statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], output)
     else:
@@ -185,7 +189,7 @@ def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, 
     if output.as_json:
         print_json({"photo": body.name, **result.model_dump(mode="json")})
     if output.csv_file:
-        result_tables.write_frame_table(output.csv_file, result.frames or [])
+        result_tables.write_frame_table(output.csv_file, result.frames or [], smooth=output.smooth)
     if output.tum_file:
-        output.tum_file.write_text(trajectory_of(result.frames or []), encoding="utf-8")
+        output.tum_file.write_text(trajectory_of(result.frames or [], smooth=output.smooth), encoding="utf-8")
     return [frame.status for frame in result.frames or []]

@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from service.web.schemas.exports import smoothed_frames
 from service.web.schemas.job_results import FrameOut, Result
 from service.web.schemas.poses import Transform
 
@@ -45,12 +46,19 @@ def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None
     _write(path, ("photo", "scene", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"), rows)
 
 
-def write_frame_table(path: Path, frames: Sequence[FrameOut]) -> None:
-    """Write a CSV table with one row a photo of the sequence; the pose is world_from_camera in OpenCV axes."""
-    rows = [
-        (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.tracked)) for f in frames
-    ]
-    _write(path, ("photo", "time_s", "status", "reason", "score", *_POSE_COLUMNS, "followed"), rows)
+def write_frame_table(path: Path, frames: Sequence[FrameOut], *, smooth: bool = False) -> None:
+    """Write a CSV table with one row a photo of the sequence; the pose is world_from_camera in OpenCV axes.
+
+    With `smooth` the column `smoothed` has `smoothed` or `interpolated`, and is empty where no pose is known.
+    """
+    found = smoothed_frames(frames) if smooth else []
+    replaced = {f.index: (f, "interpolated" if mark else "smoothed") for f, mark in found}
+    rows = []
+    for f, mark in (replaced.get(f.index, (f, "")) for f in frames):
+        row = (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.tracked))
+        rows.append((*row, mark) if smooth else row)
+    head = ("photo", "time_s", "status", "reason", "score", *_POSE_COLUMNS, "followed", *["smoothed"] * smooth)
+    _write(path, head, rows)
 
 
 def _pose(world_from_camera: Transform) -> list[float]:

@@ -49,7 +49,9 @@ def scene_facts(path: Path) -> dict[str, Any]:
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
     if not info.up_in_world:
-        warnings.append("up is unknown: z is assumed where views are placed or shown")
+        warnings.append("up is unknown: views are placed upright by z and by -y, and shown by z")
+    if not info.background_is_known:
+        warnings.append("the background is unknown: black is assumed, white for photos with a white border")
     return facts | {"warnings": warnings}
 
 
@@ -105,7 +107,7 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "floaters": f"{facts['floaters']:.1%} of the opaque Gaussians",
         "up": _point(facts["up"]) if facts["up"] else "unknown",
         "metres per unit": str(facts["metres_per_unit"] or "unknown"),
-        "on Earth": "yes" if facts["on_earth"] else "no",
+        "geo anchor": "yes" if facts["on_earth"] else "no",
         "training cameras": str(facts["training_cameras"]),
         "training size": f"{size['px']} px (from the {size['source']})" if size["px"] else size["source"],
         "index": placed,

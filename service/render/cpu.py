@@ -99,6 +99,13 @@ class CpuRasterizer:
         other.scene = replace(self.scene, info=info)
         return other
 
+    def over(self, background_rgb: tuple[float, float, float]) -> CpuRasterizer:
+        """Return a renderer of the same packed Gaussians over another background."""
+        other = copy.copy(self)
+        other.scene = replace(self.scene, info=replace(self.scene.info, background_rgb=background_rgb))
+        other._background = np.asarray(background_rgb, np.float32)
+        return other
+
     def refresh(self) -> None:
         """Copy the scene's values into the packed arrays again, for a scene under training whose arrays change."""
         fill(self.packed, self.scene)

@@ -135,6 +135,13 @@ class GsplatRasterizer:
         other.scene = replace(self.scene, info=info)
         return other
 
+    def over(self, background_rgb: tuple[float, float, float]) -> GsplatRasterizer:
+        """Return a renderer of the same tensors over another background."""
+        other = copy.copy(self)
+        other.scene = replace(self.scene, info=replace(self.scene.info, background_rgb=background_rgb))
+        other._background = self._tensor(background_rgb)
+        return other
+
     def render(
         self,
         cameras: Sequence[Camera],

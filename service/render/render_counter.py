@@ -32,6 +32,10 @@ class Counted:
         """As the inner rasterizer; the new one adds to the same tally."""
         return Counted(self.inner.trained_at(long_side_px), self.tally)
 
+    def over(self, background_rgb: tuple[float, float, float]) -> Counted:
+        """As the inner rasterizer; the new one adds to the same tally."""
+        return Counted(self.inner.over(background_rgb), self.tally)
+
     def render(self, cameras: Sequence[Camera], *rest: Any, **named: Any) -> list[Frame]:
         """Render; each image counts as one."""
         self.tally.count += len(cameras)

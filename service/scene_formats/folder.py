@@ -60,6 +60,7 @@ def load_scene(
         sha256=_digest([file, *_parts_of(reader, file)], path, used, (found.background, size, focal_px)),
         format=reader.__name__.rsplit(".", 1)[-1],
         background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
+        background_is_known=bool(manifest.background or found.background),
         up_in_world=manifest.up or _up(raw.up, manifest),
         metres_per_unit=manifest.metres_per_unit,
         render_mode=mode,

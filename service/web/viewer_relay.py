@@ -2,9 +2,9 @@
 
 The viewer's page derives the address of its WebSocket from its own: the page /viewer/jobs/ID/ connects to
 /viewer/jobs/ID. The path after /viewer is passed on, and names the job to show. All pages are the same file, so the
-relay returns it for every path that the viewer has no file for. A browser without a GPU sets a cookie
-(`static/viewer.js`), which the relay passes on as a query parameter. The same script asks `/viewer-run` whether the
-viewer is still the one that the page was opened with.
+relay returns it for every path that the viewer has no file for. A script (`static/viewer.js`) sets cookies that tell
+whether the browser has a GPU and its time zone; the relay passes them on as query parameters. The same script asks
+`/viewer-run` whether the viewer is still the one that the page was opened with.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import logging
 from collections.abc import Coroutine
 from contextlib import suppress
 from typing import Any, Protocol, runtime_checkable
+from urllib.parse import unquote, urlencode
 
 import httpx
 from fastapi import APIRouter, Request, Response, WebSocket
@@ -36,8 +37,11 @@ class Upstream(Protocol):
 
     port: int
     """On loopback. Nothing may listen there, while the viewer starts."""
-    run: str
-    """Another one for each process that has listened there."""
+
+    @property
+    def run(self) -> str:
+        """Another text for each process that has listened there."""
+        ...
 
 
 class Relay:
@@ -83,8 +87,9 @@ class Relay:
     @route_policy(role="read", key_in_address=True)
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
         offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
-        query = "?gl=software" if browser.cookies.get("splatfix_gl") == "software" else ""
-        uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{query}"
+        told = {"gl": browser.cookies.get("splatfix_gl"), "zone": unquote(browser.cookies.get("splatfix_zone", ""))}
+        query = urlencode({name: value for name, value in told.items() if value})
+        uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{'?' if query else ''}{query}"
         try:
             # No size limit and no compression: messages contain whole scenes, on loopback.
             async with connect(

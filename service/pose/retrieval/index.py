@@ -29,7 +29,7 @@ from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera, Intrinsics, Pose
 
-VERSION = 8
+VERSION = 9
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
@@ -89,8 +89,8 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
 
 def _key(tools: Tools[None], viewpoints: ViewpointConfig) -> str:
     """Return a hash of what the index depends on: code, scene, matcher, rasterizer, and all values of the configs."""
-    # The scene's digest covers the training cameras, but photos may be left out.
-    scene = (tools.scene.info.sha256, len(tools.scene.cameras))
+    # The scene's digest covers the training cameras, but photos may be left out; the background may be assumed.
+    scene = (tools.scene.info.sha256, len(tools.scene.cameras), tools.scene.info.background_rgb)
     # Dataclasses of numbers: their repr names each value.
     configs = (viewpoints, SPACE, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
     parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)

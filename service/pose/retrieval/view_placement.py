@@ -8,6 +8,9 @@ Three kinds of places: on shells around the middle (objects), anywhere in the vo
 inferred from a Gaussian's size: training splits and merges Gaussians until each fills about a pixel of the photos, so
 distance = size x focal length, whatever the scene's unit and however far its background is.
 
+Photos are taken upright, and features tolerate a roll of some 30 degrees. Where the scene's up direction is unknown,
+z and -y are assumed, as Blender's and nerfstudio's scenes and COLMAP's have it: each place has a view upright by each.
+
 A view is good if it is solid, free and inside. Solid: most of the image shows one opaque surface, not nearer than a
 floater would be; from behind walls, inside floaters and towards parts never photographed, the depths along a ray
 disagree. Near training cameras of a room's corner 0.8 to 0.94 of the image are solid, elsewhere 0.05 to 0.3; objects
@@ -18,7 +21,7 @@ are surrounded by the scene, one that isn't looks at the outside of its walls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -80,11 +83,15 @@ class PlacementConfig:
     floater_reach: float = 0.05
     floater_neighbours: int = 8
     """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
+    tolerated_roll_deg: float = 30.0
+    """Rolls that features tolerate: of views that another up direction turns by more, both are kept."""
     repeat_weight: float = 0.25
     """Worth of what another view of the choice shows already, relative to what none shows."""
 
 
 PLACEMENT = PlacementConfig()
+OTHER_UPS = ((0.0, -1.0, 0.0),)
+"""Beside z, where a scene's up direction is unknown: COLMAP's first camera is upright in its world, y down."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,11 +141,22 @@ def find_views(
         seen = views.seen(good)
         if _covered(seen) - before < config.min_gain and not few:
             break
-    chosen = good[_choice([views.cells(i) for i in good], config)]
+    others = () if scene.info.up_in_world else OTHER_UPS
+    # With a second up direction each place may have two views.
+    limited = replace(config, max_views=config.max_views // (1 + len(others)))
+    chosen = good[_choice([views.cells(i) for i in good], limited)]
     lens = search_camera(config.render_px, config.fov_deg)
-    cameras = tuple(Camera(lens, views.poses[i]) for i in chosen)
+    cameras = tuple(Camera(lens, pose) for i in chosen for pose in _uprights(views.poses[i], others, config))
     coverage = _covered(views.seen(chosen))
     return Placement(cameras, len(views.poses), len(good), coverage, space.distance, views.interior)
+
+
+def _uprights(pose: Pose, ups: Sequence[tuple[float, float, float]], config: PlacementConfig) -> list[Pose]:
+    """Return the pose, and the same place and viewing direction upright by others' up, where that rolls the image."""
+    position, axis = pose.position_in_world, pose.axis_in_world
+    turned = [look_at(position, position + axis, np.array(up)) for up in ups]
+    least = np.cos(np.radians(config.tolerated_roll_deg))
+    return [pose, *(t for t in turned if t.world_from_camera[:3, 0] @ pose.world_from_camera[:3, 0] < least)]
 
 
 def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:

@@ -200,14 +200,23 @@ async def job_render(
     | errors("invalid_request", "job_not_found", "no_geo_anchor", "job_not_ready", "no_pose"),
 )
 @route_policy(role="read")
-def export_pose(job: JobOf, app_state: AppStateOf, format: Annotated[ExportFormat, Path()]) -> Response:
+def export_pose(
+    job: JobOf,
+    app_state: AppStateOf,
+    format: Annotated[ExportFormat, Path()],
+    smooth: Annotated[
+        bool,
+        Query(description="Of a sequence: filter the jitter, each pose by its covariance, and join gaps of up to 1 s."),
+    ] = False,
+) -> Response:
     """Return the pose in the format of another program, unless the job is `not_localized`.
 
     `colmap`: an entry of `images.txt`, with its camera in a comment. `nerfstudio`: an entry of `frames` in
     `transforms.json`. `tum`: a line of a trajectory, with the time at which the job was created. `geopose`: OGC
     GeoPose 1.0, if the scene's manifest has a `geo_anchor`. Of a job with several photos: all that were localized, as
     an `images.txt`, a `transforms.json`, or a trajectory with the photos' times; `geopose` has the last one only.
+    Interpolated poses of a smoothed sequence are marked: by a comment line before them, or in nerfstudio's entry.
     """
     resources.require_pose(job)
     created, result = datetime.fromtimestamp(job.created, UTC), result_out(app_state.jobs.result(job))
-    return Response(exported(format, job.photo.name, created, result), media_type=EXPORT_TYPES[format])
+    return Response(exported(format, job.photo.name, created, result, smooth=smooth), media_type=EXPORT_TYPES[format])

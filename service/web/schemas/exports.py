@@ -14,8 +14,9 @@ import numpy as np
 from service.errors import NoGeoAnchor
 from service.photos.intrinsics import ONE_FOCAL
 from service.results import Status
+from service.smoothing import TimedPose, smoothed
 from service.types import Pose
-from service.web.schemas.conversion import pose_out
+from service.web.schemas.conversion import covariance_out, pose_out, transform_out
 from service.web.schemas.job_results import FrameOut, Result
 from service.web.schemas.poses import IntrinsicsOut, PoseOut
 
@@ -28,18 +29,52 @@ EXPORT_TYPES: dict[ExportFormat, str] = {
 }
 
 
-def exported(kind: ExportFormat, photo_name: str, created: datetime, result: Result) -> str:
-    """Return the pose, or all localized poses of a sequence, as text. Raises NoGeoAnchor."""
+_INTERPOLATED = "# interpolated: the next photo was not localized itself"
+"""A comment in COLMAP's and TUM's files."""
+
+
+def exported(kind: ExportFormat, photo_name: str, created: datetime, result: Result, *, smooth: bool = False) -> str:
+    """Return the pose, or all localized poses of a sequence, as text; `smooth` filters a sequence's jitter, and joins
+    short gaps (`service/smoothing.py`). Raises NoGeoAnchor."""
     if result.frames is None:
         poses = [_NamedPose(_field(photo_name), created.timestamp(), result.pose)]
     else:
-        poses = _localized(result.frames)
+        poses = _smoothed(result.frames) if smooth else _localized(result.frames)
     return _FORMATS[kind](poses, result)
 
 
-def trajectory_of(frames: Sequence[FrameOut]) -> str:
+def trajectory_of(frames: Sequence[FrameOut], *, smooth: bool = False) -> str:
     """Return the localized frames as a TUM trajectory: `timestamp tx ty tz qx qy qz qw`."""
-    return "".join(map(_tum_line, _localized(frames)))
+    return "".join(map(_tum_line, _smoothed(frames) if smooth else _localized(frames)))
+
+
+def smoothed_frames(frames: Sequence[FrameOut]) -> list[tuple[FrameOut, bool]]:
+    """Return the frames with smoothed poses, and whether each is interpolated; without those that no pose is known of.
+
+    An interpolated frame keeps its own status, which is not `localized`.
+    """
+    told = [
+        TimedPose(
+            frame.time_s,
+            Pose(np.array(frame.world_from_camera.matrix)) if frame.status is Status.LOCALIZED else None,
+            None if frame.covariance is None else np.array(frame.covariance.matrix),
+        )
+        for frame in frames
+    ]
+    found = []
+    for frame, answer in zip(frames, smoothed(told), strict=True):
+        if answer is not None:
+            pose = transform_out(answer.pose.world_from_camera)
+            update = {"world_from_camera": pose, "covariance": covariance_out(answer.covariance)}
+            found.append((frame.model_copy(update=update), answer.interpolated))
+    return found
+
+
+def _smoothed(frames: Sequence[FrameOut]) -> list[_NamedPose]:
+    return [
+        _NamedPose(_field(frame.name), frame.time_s, _pose_of(frame), interpolated)
+        for frame, interpolated in smoothed_frames(frames)
+    ]
 
 
 def _localized(frames: Sequence[FrameOut]) -> list[_NamedPose]:
@@ -52,6 +87,7 @@ class _NamedPose:
     name: str
     time_s: float
     pose: PoseOut
+    interpolated: bool = False
 
 
 def _pose_of(frame: FrameOut) -> PoseOut:
@@ -69,6 +105,7 @@ def _colmap(poses: Sequence[_NamedPose], result: Result) -> str:
     lines.append("# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME")
     for number, named in enumerate(poses, 1):
         pose = named.pose.camera_from_world
+        lines += [_INTERPOLATED] if named.interpolated else []
         lines += [f"{number} {_numbers(*pose.quaternion_wxyz, *pose.translation)} 1 {named.name}", ""]
     return "\n".join(lines) + "\n"
 
@@ -93,6 +130,9 @@ _DISTORTION = {
 def _nerfstudio(poses: Sequence[_NamedPose], result: Result) -> str:
     """An entry of `frames` with its intrinsics; for a sequence an object with all entries."""
     entries = [_nerfstudio_frame(named, result.intrinsics) for named in poses]
+    for named, entry in zip(poses, entries, strict=True):
+        if named.interpolated:
+            entry["interpolated"] = True
     return json.dumps({"frames": entries} if result.frames is not None else entries[0], indent=2) + "\n"
 
 
@@ -121,7 +161,8 @@ def _tum(poses: Sequence[_NamedPose], result: Result) -> str:
 def _tum_line(named: _NamedPose) -> str:
     # TUM has the scalar part last.
     w, x, y, z = named.pose.world_from_camera.quaternion_wxyz
-    return f"{named.time_s:.6f} {_numbers(*named.pose.position, x, y, z, w)}\n"
+    line = f"{named.time_s:.6f} {_numbers(*named.pose.position, x, y, z, w)}\n"
+    return f"{_INTERPOLATED}\n{line}" if named.interpolated else line
 
 
 def _geopose(poses: Sequence[_NamedPose], result: Result) -> str:

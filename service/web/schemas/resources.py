@@ -117,6 +117,7 @@ def scene_out(scene: SceneStatus, contents: SceneContents | None, root: str) -> 
         sha256=info and info.sha256,
         format=info and info.format,
         background_rgb=list(info.background_rgb) if info else None,
+        background_is_known=info and info.background_is_known,
         up_in_world=list(info.up_in_world) if info and info.up_in_world else None,
         metres_per_unit=info and info.metres_per_unit,
         render_mode=info and info.render_mode,

@@ -44,6 +44,8 @@ class SceneOut(SceneSummary):
     format: str | None
     background_rgb: list[float] | None
     """Background colour of training, 0..1."""
+    background_is_known: bool | None
+    """Whether a file says so; if not, black is assumed, and white for photos with a white border."""
     up_in_world: list[float] | None
     """Unit vector that points up, in the scene's frame."""
     metres_per_unit: float | None

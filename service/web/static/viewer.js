@@ -15,7 +15,10 @@ function drawsInSoftware() {
   return /swiftshader|llvmpipe|software|basic render/i.test(name);
 }
 const drawn = drawsInSoftware() ? "software" : "gpu";
-document.cookie = `splatfix_gl=${drawn}; path=${new URL("viewer", root).pathname}; SameSite=Strict`;
+const where = `path=${new URL("viewer", root).pathname}; SameSite=Strict`;
+document.cookie = `splatfix_gl=${drawn}; ${where}`;
+// Times are shown as on the other pages: in the browser's zone.
+document.cookie = `splatfix_zone=${encodeURIComponent(Intl.DateTimeFormat().resolvedOptions().timeZone)}; ${where}`;
 
 // Links to our own pages; their address depends on where the service is shown.
 document.addEventListener("click", event => {
@@ -53,6 +56,11 @@ async function compare() {
   if (!pending.length) location.reload();
   else show(`The service is starting (${pending[0]}).`);
 }
+
+// viser's labels have a contrast of 4.0 : 1.
+const labels = document.createElement("style");
+labels.textContent = ":root { --mantine-color-dimmed: #c3c6ca !important; --mantine-color-placeholder: #c3c6ca !important; }";
+document.head.append(labels);
 
 const bar = document.createElement("div");
 bar.setAttribute("role", "alert");
