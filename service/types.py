@@ -339,6 +339,8 @@ class LensPrior:
     """In long sides of the image: phones and calibrated test cameras have 0.001 to 0.03."""
 
 
+UNKNOWN_PRINCIPAL_POINT = LensPrior(1.0).principal_point_scale
+"""Scale of a principal point of which nothing is known but that it is usually near the centre."""
 IntrinsicsSource = Literal["given", "exif", "guessed", "memory"]
 """Where a photo's assumed intrinsics are from: the request, its EXIF, a default, or earlier photos of the camera."""
 LENS_PRIORS: dict[IntrinsicsSource, LensPrior] = {

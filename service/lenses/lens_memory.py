@@ -13,14 +13,12 @@ from service.lenses.lens_store import LensStore
 from service.photos.camera_identity import CameraIdentity
 from service.photos.intrinsics import ORIENTATIONS, oriented
 from service.results import PoseEstimate, Status
-from service.types import Intrinsics, LensPrior
+from service.types import UNKNOWN_PRINCIPAL_POINT, Intrinsics, LensPrior
 
 _INVERSE = {6: 8, 8: 6}
 """EXIF orientations that aren't undone by themselves."""
 _MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL")
 """Camera models that an estimate can hold."""
-UNKNOWN_SHIFT = LensPrior(1.0).principal_point_scale
-"""A principal point that nothing was learnt of is as of any camera."""
 _LEAST_INFORMATION = 0.5
 """Share of the posterior's information that must be the photo's own: the difference to the prior's is uncertain."""
 
@@ -56,7 +54,7 @@ class LensMemory:
         if _is_turned_unknown(camera):
             # The centre is assumed, from which the principal point lies in an unknown direction.
             shift_sigma = float(np.hypot(shift_sigma, np.hypot(*lens.estimate.mean[2:])))
-        prior = LensPrior(focal_sigma, k1_sigma, min(shift_sigma, UNKNOWN_SHIFT))
+        prior = LensPrior(focal_sigma, k1_sigma, min(shift_sigma, UNKNOWN_PRINCIPAL_POINT))
         return RecalledLens(lens.key.id, _intrinsics(lens.estimate, camera), prior, lens.estimate.photos)
 
     def learn(

@@ -77,6 +77,8 @@ class LensErrorConfig:
     k1: float = 0.004
     principal_point: float = 0.0015
     """In long sides. Forward-facing scenes turn 0.2 to 0.4 degrees with it."""
+    crop_scale: float = 0.15
+    """Standard deviation of the principal point of a photo that may have been cropped off centre, in long sides."""
 
 
 @dataclass(frozen=True, slots=True)

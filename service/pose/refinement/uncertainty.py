@@ -29,10 +29,12 @@ from service.pose.refinement.refinement_config import (
     RefinementConfig,
 )
 from service.pose.refinement.rolling_shutter import ShutterMotion, shutter_motion, with_shutter_rows
-from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior
+from service.types import NO_CORRECTION, UNKNOWN_PRINCIPAL_POINT, Camera, IntrinsicsCorrection, LensPrior
 
 FOCAL = CORRECTION.start
 """Place of log focal in the vector of unknowns."""
+SHIFT = slice(FOCAL + 2, FOCAL + 4)
+"""Places of the principal point's shift."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,9 @@ class PoseUncertainty:
     """Of the right twist, true = pose @ exp(twist); with an approximate camera also of its `correction_vector`."""
     given_lens: Float64[np.ndarray, "6 6"] | None = None
     """Covariance of the twist if the intrinsics were known; None: they are."""
+    if_cropped: Float64[np.ndarray, "6 6"] | None = None
+    """Of approximate intrinsics: covariance of the twist if nothing were known of the principal point, as in a photo
+    that may have been cropped off centre; None: they are exact, or told by a good source."""
     focal_step: float = 0.0
     """By how much the logarithm of an approximate focal length would still change."""
     lens_fit: LensFit | None = None
@@ -137,7 +142,33 @@ def _with_estimated_lens(
         return None
     covariance = _with_lens_error(covariance, config.lens_error, 1.0 / prior_precision(lens_prior, correction))
     given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
-    return PoseUncertainty(np.zeros(6), covariance, given_lens, _focal_step(hessian, score))
+    return PoseUncertainty(
+        np.zeros(6),
+        covariance,
+        given_lens,
+        _covariance_if_cropped(hessian, scale, lens_prior, correction, config.lens_error),
+        _focal_step(hessian, score),
+    )
+
+
+def _covariance_if_cropped(
+    hessian: Float64[np.ndarray, "16 16"],
+    scale: float,
+    lens_prior: LensPrior,
+    correction: IntrinsicsCorrection,
+    error: LensErrorConfig,
+) -> Float64[np.ndarray, "6 6"] | None:
+    """Return the covariance of the twist if the principal point is that of a photo cropped off centre."""
+    if lens_prior.principal_point_scale < UNKNOWN_PRINCIPAL_POINT:
+        return None
+    of_lens = slice(0, CORRECTION.stop)
+    information = _with_prior(hessian, scale, lens_prior, correction)
+    # The prior's tails are broad, but an estimate near its centre looks certain even where another rotation with
+    # another principal point fits as well: what is seen is nearly a plane, whose homography hasn't all unknowns.
+    weight = scale / error.crop_scale**2
+    information[SHIFT, SHIFT] = hessian[SHIFT, SHIFT] + weight * np.eye(2)
+    found = _covariance(information[of_lens, of_lens], scale)
+    return None if found is None else found[:6, :6]
 
 
 def _with_shutter(found: PoseUncertainty, motion: Float64[np.ndarray, "6"]) -> PoseUncertainty:

@@ -58,6 +58,10 @@ class VerificationConfig:
     """Standard deviation of the position, relative to the distance to what is seen: six in seven such positions are
     within the bound of what is right (0.0125). Photos of the test scenes have 0.0002 to 0.002, cropped to an eighth
     0.01. Wrong answers with estimated intrinsics have 0.0095 and more: crops and turntables through long lenses."""
+    max_sigma_share_if_cropped: float = 0.0125
+    """That of the position if the photo may have been cropped off centre, with approximate intrinsics: beyond it a
+    plane may be seen from elsewhere with another principal point. Right answers have up to 0.0105, wrong ones of this
+    kind 0.027 and more."""
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
@@ -236,8 +240,11 @@ def _doubt_about_position(
     if abs(uncertainty.focal_step) > config.max_focal_step:
         return Reason.FOCAL_UNCERTAIN
     if sigma_share <= config.max_sigma_share:
-        is_settled = uncertainty.given_lens is None or signals["drift_px"] <= config.max_drift_px_free_lens
-        return None if is_settled else Reason.FOCAL_UNCERTAIN
+        certain = uncertainty.given_lens is None or (
+            signals["drift_px"] <= config.max_drift_px_free_lens
+            and _is_certain_if_cropped(uncertainty, signals, config)
+        )
+        return None if certain else Reason.FOCAL_UNCERTAIN
     if uncertainty.given_lens is None:
         return Reason.POSITION_UNCERTAIN
     # With known intrinsics the position would be certain: then they are what is missing.
@@ -246,15 +253,29 @@ def _doubt_about_position(
     return Reason.FOCAL_UNCERTAIN if is_known else Reason.POSITION_UNCERTAIN
 
 
+def _is_certain_if_cropped(
+    uncertainty: PoseUncertainty, signals: Mapping[str, float], config: VerificationConfig
+) -> bool:
+    """Return whether the position would be certain if the principal point were anywhere near the centre."""
+    if uncertainty.if_cropped is None:
+        return True
+    cropped, told = (np.trace(matrix[3:6, 3:6]) for matrix in (uncertainty.if_cropped, uncertainty.covariance))
+    return bool(signals["sigma_share"] * np.sqrt(cropped / told) <= config.max_sigma_share_if_cropped)
+
+
 def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict:
     # What another step would still change is an error, too: it adds its square.
     step, given_lens = np.outer(uncertainty.last_step, uncertainty.last_step), uncertainty.given_lens
     fit, untested, shutter = uncertainty.lens_fit, uncertainty.untested_lens, uncertainty.shutter
+    told = uncertainty.covariance[:6, :6] if untested is None else untested
+    cropped = uncertainty.if_cropped
+    if verdict.reason is Reason.FOCAL_UNCERTAIN and cropped is not None and np.trace(cropped) > np.trace(told):
+        told = cropped
     # Exact intrinsics are no unknowns of the covariance.
     sigmas = np.sqrt(uncertainty.covariance.diagonal()[6:]).tolist() or [0.0] * 4
     return replace(
         verdict,
-        covariance=(uncertainty.covariance[:6, :6] if untested is None else untested) + step,
+        covariance=told + step,
         intrinsics_untested=untested is not None,
         shutter_motion=shutter and (shutter.shear, shutter.stretch),
         covariance_given_lens=None if given_lens is None else given_lens + step,
