@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, UInt8
 
 from service.geometry import se3_log
 from service.interfaces import Frame
-from service.pose.absolute_pose.lens_prior import prior_precision
+from service.pose.absolute_pose.lens_prior import SHIFT, correction_vector, prior_precision
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale, scores_by_cell
 from service.pose.refinement.gauss_newton import minimize
 from service.pose.refinement.lens_test import LensFit, fit_lens
@@ -33,8 +33,18 @@ from service.types import NO_CORRECTION, UNKNOWN_PRINCIPAL_POINT, Camera, Intrin
 
 FOCAL = CORRECTION.start
 """Place of log focal in the vector of unknowns."""
-SHIFT = slice(FOCAL + 2, FOCAL + 4)
-"""Places of the principal point's shift."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseIfCropped:
+    """The pose if the principal point may be anywhere, as in a photo that was cropped off centre."""
+
+    covariance: Float64[np.ndarray, "6 6"]
+    """Of the right twist."""
+    step: Float64[np.ndarray, "6"]
+    """The right twist (rad, scene units) that refinement with such a prior would begin with."""
+    significance: float
+    """The square of that step of all unknowns in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,9 +55,8 @@ class PoseUncertainty:
     """Of the right twist, true = pose @ exp(twist); with an approximate camera also of its `correction_vector`."""
     given_lens: Float64[np.ndarray, "6 6"] | None = None
     """Covariance of the twist if the intrinsics were known; None: they are."""
-    if_cropped: Float64[np.ndarray, "6 6"] | None = None
-    """Of approximate intrinsics: covariance of the twist if nothing were known of the principal point, as in a photo
-    that may have been cropped off centre; None: they are exact, or told by a good source."""
+    if_cropped: PoseIfCropped | None = None
+    """Of approximate intrinsics; None: they are exact, or a good source told the principal point."""
     focal_step: float = 0.0
     """By how much the logarithm of an approximate focal length would still change."""
     lens_fit: LensFit | None = None
@@ -146,29 +155,37 @@ def _with_estimated_lens(
         np.zeros(6),
         covariance,
         given_lens,
-        _covariance_if_cropped(hessian, scale, lens_prior, correction, config.lens_error),
+        _pose_if_cropped(hessian, score, scale, lens_prior, correction, config.lens_error),
         _focal_step(hessian, score),
     )
 
 
-def _covariance_if_cropped(
+def _pose_if_cropped(
     hessian: Float64[np.ndarray, "16 16"],
+    score: Float64[np.ndarray, "16"],
     scale: float,
     lens_prior: LensPrior,
     correction: IntrinsicsCorrection,
     error: LensErrorConfig,
-) -> Float64[np.ndarray, "6 6"] | None:
-    """Return the covariance of the twist if the principal point is that of a photo cropped off centre."""
+) -> PoseIfCropped | None:
+    """Return covariance and next step of the pose with a prior on the principal point that is as wide as crops are.
+
+    The usual prior's tails are broad, but an estimate near its centre looks certain even where another rotation with
+    another principal point fits as well, or better: what is seen is nearly a plane.
+    """
     if lens_prior.principal_point_scale < UNKNOWN_PRINCIPAL_POINT:
         return None
+    precision, distance = prior_precision(lens_prior, correction), correction_vector(correction)
+    precision[SHIFT] = 1.0 / error.crop_scale**2
     of_lens = slice(0, CORRECTION.stop)
-    information = _with_prior(hessian, scale, lens_prior, correction)
-    # The prior's tails are broad, but an estimate near its centre looks certain even where another rotation with
-    # another principal point fits as well: what is seen is nearly a plane, whose homography hasn't all unknowns.
-    weight = scale / error.crop_scale**2
-    information[SHIFT, SHIFT] = hessian[SHIFT, SHIFT] + weight * np.eye(2)
-    found = _covariance(information[of_lens, of_lens], scale)
-    return None if found is None else found[:6, :6]
+    information, pull = hessian[of_lens, of_lens].copy(), score[of_lens].copy()
+    information[CORRECTION, CORRECTION] += scale * np.diag(precision)
+    pull[CORRECTION] -= scale * precision * distance
+    inverse = inverse_spd(information)
+    if inverse is None:
+        return None
+    step = inverse @ pull
+    return PoseIfCropped(scale * inverse[TWIST, TWIST], step[TWIST], float(step @ pull) / scale)
 
 
 def _with_shutter(found: PoseUncertainty, motion: Float64[np.ndarray, "6"]) -> PoseUncertainty:

@@ -62,6 +62,11 @@ class VerificationConfig:
     """That of the position if the photo may have been cropped off centre, with approximate intrinsics: beyond it a
     plane may be seen from elsewhere with another principal point. Right answers have up to 0.0105, wrong ones of this
     kind 0.027 and more."""
+    max_sigma_deg_if_cropped: float = 2.0
+    """Likewise of the rotation."""
+    max_significance_if_cropped: float = 6.6
+    """Square of the step, in standard deviations, from which on it is no chance (one in a hundred): then it must not move the pose. Right
+    answers have 4.6 at most, wrong ones of this kind 15 and more."""
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
@@ -256,11 +261,17 @@ def _doubt_about_position(
 def _is_certain_if_cropped(
     uncertainty: PoseUncertainty, signals: Mapping[str, float], config: VerificationConfig
 ) -> bool:
-    """Return whether the position would be certain if the principal point were anywhere near the centre."""
-    if uncertainty.if_cropped is None:
+    """Return whether the pose would be certain, and the same, if the principal point might be anywhere."""
+    cropped, test = uncertainty.if_cropped, config.refinement.lens_test
+    if cropped is None:
         return True
-    cropped, told = (np.trace(matrix[3:6, 3:6]) for matrix in (uncertainty.if_cropped, uncertainty.covariance))
-    return bool(signals["sigma_share"] * np.sqrt(cropped / told) <= config.max_sigma_share_if_cropped)
+    sigma_deg = np.degrees(np.sqrt(np.trace(cropped.covariance[:3, :3])))
+    sigma, sigma_told = (np.sqrt(np.trace(one[3:6, 3:6])) for one in (cropped.covariance, uncertainty.covariance))
+    depth = sigma_told / max(signals["sigma_share"], 1e-9)
+    if sigma_deg > config.max_sigma_deg_if_cropped or sigma > config.max_sigma_share_if_cropped * depth:
+        return False
+    moves = moves_pose(cropped.step, depth, test.contradicting_deg, test.contradicting_share)
+    return not (moves and cropped.significance > config.max_significance_if_cropped)
 
 
 def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict:
@@ -269,8 +280,8 @@ def _with_uncertainty(verdict: Verdict, uncertainty: PoseUncertainty) -> Verdict
     fit, untested, shutter = uncertainty.lens_fit, uncertainty.untested_lens, uncertainty.shutter
     told = uncertainty.covariance[:6, :6] if untested is None else untested
     cropped = uncertainty.if_cropped
-    if verdict.reason is Reason.FOCAL_UNCERTAIN and cropped is not None and np.trace(cropped) > np.trace(told):
-        told = cropped
+    if verdict.reason is Reason.FOCAL_UNCERTAIN and cropped and np.trace(cropped.covariance) > np.trace(told):
+        told = cropped.covariance + np.outer(cropped.step, cropped.step)
     # Exact intrinsics are no unknowns of the covariance.
     sigmas = np.sqrt(uncertainty.covariance.diagonal()[6:]).tolist() or [0.0] * 4
     return replace(
