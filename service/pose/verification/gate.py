@@ -65,8 +65,8 @@ class VerificationConfig:
     max_sigma_deg_if_cropped: float = 2.0
     """Likewise of the rotation."""
     max_significance_if_cropped: float = 6.6
-    """Square of the step, in standard deviations, from which on it is no chance (one in a hundred): then it must not move the pose. Right
-    answers have 4.6 at most, wrong ones of this kind 15 and more."""
+    """Square of the next step, in standard deviations, from which on it is no chance (one in a hundred): then it must
+    not move the pose. Right answers have 4.6 at most, wrong ones of this kind 9.3 and more."""
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
