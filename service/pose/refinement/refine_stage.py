@@ -112,8 +112,8 @@ def refine_stage(
 ) -> Generator[IterationRecord, None, RefineOutcome]:
     """Render, refine photometrically, render at the result, refine again, until a new render would be the same.
 
-    Ends early where the loss exceeds `max_loss`. Where the intrinsics are estimated and the pose moves far or for too
-    long, the outcome says where to match again; not so if it is of matches with a render at the pose (`is_rematched`).
+    Ends early where the loss exceeds `max_loss`. Where the pose has not settled, or moves far with estimated
+    intrinsics, the outcome says where to match again.
     """
     if config.max_renders == 0:
         return RefineOutcome((yield from _as_matched(found, renderer)))
@@ -144,12 +144,10 @@ def refine_stage(
         if is_first and result.loss > config.max_first_loss and _moved_far(rendered, refined, images, config):
             return RefineOutcome(replace(refined, photometric=None), restart=found)
         now, small_px = replace(found, pose=result.pose, correction=result.correction), None
-    if refined is None or not free_lens:
+    following = refined and _next_render(rendered, now, images, renderer, config, None)
+    if refined is None or following is None:
         return RefineOutcome(refined)
-    following = _next_render(rendered, now, images, renderer, config, None)
-    if following is None:
-        return RefineOutcome(refined)
-    # Distance and focal length still move along together: fresh matches decide between them.
+    # The pose began too far off, or distance and focal length still move along together: fresh matches bring it near.
     return RefineOutcome(replace(refined, rendered=following, photometric=None), restart=now)
 
 
