@@ -90,7 +90,7 @@ class LensTestConfig:
     principal_point_scale: float = 0.05
     """Of the prior while they are free: wide, for wrong ones may be off by any amount."""
     suspicious_deg: float = 0.5
-    suspicious_share: float = 0.002
+    suspicious_share: float = 0.0015
     """Predicted motion of the pose (degrees; share of the median depth) from which on they are refined..."""
     suspicious_loss: float = 0.03
     """...and mean absolute residual (0..1): most right answers with the right intrinsics have less."""
