@@ -19,6 +19,8 @@ from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose import lens_prior
+from service.pose.refinement.uncertainty import PoseUncertainty
+from service.pose.verification.gate import verdict_of
 from service.results import PoseEstimate, Reason, Status
 from service.types import Intrinsics, Pose
 
@@ -160,6 +162,37 @@ def test_a_strip_is_refined_until_it_settles_or_refused(studio: LoadedScene, goe
         assert pose_distance(found.pose, truth)[1] < 0.02
     else:
         assert found.verdict.reason is Reason.FOCAL_UNCERTAIN
+
+
+@pytest.mark.parametrize("name", ["same_light/same_light_18.jpg", "phone/phone_02.jpg"])
+def test_a_plane_seen_with_another_principal_point_is_no_sure_answer(studio: LoadedScene, name: str) -> None:
+    """The left two fifths of a photo of walls: 20 degrees turned, with the principal point in the middle, fits, too."""
+    file = ROOT / "scenes" / "studio_another_day" / name
+    rgb = cv2.cvtColor(cv2.imread(str(file)), cv2.COLOR_BGR2RGB)
+    entry = next(one for one in json.loads((file.parent / "truth.json").read_text()) if one["photo"] == file.name)
+    found = localize(read_query(jpeg(rgb[:, : int(0.4 * rgb.shape[1])])), studio)
+    assert pose_distance(found.pose, Pose(np.array(entry["world_from_camera"])))[0] > 15.0
+    assert found.verdict.reason is Reason.FOCAL_UNCERTAIN
+
+
+def test_an_exact_lens_is_matched_again_where_refinement_does_not_settle(studio: LoadedScene) -> None:
+    rgb, camera, truth = photo("photo_05.jpg")
+    query = read_query(jpeg(rgb), intrinsics=camera)
+    one_render = replace(SEARCH, refinement=replace(SEARCH.refinement, max_renders=1))
+    stages = [
+        [record.stage for record in localize(query, studio, Request(config=config)).records]
+        for config in (SEARCH, one_render)
+    ]
+    assert ["rematch" in some for some in stages] == [False, True]
+    assert pose_distance(localize(query, studio, Request(config=one_render)).pose, truth)[1] < 0.02
+
+
+def test_a_pose_that_another_step_would_move_is_no_sure_answer(studio: LoadedScene) -> None:
+    rgb, camera, _ = photo("photo_05.jpg")
+    signals = localize(read_query(jpeg(rgb), intrinsics=camera), studio).verdict.signals
+    certain = PoseUncertainty(np.zeros(6), 1e-8 * np.eye(6))
+    assert verdict_of(signals, certain).status is Status.LOCALIZED
+    assert verdict_of({**signals, "drift_px": 2.5}, certain).reason is Reason.POSITION_UNCERTAIN
 
 
 def test_a_lens_at_the_bound_of_what_is_estimated_is_no_sure_answer(
