@@ -79,7 +79,7 @@ def checked(raw: RawGaussians, where: str) -> RawGaussians:
 
 
 def _non_finite(values: np.ndarray) -> Bool[np.ndarray, "n"]:
-    return ~np.isfinite(values.reshape(len(values), -1)).all(1)
+    return np.asarray(~np.isfinite(values.reshape(len(values), -1)).all(1))
 
 
 def cut_sh(sh: Float32[np.ndarray, "n k 3"]) -> tuple[Float32[np.ndarray, "n m 3"], tuple[str, ...]]:

@@ -65,7 +65,7 @@ class _File:
         data = np.fromfile(path, np.uint8)
         if len(data) < 20:
             raise CorruptScene("truncated within the header of 20 bytes.", where=path.name)
-        _, version, _, length, kind = struct.unpack_from("<4sIII4s", data)
+        _, version, _, length, kind = struct.unpack_from("<4sIII4s", data[:20].tobytes())
         if version != 2 or kind != b"JSON" or length > min(MAX_JSON_BYTES, len(data) - 20):
             raise CorruptScene(f"glTF version {version}, or no JSON chunk of {length} bytes.", where=path.name)
         try:
@@ -79,10 +79,11 @@ class _File:
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
         """Return one of the file's numbered objects. Raises CorruptScene."""
         entries = self.tree.get(kind)
-        known = isinstance(entries, list) and isinstance(index, int) and 0 <= index < len(entries)
-        if not known or not isinstance(entries[index], dict):
-            raise CorruptScene(f"it has no {kind}[{str(index)[:20]}].", where=self.name)
-        return entries[index]
+        if isinstance(entries, list) and isinstance(index, int) and 0 <= index < len(entries):
+            entry = entries[index]
+            if isinstance(entry, dict):
+                return entry
+        raise CorruptScene(f"it has no {kind}[{str(index)[:20]}].", where=self.name)
 
     def placed_meshes(self) -> list[tuple[int, Float64[np.ndarray, "4 4"]]]:
         """Return the meshes of the file's scene with their transforms. Raises CorruptScene."""
@@ -160,10 +161,10 @@ class _File:
         """Return the bytes of a buffer view. Raises CorruptScene."""
         view = self.entry("bufferViews", index)
         start, length = view.get("byteOffset", 0), view.get("byteLength")
-        whole = isinstance(start, int) and isinstance(length, int) and view.get("buffer", 0) == 0
-        if not whole or not 0 <= start <= start + length <= len(self.data):
-            raise CorruptScene(f"bufferViews[{index}] reaches beyond the file.", where=self.name)
-        return self.data[start : start + length]
+        of_this_file = isinstance(start, int) and isinstance(length, int) and view.get("buffer", 0) == 0
+        if of_this_file and 0 <= start <= start + length <= len(self.data):
+            return self.data[start : start + length]
+        raise CorruptScene(f"bufferViews[{index}] reaches beyond the file.", where=self.name)
 
     def _accessor(self, attribute: dict[str, Any], name: str, width: int) -> Float32[np.ndarray, "n m"]:
         """Return an attribute as floats; integers are shares of their greatest value. Raises CorruptScene."""

@@ -52,7 +52,7 @@ def read(path: Path) -> RawGaussians:
     data = np.fromfile(path, np.uint8)
     if len(data) < _HEADER:
         raise CorruptScene(f"truncated: {len(data)} bytes, the header has {_HEADER}.", where=path.name)
-    major, minor, sections, count, level = struct.unpack_from("<BBxxI8xIH", data)
+    major, minor, sections, count, level = struct.unpack_from("<BBxxI8xIH", data[:_HEADER].tobytes())
     if major != 0 or minor < 1 or level > 2:
         raise UnsupportedFormat(
             f".ksplat version {major}.{minor}, compression level {level}; known: 0.1 and later, 0 to 2.",
@@ -61,7 +61,7 @@ def read(path: Path) -> RawGaussians:
     require_count(count, path.name)
     if sections > _MAX_SECTIONS or _HEADER + _SECTION * sections > len(data):
         raise CorruptScene(f"{sections} sections in {len(data)} bytes.", where=path.name)
-    low, high = (float(value) for value in struct.unpack_from("<2f", data, 36))
+    low, high = (float(value) for value in struct.unpack_from("<2f", data[:_HEADER].tobytes(), 36))
     bounds = (low or -1.5, high or 1.5)
     at, found = _HEADER + _SECTION * sections, []
     for number in range(sections):
@@ -94,7 +94,7 @@ def _record(level: int, degree: int) -> np.dtype:
 
 
 def _section(data: np.ndarray, at: int, level: int, where: str) -> _Section:
-    values = struct.unpack_from("<IIIIfH2xI4xIIH", data, at)
+    values = struct.unpack_from("<IIIIfH2xI4xIIH", data[at : at + _SECTION].tobytes())
     count, capacity, bucket_size, buckets, block_size, bucket_bytes, steps, full, partial, degree = values
     if degree >= len(_COEFFICIENTS):
         raise CorruptScene(f"SH degree {degree}; the limit is 3.", where=where)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.errors import UnsupportedFormat
 
 CONVERT = "npx @playcanvas/splat-transform"
-"""The converter that hints name; tests run it where it is installed."""
+"""The converter that hints name."""
 NO_CONVERTER = "No converter to plain 3DGS is known: train the scene with plain 3DGS."
 _NO_SHAPES = "Its points have no shapes: name the file that the trainer wrote."
 UNREAD_SUFFIXES = {

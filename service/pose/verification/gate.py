@@ -247,16 +247,16 @@ def _doubt_about_position(
         return Reason.INTRINSICS_CONTRADICTED
     if abs(uncertainty.focal_step) > config.max_focal_step:
         return Reason.FOCAL_UNCERTAIN
-    exact = uncertainty.given_lens is None
-    settled = signals["drift_px"] <= (config.max_drift_px if exact else config.max_drift_px_free_lens)
+    given_lens = uncertainty.given_lens
+    settled = signals["drift_px"] <= (config.max_drift_px if given_lens is None else config.max_drift_px_free_lens)
     if sigma_share <= config.max_sigma_share and settled and _is_certain_if_cropped(uncertainty, signals, config):
         return None
-    if exact:
+    if given_lens is None:
         return Reason.POSITION_UNCERTAIN
     if sigma_share <= config.max_sigma_share:
         return Reason.FOCAL_UNCERTAIN
     # With known intrinsics the position would be certain: then they are what is missing.
-    known, unknown = (np.trace(matrix[3:6, 3:6]) for matrix in (uncertainty.given_lens, uncertainty.covariance))
+    known, unknown = (np.trace(matrix[3:6, 3:6]) for matrix in (given_lens, uncertainty.covariance))
     is_known = sigma_share * np.sqrt(known / unknown) <= config.max_sigma_share
     return Reason.FOCAL_UNCERTAIN if is_known else Reason.POSITION_UNCERTAIN
 

@@ -173,11 +173,11 @@ def prior_of(request: GeoPoseRequest, anchor: GeoAnchor) -> PriorIn | None:
             "must have length 1.", where=f"{where}.geopose.quaternion", hint='Example: {"x": 0, "y": 0, "z": 0, "w": 1}'
         )
     pose = pose_on_earth(anchor, np.array([place.lat, place.lon, place.h]), quaternion)
-    spread: dict[str, float] = {}
-    if accuracy:
-        metres = _metres_per_unit(anchor)
-        spread = {"sigma_deg": accuracy.orientation, "sigma_units": accuracy.position / metres}
-    return PriorIn(world_from_camera=pose.world_from_camera.tolist(), **spread)
+    matrix = pose.world_from_camera.tolist()
+    if not accuracy:
+        return PriorIn(world_from_camera=matrix)
+    sigma_units = accuracy.position / _metres_per_unit(anchor)
+    return PriorIn(world_from_camera=matrix, sigma_deg=accuracy.orientation, sigma_units=sigma_units)
 
 
 def _metres_per_unit(anchor: GeoAnchor) -> float:
