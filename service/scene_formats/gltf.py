@@ -161,8 +161,9 @@ class _File:
         """Return the bytes of a buffer view. Raises CorruptScene."""
         view = self.entry("bufferViews", index)
         start, length = view.get("byteOffset", 0), view.get("byteLength")
-        of_this_file = isinstance(start, int) and isinstance(length, int) and view.get("buffer", 0) == 0
-        if of_this_file and 0 <= start <= start + length <= len(self.data):
+        if not isinstance(start, int) or not isinstance(length, int) or view.get("buffer", 0) != 0:
+            raise CorruptScene(f"bufferViews[{index}] has no range in this file.", where=self.name)
+        if 0 <= start <= start + length <= len(self.data):
             return self.data[start : start + length]
         raise CorruptScene(f"bufferViews[{index}] reaches beyond the file.", where=self.name)
 
