@@ -205,4 +205,5 @@ def test_the_python_of_a_document_runs(document, folder, cache, monkeypatch):
     for block in PYTHON:
         if block.document == document:
             exec(compile(block.text, str(block), "exec"), namespace)
-    assert namespace["estimate"].verdict.status == "localized"
+    # A document may explain results without localizing a photo.
+    assert "estimate" not in namespace or namespace["estimate"].verdict.status == "localized"

@@ -64,7 +64,7 @@ def stepping() -> Iterator:
 
 def write_scenes(folder: Path) -> None:
     """One that is well, and one for each thing that can be wrong; all but `plain` have a place on Earth."""
-    broken = {"torn": ply(9)[:-1], "odd": b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"}
+    broken = {"torn": ply(9)[:-1], "odd": b"ply\nformat ascii 1.0\nelement face 0\nend_header\n"}
     for name in ("good", "plain", "away", "slow", "fat", *broken):
         (folder / name).mkdir(parents=True)
         (folder / name / "scene.ply").write_bytes(broken.get(name) or ply(20_000 if name == "fat" else 50))

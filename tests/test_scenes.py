@@ -16,7 +16,7 @@ import torch
 from api_server import assert_problem, create_app, finished, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
-from service.errors import BadInput, InvalidRequest, UnsupportedFormat
+from service.errors import BadInput, CorruptScene, InvalidRequest, UnsupportedFormat
 from service.localize import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
@@ -105,7 +105,7 @@ def test_scenes_of_one_name_get_ids_of_their_own(tmp_path):
 
 def test_a_file_that_cannot_be_read_leaves_the_one_that_can(tmp_path):
     (tmp_path / "scene.ply").write_bytes(ply())
-    (tmp_path / "biker.ksplat").write_bytes(b"?")
+    (tmp_path / "biker.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     assert load_scene(tmp_path).info.format == "ply"
     (tmp_path / "second.ply").write_bytes(ply())
     with pytest.raises(CorruptScene, match=r'"file": "scene\.ply"'):

@@ -13,7 +13,7 @@ import shutil
 import zipfile
 from collections.abc import Container, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self, runtime_checkable
@@ -108,7 +108,8 @@ def named_scenes(paths: Iterable[Path]) -> list[StoredScene]:
 
 
 def _free_id(wanted: str, taken: Container[str]) -> str:
-    return next(name for name in (wanted, *(f"{wanted}-{n}" for n in count(2))) if name not in taken)
+    numbered = (f"{wanted}-{number}" for number in count(2))
+    return next(name for name in chain([wanted], numbered) if name not in taken)
 
 
 class FolderSceneStore:

@@ -37,7 +37,8 @@ class RefineStageConfig:
     max_first_motion_px: float = 4.0
     max_first_loss: float = 0.03
     """With approximate intrinsics, image motion and mean residual of the first refinement from which on matches are
-    better: pose and intrinsics are then so far off that renders would follow one another without an end."""
+    better: pose and intrinsics are then so far off that renders would follow one another without an end. With exact
+    ones the residual of a pose that has not settled, likewise."""
     settled_px: float = 0.3
     """Where refinement moved the image by less, another render would be the same."""
     levels: int = 2
@@ -144,8 +145,11 @@ def refine_stage(
         if is_first and result.loss > config.max_first_loss and _moved_far(rendered, refined, images, config):
             return RefineOutcome(replace(refined, photometric=None), restart=found)
         now, small_px = replace(found, pose=result.pose, correction=result.correction), None
-    following = refined and _next_render(rendered, now, images, renderer, config, None)
-    if refined is None or following is None:
+    # Exact intrinsics: where photo and render agree, repeated texture may let refinement alternate between two poses.
+    if refined is None or (not free_lens and (refined.loss or 0.0) <= config.max_first_loss):
+        return RefineOutcome(refined)
+    following = _next_render(rendered, now, images, renderer, config, None)
+    if following is None:
         return RefineOutcome(refined)
     # The pose began too far off, or distance and focal length still move along together: fresh matches bring it near.
     return RefineOutcome(replace(refined, rendered=following, photometric=None), restart=now)

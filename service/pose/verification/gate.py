@@ -70,12 +70,9 @@ class VerificationConfig:
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
     it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
-    max_drift_px: float = 2.0
-    """By which another step would move the image: a pose that has not settled may still be a tenth of the distance off.
-    Of 1223 right answers of the default estimator with exact intrinsics all have less than 0.22, of other estimators
-    up to 1.4; wrong ones have 1.3 to 4."""
     max_drift_px_free_lens: float = 0.3
-    """With approximate intrinsics, where distance and focal length move along together."""
+    """By which another step would move the image, with approximate intrinsics: refinement settles at 0.3 px, and what
+    it has not settled may still be a tenth of the distance off, for distance and focal length move along together."""
     min_lens_matches: int = 50
     """Matches with which exact intrinsics are tested: ten unknowns with ten times as many equations."""
     max_inlier_scale: float = 10.0
@@ -248,7 +245,7 @@ def _doubt_about_position(
     if abs(uncertainty.focal_step) > config.max_focal_step:
         return Reason.FOCAL_UNCERTAIN
     given_lens = uncertainty.given_lens
-    settled = signals["drift_px"] <= (config.max_drift_px if given_lens is None else config.max_drift_px_free_lens)
+    settled = given_lens is None or signals["drift_px"] <= config.max_drift_px_free_lens
     if sigma_share <= config.max_sigma_share and settled and _is_certain_if_cropped(uncertainty, signals, config):
         return None
     if given_lens is None:

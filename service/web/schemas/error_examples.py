@@ -75,7 +75,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/localize",
     ),
     (
-        e.UnsupportedFormat("a text PLY is not read.", where="scene.ply", hint="Save it as binary."),
+        e.UnsupportedFormat("no element 'vertex' of plain properties: not a 3DGS scene.", where="scene.ply"),
         "/localize",
     ),
     (e.JobNotFound("job '3f9c2a7be1d04c58' not found or expired.", where="job"), _JOB),
