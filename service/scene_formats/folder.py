@@ -12,8 +12,10 @@ from types import ModuleType
 import numpy as np
 
 from service.errors import SceneNotFound
-from service.scene_formats import colmap, inria
+from service.scene_formats.colmap import read_cameras as read_colmap_cameras
 from service.scene_formats.gaussians import checked
+from service.scene_formats.inria import ARGUMENTS, CAMERAS, background_of
+from service.scene_formats.inria import read_cameras as read_inria_cameras
 from service.scene_formats.layouts import COLMAP_FOLDER, scene_file
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
@@ -108,17 +110,17 @@ def _training(folder: Path, manifest: Manifest, without_photos: Collection[str])
     def keep(name: str) -> bool:
         return not any(same_photo(name, photo) for photo in without_photos)
 
-    arguments = folder / inria.ARGUMENTS
-    background = inria.background(arguments) if arguments.is_file() else None
+    arguments = folder / ARGUMENTS
+    background = background_of(arguments) if arguments.is_file() else None
     transforms = transforms_path(folder)
     if transforms is not None:
         file = TransformsFile.open(transforms)
         photos = [photo for photo in file.training_photos() if keep(photo)]
         return _Training(tuple(file.camera(photo, manifest) for photo in photos), file.background() or background)
     if any((folder / COLMAP_FOLDER / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return _Training(colmap.read_cameras(folder / COLMAP_FOLDER, keep), background)
-    if (folder / inria.CAMERAS).is_file():
-        return _Training(inria.read_cameras(folder / inria.CAMERAS, keep), background)
+        return _Training(read_colmap_cameras(folder / COLMAP_FOLDER, keep), background)
+    if (folder / CAMERAS).is_file():
+        return _Training(read_inria_cameras(folder / CAMERAS, keep), background)
     return _Training(background=background, warnings=_models_elsewhere(folder))
 
 

@@ -41,7 +41,7 @@ def read_cameras(path: Path, keep: Callable[[str], bool]) -> tuple[NamedCamera, 
     return tuple(sorted(found, key=lambda camera: camera.name))
 
 
-def background(path: Path) -> tuple[float, float, float] | None:
+def background_of(path: Path) -> tuple[float, float, float] | None:
     """Return white if the scene was trained on it, black if not; None if the file doesn't say."""
     if path.stat().st_size > _MAX_ARGUMENT_BYTES:
         return None
