@@ -27,6 +27,7 @@ from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import Answer, ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
 from service.matchers import MATCHERS
+from service.photos.intrinsics import taken_through
 from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
@@ -226,7 +227,7 @@ def localize(
     # Before verification: its renders are not the estimator's.
     renders, last = tally.count, trace.records[-1]
     # The intrinsics belong to the pose, in the result and in its verification.
-    query = query.corrected(last.correction)
+    query = taken_through(query, last.lens) if last.lens else query.corrected(last.correction)
     verdict = (
         answer.verdict if answer else render_and_verify(QueryImages(query, loaded.matcher), last.pose, tools.rasterizer)
     )
@@ -308,7 +309,11 @@ def estimate_of(
         budget_exhausted=exhausted,
         renders=renders,
         timings=tuple(timings),
-        warnings=query.warnings + info.warnings + loaded.warnings + _assumptions(query, loaded) + _cautions(verdict),
+        warnings=query.warnings
+        + info.warnings
+        + loaded.warnings
+        + _assumptions(query, loaded)
+        + _cautions(query, verdict),
         records=tuple(records),
     )
 
@@ -353,9 +358,14 @@ def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
     )
 
 
-def _cautions(verdict: Verdict) -> tuple[str, ...]:
+def _cautions(query: Query, verdict: Verdict) -> tuple[str, ...]:
     """Return warnings of what the photo shows of its camera."""
     cautions = []
+    if query.intrinsics_source == "fisheye":
+        cautions.append(
+            "the photo's lens is a fisheye, not what was sent or assumed: its intrinsics were estimated with the pose. "
+            "Send them with `model` and `distortion` for an exact pose."
+        )
     if verdict.intrinsics_untested:
         cautions.append(
             "the photo can't confirm its intrinsics: a focal length that is 1 % off moves the camera by about 1 % of "

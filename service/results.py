@@ -79,6 +79,9 @@ class IterationRecord:
     the rest."""
     mirrored: bool = False
     """The photo's mirror image fits the scene better."""
+    lens: Intrinsics | None = None
+    """The whole upright photo's, if it is a fisheye instead of what was assumed; the correction is then without its
+    distortion."""
     index: int = 0
     """Number of the record in the trace; stamped by the driver, like the times."""
     elapsed_s: float = 0.0
@@ -104,6 +107,7 @@ class Reason(StrEnum):
     LOW_COVERAGE = "low_coverage"
     FOCAL_UNCERTAIN = "focal_uncertain"
     INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
+    LENS_UNMODELLED = "lens_unmodelled"
     POSITION_UNCERTAIN = "position_uncertain"
     OUTSIDE_PRIOR = "outside_prior"
     AMBIGUOUS = "ambiguous"
@@ -129,6 +133,10 @@ HINTS: dict[Reason, str] = {
     Reason.INTRINSICS_CONTRADICTED: (
         "The photo fits the scene far better with other intrinsics, which `fitting_intrinsics` lists: check focal "
         'length, distortion and cropping, or send the intrinsics with trust "approximate".'
+    ),
+    Reason.LENS_UNMODELLED: (
+        "The photo's lens is neither a pinhole with one radial coefficient nor a fisheye that could be estimated: "
+        "calibrate it and send the intrinsics with `model` and `distortion`."
     ),
     Reason.POSITION_UNCERTAIN: (
         "The photo fits the scene, but hardly determines the camera position: show more of the scene, or nearer things."

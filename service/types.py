@@ -341,12 +341,14 @@ class LensPrior:
 
 UNKNOWN_PRINCIPAL_POINT = LensPrior(1.0).principal_point_scale
 """Scale of a principal point of which nothing is known but that it is usually near the centre."""
-IntrinsicsSource = Literal["given", "exif", "guessed", "memory"]
-"""Where a photo's assumed intrinsics are from: the request, its EXIF, a default, or earlier photos of the camera."""
+IntrinsicsSource = Literal["given", "exif", "guessed", "memory", "fisheye"]
+"""Where a photo's assumed intrinsics are from: the request, its EXIF, a default, earlier photos of the camera, or a
+fisheye that the photo's matches showed instead of these."""
 LENS_PRIORS: dict[IntrinsicsSource, LensPrior] = {
     "given": LensPrior(0.15),
     "exif": LensPrior(0.06),
     "guessed": LensPrior(0.5, k1_sigma=0.1),
+    "fisheye": LensPrior(0.05, k1_sigma=0.03),
 }
 """By the source of approximate intrinsics; of EXIF where nothing more is known of the tag."""
 

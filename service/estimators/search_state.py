@@ -41,7 +41,7 @@ from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import VERIFICATION, VerificationConfig, verify
 from service.pose.verification.mirror_images import MIRROR, MirrorConfig, dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
-from service.types import Query
+from service.types import IntrinsicsCorrection, Query
 
 Result = TypeVar("Result")
 CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
@@ -98,6 +98,13 @@ class SearchConfig:
     """Rounds with effort `normal`, and with `exhaustive` if there is no budget."""
     min_sample_inliers: int = 12
     """Inliers of a sampled pose from which on it is rendered in full size."""
+    max_plain_distortion: float = 0.12
+    """Estimated distortion k1 r^2, at the image's corner, beyond which the lens is checked though the answer was
+    accepted: a phone's is 0.05, that of an equidistant fisheye of 90 degrees 0.3."""
+    min_lens_matches: int = 80
+    """Matches with a render at the answer with which lens models are fitted."""
+    fisheye_doubts: tuple[Reason, ...] = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.OUTSIDE_PRIOR)
+    """Doubts that don't speak against a fisheye's answer."""
     ambiguity_photo_px: int = 256
     """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
     max_ambiguous_loss_ratio: float = 3.0
@@ -170,6 +177,8 @@ class SearchState:
     """Whether any stage so far recognised something (`StageOutcome`)."""
     unmatched: AbsolutePose | None = None
     """That of the latest stage."""
+    assumed: Query | None = None
+    """The photo with the lens that was assumed, where that proved to be a fisheye; None: it is `images.query`'s."""
 
     @classmethod
     def of(cls, query: Query, tools: Tools[ViewIndex], config: SearchConfig) -> SearchState:
@@ -199,7 +208,16 @@ class SearchState:
         """Return the record with the best answer so far in place of its own pose."""
         if self.best is None:
             return record
-        return replace(record, pose=self.best.refined.pose, correction=self.best.refined.correction)
+        pose, correction = self.best.refined.pose, self.best.refined.correction
+        if self.assumed is None:
+            return replace(record, pose=pose, correction=correction)
+        lens, assumed = self.images.query.corrected(correction).photo_intrinsics, self.assumed.photo_intrinsics
+        correction = IntrinsicsCorrection(
+            lens.fx / assumed.fx,
+            (lens.cx - assumed.cx) / assumed.long_side,
+            (lens.cy - assumed.cy) / assumed.long_side,
+        )
+        return replace(record, pose=pose, correction=correction, lens=lens)
 
     def answer(self) -> Answer | None:
         """Return the best answer; None: no stage led to one."""
@@ -213,7 +231,7 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
 
     Where the answer was expected, or many matches with a view led to it, the pixels alone may decide.
     """
-    outcome = yield from _changed(stage.records, state.with_answer)
+    outcome = yield from changed(stage.records, state.with_answer)
     state.recognised |= outcome.recognised
     state.unmatched = outcome.unmatched
     found = outcome.refined
@@ -258,7 +276,7 @@ def _refined_in_other_light(
     stage = refine_stage(
         start, state.images, state.renderer, replace(config.refinement, photometric=config.other_light)
     )
-    again = (yield from _changed(stage, state.with_answer)).refined
+    again = (yield from changed(stage, state.with_answer)).refined
     if again is None:
         return None
     verdict = state.verify(again, refinement_config=config.other_light)
@@ -266,7 +284,7 @@ def _refined_in_other_light(
     return replace(again, loss=found.loss), verdict
 
 
-def _changed(
+def changed(
     records: Generator[IterationRecord, None, Result], change: Callable[[IterationRecord], IterationRecord]
 ) -> Generator[IterationRecord, None, Result]:
     """Yield each record as a function changes it; return what the generator returns."""
@@ -294,7 +312,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     # Mirroring turns a rotation into its opposite.
     variant = replace(best.variant, roll_steps_45deg=-best.variant.roll_steps_45deg % 8)
     search = _search_mirrored(mirrored, variant, config.mirror.max_loss_ratio * best.loss)
-    found = yield from _changed(
+    found = yield from changed(
         search, lambda record: state.with_answer(replace(record, stage="check_mirror", matches=None))
     )
     if found is None:
@@ -384,7 +402,7 @@ def _refine_ambiguous(
     if next(refine_stage(other, state.images, state.renderer, config.refinement, max_loss), None) is None:
         return None
     stage = rematch_and_refine(other, state.images, state.renderer, config.matching, config.refinement)
-    return (yield from _changed(stage, state.with_answer)).refined
+    return (yield from changed(stage, state.with_answer)).refined
 
 
 def _ranked(state: SearchState, answers: list[VerifiedPose]) -> IterationRecord:

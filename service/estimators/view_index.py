@@ -24,6 +24,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from service.errors import InvalidOptions
+from service.estimators.lens_check import check_lens
 from service.estimators.search_state import (
     SEARCH,
     SearchConfig,
@@ -31,6 +32,7 @@ from service.estimators.search_state import (
     Stage,
     StageOutcome,
     StageResult,
+    changed,
     check_ambiguity,
     check_mirror,
     run_stage,
@@ -92,10 +94,16 @@ def run(
             yield from run_stage(state, replace(stage, records=_rematch(state.unmatched, state)))
         if state.finished:
             break
+    state = yield from check_lens(state)
+    yield from changed(_doubts(state), state.with_answer)
+    return state.answer()
+
+
+def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
+    """Look for reasons to doubt the answer of a search."""
     mirrored = yield from check_mirror(state)
     if state.finished and not mirrored:
         yield from check_ambiguity(state)
-    return state.answer()
 
 
 def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.distortion import fisheye_radius, radial_radius
 from service.errors import InvalidIntrinsics
-from service.types import Intrinsics, IntrinsicsCorrection, Query
+from service.types import LENS_PRIORS, Intrinsics, IntrinsicsCorrection, Query
 
 DISTORTION_COUNTS = {
     "SIMPLE_PINHOLE": 0, "PINHOLE": 0, "SIMPLE_RADIAL": 1, "RADIAL": 2, "OPENCV": 4, "FULL_OPENCV": 8,
@@ -201,7 +201,7 @@ def undistorted(
     photo; None if the camera has no distortion.
     """
     pinhole = replace(intrinsics, model="PINHOLE", distortion=())
-    if "FISHEYE" not in intrinsics.model and not any(intrinsics.distortion):
+    if not has_distortion(intrinsics):
         return image, pinhole, None
     x, y, inside = _undistortion(intrinsics)
     straight = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT)
@@ -239,6 +239,42 @@ def undistorted_query(query: Query, correction: IntrinsicsCorrection) -> Query:
     if inside is not None and query.valid_mask is not None:
         inside = inside & (undistorted(query.valid_mask.astype(np.uint8), camera)[0] > 0)
     return replace(corrected, rgb=rgb, valid_mask=inside)
+
+
+def has_distortion(intrinsics: Intrinsics) -> bool:
+    """Return whether the camera is no pinhole."""
+    return "FISHEYE" in intrinsics.model or any(intrinsics.distortion)
+
+
+def taken_through(query: Query, lens: Intrinsics) -> Query:
+    """Return the query of the same photo, whose pinhole was assumed, with this lens of the whole upright photo.
+
+    Its pixels are undistorted; what is left to estimate has the prior of a fisheye.
+    """
+    photo, shown = query.photo_intrinsics, query.intrinsics
+    # The map from the photo's pixels to the query's.
+    sx, sy = shown.fx / photo.fx, shown.fy / photo.fy
+    camera = replace(
+        lens,
+        width=shown.width,
+        height=shown.height,
+        fx=lens.fx * sx,
+        fy=lens.fy * sy,
+        cx=shown.cx + (lens.cx - photo.cx) * sx,
+        cy=shown.cy + (lens.cy - photo.cy) * sy,
+    )
+    rgb, pinhole, inside = undistorted(query.rgb, camera)
+    if inside is not None and query.valid_mask is not None:
+        inside = inside & (undistorted(query.valid_mask.astype(np.uint8), camera)[0] > 0)
+    return replace(
+        query,
+        rgb=rgb,
+        intrinsics=pinhole,
+        intrinsics_source="fisheye",
+        photo_intrinsics=lens,
+        valid_mask=None if inside is None or inside.all() else inside,
+        lens_prior=LENS_PRIORS["fisheye"],
+    )
 
 
 @lru_cache(maxsize=4)
