@@ -98,7 +98,7 @@ class SearchConfig:
     """Rounds with effort `normal`, and with `exhaustive` if there is no budget."""
     min_sample_inliers: int = 12
     """Inliers of a sampled pose from which on it is rendered in full size."""
-    max_plain_distortion: float = 0.12
+    max_plain_distortion: float = 0.09
     """Estimated distortion k1 r^2, at the image's corner, beyond which the lens is checked though the answer was
     accepted: a phone's is 0.05, that of an equidistant fisheye of 90 degrees 0.3."""
     min_lens_matches: int = 80

@@ -57,10 +57,10 @@ class FisheyeConfig:
     significant_drop: float = 16.0
     """From the first model's cost to the second's, in units of a correspondence's mean cost: a difference of
     chi-squares from which on the lens is a fisheye even if that leads to no answer."""
-    misfit_drop: float = 25.0
+    misfit_drop: float = 40.0
     misfit_px: float = 2.0
-    """Drop of the better model's cost by a smooth function of the radius, and that function's largest value, in pixels
-    at an inlier threshold of 3, from which on the lens is neither: matches scatter by 1.5 px."""
+    """Significance of a smooth function of the radius in what the better model leaves (a chi-square of three), and that
+    function's largest value, in pixels at an inlier threshold of 3, from which on the lens is neither."""
 
 
 FISHEYE = FisheyeConfig()
@@ -204,7 +204,8 @@ def _fit(
     problem = _Problem(model, photo_px, points_in_world, intrinsics, prior, config.noise * max_error_px)
     ends = [_minimized(problem, start, config) for start in starts]
     end = min(ends, key=lambda one: one.cost)
-    drop, misfit_px = _misfit(end, 3.0 / max_error_px)
+    wide = problem.linearized(end.pose, end.correction, config.cauchy_scales[0] / config.noise)
+    drop, misfit_px = _misfit(wide, 3.0 / max_error_px)
     error = np.linalg.norm(end.residual, axis=1)
     return LensModelFit(model, end.pose, end.correction, end.cost, end.ahead & (error < max_error_px), drop, misfit_px)
 
@@ -251,7 +252,7 @@ class _Problem:
         hessian[range(6, 10), range(6, 10)] += precision
         rhs[6:] -= precision * correction_vector(correction)
         cost = scale**2 * float(np.log1p(squared / scale**2).sum()) + prior_cost(self.prior, correction)
-        return _Linearized(pose, correction, cost, hessian, rhs, residual, weight, ahead, unit, radius)
+        return _Linearized(pose, correction, cost, hessian, rhs, jacobian, residual, weight, ahead, unit, radius)
 
 
 def _ray_by_twist(x: Radii, y: Radii, depth: Radii) -> Float64[np.ndarray, "m 2 6"]:
@@ -270,6 +271,7 @@ class _Linearized:
     cost: float
     hessian: Float64[np.ndarray, "10 10"]
     rhs: Float64[np.ndarray, "10"]
+    jacobian: Float64[np.ndarray, "m 2 10"]
     residual: Float64[np.ndarray, "m 2"]
     weight: Radii
     ahead: Bool[np.ndarray, "m"]
@@ -303,17 +305,25 @@ def _minimized(problem: _Problem, start: AbsolutePose, config: FisheyeConfig) ->
     return now
 
 
-def _misfit(end: _Linearized, px: float) -> tuple[float, float]:
-    """Return by how much r^3, r^5 and r^7 lower the cost of a fit, and how large their sum is on half of the points.
+def _misfit(wide: _Linearized, px: float) -> tuple[float, float]:
+    """Return how significantly a step of the fit with r^5, r^7 and r^9 beside its unknowns is better than one without,
+    and by how much that moves most of the points.
 
-    `px` turns pixels into those of the limit. The cost is in units of a correspondence's mean one.
+    By the share of the weighted variance that it explains. `wide` has weights of the wider scale, so that what lies
+    beyond the fit's reach counts; `px` turns pixels into those of `misfit_px`.
     """
-    count = max(int(end.ahead.sum()), 1)
-    radial = (end.residual * end.unit).sum(1)
-    rho = end.radius / max(float(np.quantile(end.radius, 0.98)), 1e-9)
-    basis = np.minimum(rho, 1.0)[:, None] ** [3, 5, 7]
-    weighted = basis * end.weight[:, None]
-    normal = weighted.T @ basis + 1e-9 * np.eye(3)
-    solution = np.linalg.solve(normal, weighted.T @ radial)
-    drop = float(solution @ normal @ solution) / max(1.0, end.cost / count)
-    return drop, float(np.quantile(np.abs(basis @ solution), 0.9)) * px
+    count = len(wide.radius)
+    rho = np.minimum(wide.radius / max(float(np.quantile(wide.radius, 0.98)), 1e-9), 1.0)
+    smooth = wide.unit[:, :, None] * (rho[:, None] ** [5, 7, 9])[:, None, :]
+    both = np.concatenate([wide.jacobian, smooth], 2).reshape(2 * count, -1)
+    weight, residual = np.repeat(wide.weight, 2), wide.residual.reshape(-1)
+    root = np.sqrt(weight)
+    changes = []
+    for columns in (both[:, : wide.jacobian.shape[2]], both):
+        solution = np.linalg.lstsq(columns * root[:, None], residual * root, rcond=1e-9)[0]
+        changes.append(columns @ solution)
+    without, with_smooth = (float(weight @ (residual - change) ** 2) for change in changes)
+    effective = 2 * float(wide.weight.sum() / max(wide.weight.max(), 1e-12))
+    moved = np.linalg.norm((changes[1] - changes[0]).reshape(count, 2), axis=1)[wide.ahead]
+    drop = effective * (without - with_smooth) / max(with_smooth, 1e-12)
+    return drop, float(np.quantile(moved, 0.9)) * px
