@@ -201,7 +201,8 @@ class Tracker:
         self._rendered, self._unverified = None, 0
         shared = self._intrinsics.correction
         records = tuple(replace(record, correction=shared.then(record.correction)) for record in found.records)
-        if query.lens_prior and _is_placed(found.verdict):
+        # A fisheye's correction isn't one of the pinhole that the next photos are taken for.
+        if query.lens_prior and _is_placed(found.verdict) and records[-1].lens is None:
             prior = replace(query.lens_prior, log_focal_scale=found.verdict.focal_sigma)
             self._intrinsics.set(found.pose, records[-1].correction, prior)
         return replace(found, records=records)

@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from small_room import write_room
 from test_estimators import LENS, photo_at, unseen_pose
+from test_fisheye import CAMERA, NEITHER, taken_through
 
 from service.estimators.view_index import Options
 from service.geometry import look_at
 from service.localize import LoadedScene, Request, localize, render_and_verify
+from service.photos.images import query_of
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
 from service.pose.refinement.photometric import refine_photometric
@@ -57,6 +59,9 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
     Reason.LOW_COVERAGE: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
     Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room, 0.1)), BEFORE_A_WALL),
     Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
+    Reason.LENS_UNMODELLED: lambda room, _: (
+        localize(query_of(taken_through(room, NEITHER), intrinsics=CAMERA), room, FAST).verdict
+    ),
     Reason.POSITION_UNCERTAIN: lambda room, _: judged(room, middle_of_a_wall(room), BEFORE_A_WALL),
     Reason.OUTSIDE_PRIOR: lambda room, _: judged(room, replace(photo_at(room, TRUTH), region=ELSEWHERE)),
     Reason.AMBIGUOUS: lambda _, rooms: localize(photo_at(rooms["repeated"], TRUTH), rooms["repeated"], FAST).verdict,

@@ -46,6 +46,11 @@ def _is_suspicious(state: SearchState, best: VerifiedPose) -> bool:
         return False
     if best.verdict.status is not Status.LOCALIZED:
         return True
+    # Exact intrinsics of an accepted answer were tested by the gate.
+    if query.lens_prior is None:
+        return False
+    if best.verdict.signals.get("inlier_share", 1.0) < config.min_plain_inlier_share:
+        return True
     camera = query.intrinsics.corrected(best.refined.correction)
     corner = np.hypot(
         max(camera.cx, camera.width - camera.cx) / camera.fx, max(camera.cy, camera.height - camera.cy) / camera.fy

@@ -101,6 +101,9 @@ class SearchConfig:
     max_plain_distortion: float = 0.09
     """Estimated distortion k1 r^2, at the image's corner, beyond which the lens is checked though the answer was
     accepted: a phone's is 0.05, that of an equidistant fisheye of 90 degrees 0.3."""
+    min_plain_inlier_share: float = 0.65
+    """Share of the matches that agree with an accepted answer with an estimated lens, below which that is checked, too:
+    photos of the test scenes have 0.71 and more, lenses beyond SIMPLE_RADIAL 0.62."""
     min_lens_matches: int = 80
     """Matches with a render at the answer with which lens models are fitted."""
     fisheye_doubts: tuple[Reason, ...] = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.OUTSIDE_PRIOR)

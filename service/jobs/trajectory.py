@@ -48,6 +48,7 @@ class Trajectory:
             stage="track" if frame.tracked else "localize",
             pose=shown.pose,
             correction=shown.correction,
+            lens=shown.lens,
             index=frame.index,
             elapsed_s=self._clock.wall_s,
             cpu_s=self._clock.cpu_s,

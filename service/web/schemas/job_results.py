@@ -145,7 +145,8 @@ class Result(Model):
     """Camera model used for the whole upright photo."""
     intrinsics_source: IntrinsicsSource
     """Where the intrinsics come from. Unless the request gave them as exact, focal length, radial distortion and
-    principal point were then estimated together with the pose. `memory`: earlier photos of the same camera."""
+    principal point were then estimated together with the pose. `memory`: earlier photos of the same camera. `fisheye`:
+    the photo's matches, by which its lens is a fisheye instead of what was sent or assumed; `warnings` says so."""
     fitting_intrinsics: IntrinsicsOut | None = None
     """Of exact intrinsics that the photo contradicts (`reason` is `intrinsics_contradicted`): those that fit it."""
     focal_sigma_px: float | None

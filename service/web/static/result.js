@@ -93,7 +93,8 @@ function numbers(job, scene) {
 }
 
 function lens({ intrinsics, intrinsics_source: source }) {
-  const from = { exif: "from EXIF", memory: "from earlier photos of the camera" }[source] ?? source;
+  const from = { exif: "from EXIF", memory: "from earlier photos of the camera",
+    fisheye: "a fisheye, by the photo itself" }[source] ?? source;
   return intrinsics.trust === "approximate" ? `${from}, then estimated with the pose` : from;
 }
 
