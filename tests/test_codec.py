@@ -45,6 +45,7 @@ STORED_RECORD = {
             "candidates": None,
             "alternatives": {"world_from_camera": [IDENTITY], "scores": [0.25]},
             "mirrored": True,
+            "lens": None,
             "index": 3,
             "elapsed_s": 0.5,
             "cpu_s": 0.25,

@@ -137,10 +137,15 @@ def test_an_exact_focal_length_that_is_not_true_is_contradicted(studio: LoadedSc
 
 @pytest.mark.parametrize("name", NAMES)
 def test_no_lens_that_a_pinhole_is_said_to_be_gives_a_confident_wrong_pose(studio: LoadedScene, name: str) -> None:
-    """A fisheye, and a crop off centre."""
-    for rgb, said in (through_lens(name, fisheye=True), cropped(name, 0.8)):
-        assert localize(read_query(jpeg(rgb), intrinsics=said), studio).verdict.status is not Status.LOCALIZED
-        assert_right_if_localized(localize(read_query(jpeg(rgb)), studio), name)
+    """A fisheye, which is recognised, and a crop off centre."""
+    rgb, said = through_lens(name, fisheye=True)
+    found = localize(read_query(jpeg(rgb), intrinsics=said), studio)
+    assert_right(found, name)
+    assert found.intrinsics_source == "fisheye"
+    assert_right_if_localized(localize(read_query(jpeg(rgb)), studio), name)
+    rgb, said = cropped(name, 0.8)
+    assert localize(read_query(jpeg(rgb), intrinsics=said), studio).verdict.status is not Status.LOCALIZED
+    assert_right_if_localized(localize(read_query(jpeg(rgb)), studio), name)
 
 
 def assert_right_if_localized(found: PoseEstimate, name: str) -> None:
