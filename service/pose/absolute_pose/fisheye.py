@@ -52,8 +52,8 @@ class FisheyeConfig:
     radial: LensPrior = field(default_factory=lambda: LensPrior(0.5, 0.1, 0.01))
     fisheye: LensPrior = field(default_factory=lambda: LensPrior(0.5, 0.05, 0.01))
     """Of the two models: lenses that aren't fisheyes have |k1| of 0.1 and less; these are between stereographic and
-    equisolid. (27 photos of equidistant lenses of 65 degrees and more: k1 from -0.32 to -0.23 and k from -0.03 to 0.03,
-    each with about the same residuals; 40 with k1 of 0.1 and less: k of 0.2 and more, and larger residuals.)"""
+    equisolid. (14 fits to photos of equidistant lenses: k1 from -0.32 to -0.23, k from -0.03 to 0.03, about the same
+    residuals or smaller ones; 37 fits to photos with k1 of 0.1 and less: k of 0.2 and more, and larger residuals.)"""
     significant_drop: float = 16.0
     """From the first model's cost to the second's, in units of a correspondence's mean cost: a difference of
     chi-squares from which on the lens is a fisheye even if that leads to no answer."""
