@@ -14,7 +14,7 @@ from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service.errors import InvalidOptions, InvalidPrior, UnknownName
 from service.estimators import ESTIMATORS
-from service.estimators.search_state import SEARCH
+from service.estimators.search_config import SEARCH
 from service.geometry import moved, pose_distance
 from service.interfaces import RenderTally, Tools
 from service.localize import LoadedScene, Request, localize

@@ -13,7 +13,7 @@ import pytest
 from api_server import ROOT
 from PIL import Image
 
-from service.estimators.search_state import SEARCH
+from service.estimators.search_config import SEARCH
 from service.geometry import pose_distance, se3_log
 from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query

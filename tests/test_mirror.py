@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from small_room import write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
-from service.estimators.search_state import SEARCH
+from service.estimators.search_config import SEARCH
 from service.geometry import project, transformed
 from service.localize import LoadedScene, Request, localize
 from service.pose.features.mirrored_query import mirrored_query

@@ -10,7 +10,7 @@ from small_room import HALF_TURN, write_room
 from test_estimators import assert_near, photo_at, unseen_pose
 
 from service.errors import InvalidPrior
-from service.estimators.search_state import SEARCH
+from service.estimators.search_config import SEARCH
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize

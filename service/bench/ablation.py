@@ -19,7 +19,7 @@ from service.bench.localize import BenchScene, Trial, load_bench_scene, localize
 from service.bench.pose_metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
-from service.estimators.search_state import SEARCH, SearchConfig
+from service.estimators.search_config import SEARCH, SearchConfig
 from service.localize import DEFAULT_ESTIMATOR, Request
 from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig
 from service.pose.retrieval.scores import ScoreConfig

@@ -28,7 +28,7 @@ from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.gate_fit import Sample, fit_model, summary
 from service.bench.localize import BenchScene, load_bench_scene
 from service.bench.pose_metrics import COARSE, errors, nees
-from service.estimators.search_state import SEARCH
+from service.estimators.search_config import SEARCH
 from service.estimators.view_index import Options
 from service.geometry import moved
 from service.localize import Request, localize, render_and_verify

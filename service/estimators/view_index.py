@@ -25,9 +25,8 @@ import numpy as np
 
 from service.errors import InvalidOptions
 from service.estimators.lens_check import check_lens
+from service.estimators.search_config import SEARCH, SearchConfig
 from service.estimators.search_state import (
-    SEARCH,
-    SearchConfig,
     SearchState,
     Stage,
     StageOutcome,
