@@ -11,6 +11,7 @@ import typer
 from rich.logging import RichHandler
 
 from service.cli.bench import bench_app
+from service.cli.demo import demo
 from service.cli.doctor import doctor
 from service.cli.keys import keys_app
 from service.cli.localize import localize
@@ -22,7 +23,7 @@ from service.cli.terminal import err
 from service.errors import SplatfixError
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="Photo in, pose out.")
-for command in (serve, localize, render, doctor):
+for command in (serve, demo, localize, render, doctor):
     app.command()(command)
 app.command(hidden=True)(openapi)
 app.add_typer(bench_app, name="bench")
