@@ -109,7 +109,21 @@ def test_colours_count_unless_matches_and_gradients_support_another_light(tmp_pa
     assert SHIPPED_MODEL.below_floor(alone, light_may_differ=True) == colours
     # A fit keeps the rule, and so does its file.
     write_model(fit_model(scene_samples("a", 4, np.random.default_rng(4)), SHIPPED_MODEL, {}), tmp_path / "m.json")
-    assert load_model(tmp_path / "m.json").other_light == SHIPPED_MODEL.other_light
+    read = load_model(tmp_path / "m.json")
+    assert (read.other_light, read.less_detail) == (SHIPPED_MODEL.other_light, SHIPPED_MODEL.less_detail)
+
+
+def test_gradients_count_unless_matches_and_colours_support_the_pose() -> None:
+    """An enlarged crop is blurred: its gradients hardly correlate, all else agrees."""
+    right = sample("a", "clean", True, 0.97).signals
+    blurred = {**right, "gradients": 0.5, "gradients_half": 0.75, "inliers": 400.0}
+    assert SHIPPED_MODEL.below_floor(blurred) == []
+    gradients = {"gradients", "gradients_half"}
+    weaker = {"inliers": 150.0, "inlier_share": 0.6, "inlier_spread": 0.5, "colours_half": 0.9}
+    for name, value in {**weaker, "local_colour_correlation": 0.95}.items():
+        assert gradients <= set(SHIPPED_MODEL.below_floor({**blurred, name: value}))
+    alone = {name: value for name, value in blurred.items() if not name.startswith("inlier")}
+    assert set(SHIPPED_MODEL.below_floor(alone)) == gradients
 
 
 def test_a_photo_that_always_fails_moves_only_its_own_fold() -> None:

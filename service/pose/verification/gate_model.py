@@ -3,8 +3,8 @@
 A logistic model without negative weights: each signal is mapped to 0..1 and cut off at both ends. Besides, each signal
 has a floor: below it a pose is in doubt, however good the other signals are, because a sum would compensate for one
 that is bad. `splatfix bench gate` fits weights and floors, and writes the file; floors that were set by hand it keeps.
-Where the scene may be lit otherwise than in its training photos, floors of colours don't hold if matches and gradients
-support the pose (`OtherLight`).
+Floors of one kind of signals don't hold where all other kinds support the pose (`FloorException`): those of colours in
+other light than that of the training photos, those of gradients where photo and scene differ in detail.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 MODEL_FILE = Path(__file__).with_name("model.json")
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,8 +64,8 @@ class HandSetFloor:
 
 
 @dataclass(frozen=True, slots=True)
-class OtherLight:
-    """When colours that disagree are taken for other light: evidence that doesn't depend on light is above floors."""
+class FloorException:
+    """When floors of some signals don't hold: the others are above floors of this exception."""
 
     ignored: tuple[str, ...]
     """Signals whose own floors then don't hold."""
@@ -87,8 +87,11 @@ class GateModel:
     """In the signals' units; for a signal whose scale descends, a ceiling. Includes those that were set by hand."""
     set_by_hand: Mapping[str, HandSetFloor] = field(default_factory=dict)
     """Floors that a fit keeps, by the signals' names."""
-    other_light: OtherLight | None = None
-    """Kept by a fit, too; None: colours always count."""
+    other_light: FloorException | None = None
+    """For colours, where the light may be another than the scene's. Exceptions are kept by a fit, too; None: there is
+    none."""
+    less_detail: FloorException | None = None
+    """For gradients: a photo that was enlarged after it was cropped, or is sharper than the scene's model."""
     fitted_on: Mapping[str, Any] = field(default_factory=dict)
     """Scenes with their hashes and photos, and counts of right and wrong poses."""
 
@@ -102,13 +105,13 @@ class GateModel:
     def below_floor(self, signals: Mapping[str, float], light_may_differ: bool = False) -> list[str]:
         """Return the names of the signals that are below their floors.
 
-        With `light_may_differ` those of colours don't count where the others support the pose (`OtherLight`).
+        The exception `other_light` is made with `light_may_differ` only.
         """
         below = self._below(signals, self.floors)
-        rule = self.other_light if light_may_differ else None
-        if rule is None or not below or not rule.floors.keys() <= signals.keys() or self._below(signals, rule.floors):
-            return below
-        return [name for name in below if name not in rule.ignored]
+        for exception in (self.other_light if light_may_differ else None, self.less_detail):
+            if exception and exception.floors.keys() <= signals.keys() and not self._below(signals, exception.floors):
+                below = [name for name in below if name not in exception.ignored]
+        return below
 
     def _below(self, signals: Mapping[str, float], floors: Mapping[str, float]) -> list[str]:
         scales = self.scales
@@ -120,20 +123,36 @@ def model_from_json(content: Mapping[str, Any]) -> GateModel:
     if content["version"] != FORMAT_VERSION:
         raise ValueError(f"the gate's model has version {content['version']}, this code reads {FORMAT_VERSION}")
     set_by_hand = {name: HandSetFloor(**entry) for name, entry in content["set_by_hand"].items()}
-    other = content["other_light"]
     return GateModel(
         scales=MappingProxyType({name: Scale(**scale) for name, scale in content["scales"].items()}),
         with_matches=_logistic(content["with_matches"]),
         photometric=_logistic(content["photometric"]),
         floors=MappingProxyType(content["floors"] | {name: entry.floor for name, entry in set_by_hand.items()}),
         set_by_hand=MappingProxyType(set_by_hand),
-        other_light=other and OtherLight(tuple(other["ignored"]), MappingProxyType(other["floors"]), other["reason"]),
+        other_light=_exception(content["other_light"]),
+        less_detail=_exception(content["less_detail"]),
         fitted_on=MappingProxyType(content["fitted_on"]),
     )
 
 
 def _logistic(content: Mapping[str, Any]) -> Logistic:
     return Logistic(content["bias"], MappingProxyType(content["weights"]))
+
+
+def _exception(content: Mapping[str, Any] | None) -> FloorException | None:
+    if content is None:
+        return None
+    return FloorException(tuple(content["ignored"]), MappingProxyType(content["floors"]), content["reason"])
+
+
+def _exception_to_json(exception: FloorException | None) -> dict[str, Any] | None:
+    if exception is None:
+        return None
+    return {
+        "ignored": list(exception.ignored),
+        "floors": dict(exception.floors),
+        "reason": exception.reason,
+    }
 
 
 def model_to_json(model: GateModel) -> dict[str, Any]:
@@ -150,12 +169,8 @@ def model_to_json(model: GateModel) -> dict[str, Any]:
         # Each floor stands in one place only, so that the two can't contradict one another.
         "floors": {name: floor for name, floor in model.floors.items() if name not in model.set_by_hand},
         "set_by_hand": {name: asdict(entry) for name, entry in model.set_by_hand.items()},
-        "other_light": model.other_light
-        and {
-            "ignored": list(model.other_light.ignored),
-            "floors": dict(model.other_light.floors),
-            "reason": model.other_light.reason,
-        },
+        "other_light": _exception_to_json(model.other_light),
+        "less_detail": _exception_to_json(model.less_detail),
     }
 
 
