@@ -44,7 +44,7 @@ FLOORS = {
         {"problems", "route_policy"},
         {"schemas"},
         {"middleware"},
-        {"routes", "openapi", "pages", "viewer_relay"},
+        {"routes", "openapi", "pages", "api_page", "viewer_relay"},
         {"app"},
     ],
 }

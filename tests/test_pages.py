@@ -315,6 +315,15 @@ def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
     assert page.locator(".stack").count() == 2
 
 
+def test_the_api_page_needs_no_other_server(page: Page, url: str) -> None:
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(f"{url}/docs")
+    page.get_by_text("Post a photo to").wait_for()
+    page.get_by_text("/localize", exact=True).first.wait_for()
+    assert [address for address in asked if not address.startswith((f"{url}/", "data:", "blob:"))] == []
+
+
 def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
     page.goto(f"{url}/#/jobs/nothing")
     expect(page.get_by_role("alert")).to_contain_text("job 'nothing' not found")

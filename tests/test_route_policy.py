@@ -24,7 +24,7 @@ from service.web.viewer_relay import Relay
 # What anybody may do without a key. Whatever is missing here must be refused.
 PUBLIC = {
     ("GET", "/"), ("GET", "/livez"), ("GET", "/readyz"), ("GET", "/docs"), ("GET", "/openapi.json"), ("GET", "/ui/x"),
-    ("GET", "/client.js"),
+    ("GET", "/client.js"), ("GET", "/docs/swagger-ui-bundle.js"), ("GET", "/docs/swagger-ui.css"),
 }  # fmt: skip
 UNKNOWN = [
     *(("GET", path) for path in ("/nowhere", "/jobs/", "/JOBS", "//jobs", "/ui", "/livez/x", "/docs/", "/redoc")),

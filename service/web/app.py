@@ -36,6 +36,7 @@ from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.status import StoredScene
 from service.web.api_keys import VIEWER_KEY, KeyRing
+from service.web.api_page import add_api_page
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
 from service.web.middleware.limits import Limits
@@ -81,18 +82,21 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
         title="splatfix",
         version=__version__,
         lifespan=lifespan,
+        docs_url=None,
+        redoc_url=None,
         generate_unique_id_function=lambda route: route.name,
     )
     add_error_handlers(app)
     app.include_router(router)
     add_pages(app)
+    add_api_page(app)
     if relay:
         # After the API's routes, which no path of the viewer can hide then.
         app.include_router(relay.router)
     _add_middleware(app, settings, keys, metrics)
     # In place of FastAPI's: with problem documents, examples and links.
     app.openapi = lambda: description(app)
-    _declare_documentation(app)
+    _declare_description(app)
     # Last, when all routes are there: one without a policy stops the start.
     require_policies(app.routes)
     return app
@@ -161,19 +165,11 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Me
     app.add_middleware(Proxy, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
 
 
-# FastAPI's own routes: the description of the API is public, with the page that shows it.
-_DOCUMENTATION = {
-    "openapi": RoutePolicy(role=None),
-    "swagger_ui_html": RoutePolicy(role=None),
-    "swagger_ui_redirect": RoutePolicy(role="read"),
-    "redoc_html": RoutePolicy(role="read"),
-}
-
-
-def _declare_documentation(app: FastAPI) -> None:
+def _declare_description(app: FastAPI) -> None:
+    """Declare FastAPI's own route public: the API's description, which the page at `/docs` shows."""
     for route in app.routes:
-        if isinstance(route, Route) and route.name in _DOCUMENTATION:
-            declare(route.endpoint, _DOCUMENTATION[route.name])
+        if isinstance(route, Route) and route.name == "openapi":
+            declare(route.endpoint, RoutePolicy(role=None))
 
 
 @contextmanager
