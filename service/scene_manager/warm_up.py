@@ -22,14 +22,17 @@ def warm_up(loaded: LoadedScene, estimator: str) -> None:
     camera = overview(loaded, 512)
     frame = loaded.rasterizer.render([camera])[0]
     rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
-    query = Query(rgb, camera.intrinsics, "given", camera.intrinsics)
-    try:
-        estimate = localize(query, loaded, Request(estimator))
-    # Methods that only refine need a pose to start from.
-    except InvalidPrior:
-        begun = replace(query, prior=camera.pose)
-        estimate = localize(begun, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
-    _log.info("scene %s: warmed up, %s", loaded.scene.info.id, estimate.verdict.status)
+    # Estimated intrinsics have code of their own.
+    for intrinsics in (camera.intrinsics, replace(camera.intrinsics, trust="approximate")):
+        query = Query(rgb, intrinsics, "given", intrinsics)
+        try:
+            estimate = localize(query, loaded, Request(estimator))
+        # Methods that only refine need a pose to start from.
+        except InvalidPrior:
+            begun = replace(query, prior=camera.pose)
+            estimate = localize(begun, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
+        trust, status = intrinsics.trust, estimate.verdict.status
+        _log.info("scene %s: warmed up, %s intrinsics: %s", loaded.scene.info.id, trust, status)
 
 
 def overview(loaded: LoadedScene, long_side: int) -> Camera:
