@@ -5,7 +5,8 @@
 Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/, all kinds alike, is applied in a
 copy of the last commit, and the tests that run its line are started until one fails. Which those are is measured first,
 by one run of all tests (some ten minutes), and kept beside the output. Compiled kernels and processes of their own
-can't be measured: they have the test files that name the module, then those of the modules that import it, then all. A
+can't be measured, and what an import runs is measured in the test that happened to import it: these have the test files
+that name the module or run any of its lines, then those of the modules that import it, then all. A
 failing test counts if it passes without the mutant; one that does not end within the limit has not noticed anything.
 
 The output has a line of JSON for each mutant; a run that was stopped goes on where it was. A mutant that changes
@@ -15,6 +16,7 @@ nothing that anybody could see is marked by hand: `"equivalent": "why"` in its l
 from __future__ import annotations
 
 import argparse
+import ast
 import json
 import os
 import queue
@@ -100,8 +102,10 @@ def measured(copy: Copy, workers: int, file: Path) -> None:
 
 def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]]:
     """Yield what to run, one after the other until something fails."""
-    tests, near = coverage.tests(mutant), {str(p) for p in naming(mutant.file, copy) if p.parts[0] == "tests"}
+    near = {str(path) for path in naming(mutant.file, copy) if path.parts[0] == "tests"}
+    tests = [] if runs_at_import(mutant.line, (copy / mutant.file).read_bytes()) else coverage.tests(mutant)
     if not tests:
+        near |= coverage.files(mutant.file)
         importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
         yield sorted(near)
         yield sorted(importing - near)
@@ -113,6 +117,12 @@ def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]
     else:
         yield [test for test in tests if test.split("::")[0] in near]
         yield [test for test in tests if test.split("::")[0] not in near]
+
+
+def runs_at_import(line: int, source: bytes) -> bool:
+    """Whether a line is in no function's body."""
+    functions = (n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
+    return not any(each.body[0].lineno <= line <= (each.end_lineno or 0) for each in functions)
 
 
 def naming(file: str, copy: Path) -> list[Path]:

@@ -16,7 +16,7 @@ from fake_service import PHOTO, orbit, records
 
 from service.results import Candidates
 from service.types import Camera, Pose
-from viewer.camera_views import SceneExtent, view_from_behind
+from viewer.camera_views import SceneExtent, view_from_behind, view_through
 from viewer.frusta import viser_frustum
 from viewer.layers.candidate_layer import CandidateLayer
 from viewer.layers.layer import Layer, linear_colours, quaternion_wxyz
@@ -24,6 +24,7 @@ from viewer.layers.match_layer import MatchLayer
 from viewer.layers.splat_layer import SplatLayer
 from viewer.layers.training_camera_layer import TrainingCameraLayer
 from viewer.layers.trajectory_layer import TrajectoryLayer
+from viewer.scene_3d import Scene3D
 from viewer.service_values import Job, JobOutcome, Splats
 
 L = TypeVar("L", bound=Layer)
@@ -35,7 +36,8 @@ class Canvas:
 
     def __init__(self) -> None:
         self.scene: Any = self
-        self.camera = None
+        self.camera: Any = None
+        self.up: Any = None
         self.nodes: dict[str, Any] = {}
         self.background: Any = None
 
@@ -43,6 +45,9 @@ class Canvas:
         return nullcontext()
 
     def flush(self) -> None: ...
+
+    def set_up_direction(self, up: np.ndarray) -> None:
+        self.up = up
 
     def set_background_image(self, image: np.ndarray, **options: Any) -> None:
         self.background = image, options["format"]
@@ -226,6 +231,29 @@ def test_a_path_has_a_frustum_for_each_step_that_moves(canvas: Canvas) -> None:
     assert set(canvas.nodes) == {"/trajectory/initial"}  # a camera that stays has no path
 
 
+def test_two_poses_make_a_path_and_one_that_stays_removes_it(canvas: Canvas) -> None:
+    layer = on(canvas, TrajectoryLayer)
+    layer.show(records(2), job_of(None))
+    assert "/trajectory/path" in canvas.nodes
+    layer.show([records(1)[0]] * 2, job_of(None))
+    assert "/trajectory/path" not in canvas.nodes
+
+
+def test_training_cameras_are_smaller_than_the_photos(canvas: Canvas) -> None:
+    """Else the photo's own frustum could not be told from those around it."""
+    on(canvas, TrainingCameraLayer).show([Camera(PHOTO, Pose(np.eye(4)))])
+    assert 0.3 * EXTENT.frustum_depth < canvas.nodes["/training cameras/cameras"].points[..., 2].max()
+    assert canvas.nodes["/training cameras/cameras"].points[..., 2].max() < 0.8 * EXTENT.frustum_depth
+
+
+def test_matches_without_colours_are_not_drawn(canvas: Canvas) -> None:
+    layer = on(canvas, MatchLayer)
+    view, colours = matches(3)
+    layer.show(view, None)
+    layer.show(None, colours)
+    assert not canvas.nodes
+
+
 def depth_of(node: Any) -> float:
     """Return the depth of a drawn frustum: viser's scale is proportional to it."""
     return node.scale / viser_frustum(PHOTO, 1.0)[2]
@@ -320,6 +348,39 @@ def test_a_render_covers_the_splats_and_leaves_the_background_colour(canvas: Can
     layer.set_visible(False)
     layer.show_background(None)
     assert not canvas.nodes["/splats/splats"].visible
+
+
+def test_another_scene_begins_with_its_own_view_size_and_background(canvas: Canvas) -> None:
+    canvas.camera = SimpleNamespace(aspect=1.5)
+    scene, training = Scene3D(canvas), Camera(PHOTO, orbit(0.6))
+    assert scene.metres_per_unit is None
+    for pose, metres, colour in ((None, 0.5, (1.0, 0.0, 0.0)), (orbit(0.2), None, (0.0, 0.0, 1.0))):
+        described = SimpleNamespace(background_rgb=colour, cameras=(SimpleNamespace(camera=training),))
+        described.metres_per_unit = metres
+        splats = Splats(np.zeros((1, 3), np.float32), np.full((1, 6), 1e-4, np.float32), np.zeros((1, 4), np.uint8), 1)
+        shown: Any = SimpleNamespace(description=described, splats=splats, extent=EXTENT)
+        scene.splats.show_background(np.zeros((4, 5, 3), np.uint8))  # the last scene's
+        scene.show_scene(shown, pose)
+        assert canvas.background[0].tolist() == [[[255 * part for part in colour]]]
+        assert "/training cameras/cameras" in canvas.nodes
+        assert scene.metres_per_unit == metres
+        assert np.array_equal(canvas.up, EXTENT.up)
+        wanted = view_from_behind(pose, EXTENT, splats.centres) if pose else view_through(training, EXTENT, 1.0)
+        assert np.allclose(canvas.camera.position, wanted.position)
+        assert np.allclose(canvas.camera.look_at, wanted.look_at)
+        # One looks through a camera: its own frustum is before the near plane, the scene behind it.
+        assert EXTENT.frustum_depth < canvas.camera.near < 2 * EXTENT.frustum_depth
+        assert canvas.camera.far > 100 * EXTENT.radius
+    scene.trajectory.show(records(3), job_of(None))
+    scene.candidates.show(candidates(3), PHOTO)
+    scene.matches.show(*matches(3))
+    here = records(3)[-1].pose
+    behind = here.position_in_world - 3 * here.axis_in_world
+    assert isinstance(scene.hit(behind.tolist(), here.axis_in_world.tolist()), int)
+    scene.clear_job()
+    assert set(canvas.nodes) == {"/training cameras/cameras"}
+    away = training.pose.position_in_world - 3 * training.pose.axis_in_world
+    assert scene.hit(away.tolist(), training.pose.axis_in_world.tolist()) is training
 
 
 # ------------------------------------------------------------------ where the view goes

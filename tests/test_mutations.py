@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from api_server import ROOT
-from mutation_run import drawn, naming
+from mutation_run import drawn, naming, runs_at_import
 from mutations import KINDS, mutants_of
 
 SOURCE = b'''"""A module \xe2\x80\x94 not all of it is ASCII."""
@@ -77,3 +77,8 @@ def test_what_names_a_module_is_found():
     named = {str(path) for path in naming("service/photos/images.py", ROOT)}
     assert {"tests/test_images.py", "service/photos/sequence.py"} <= named
     assert not {"tests/test_mutations.py", "service/geometry.py"} & named
+
+
+def test_what_runs_at_an_import_is_told_from_what_a_test_calls():
+    at_import = {mutant.before for mutant in MUTANTS if runs_at_import(mutant.line, SOURCE)}
+    assert at_import == {"3", "0.8", "5"}
