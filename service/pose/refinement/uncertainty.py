@@ -105,7 +105,8 @@ def pose_uncertainty(
     if lens_prior is None:
         found = _with_exact_lens(level, state, score, hessian, scale, loss, config)
     else:
-        found = _with_estimated_lens(hessian, score, scale, lens_prior, correction, config)
+        focal_lengths = answer.intrinsics.fx / answer.intrinsics.long_side
+        found = _with_estimated_lens(hessian, score, scale, lens_prior, correction, focal_lengths, config)
     if found is None:
         return None
     information = hessian if lens_prior is None else _with_prior(hessian, scale, lens_prior, correction)
@@ -142,20 +143,25 @@ def _with_estimated_lens(
     scale: float,
     lens_prior: LensPrior,
     correction: IntrinsicsCorrection,
+    focal_lengths: float,
     config: RefinementConfig,
 ) -> PoseUncertainty | None:
+    """`focal_lengths`: the focal length, in long sides."""
     of_lens = slice(0, CORRECTION.stop)
     # A prior is information: added before the photometric parameters are marginalized.
     covariance = _covariance(_with_prior(hessian, scale, lens_prior, correction)[of_lens, of_lens], scale)
     if covariance is None:
         return None
-    covariance = _with_lens_error(covariance, config.lens_error, 1.0 / prior_precision(lens_prior, correction))
+    error = config.lens_error
+    shift = error.principal_point * focal_lengths
+    errors = np.array([error.log_focal, error.k1, shift, shift])
+    covariance = _with_lens_error(covariance, errors, 1.0 / prior_precision(lens_prior, correction))
     given_lens = _covariance(hessian[:FOCAL, :FOCAL], scale)
     return PoseUncertainty(
         np.zeros(6),
         covariance,
         given_lens,
-        _pose_if_cropped(hessian, score, scale, lens_prior, correction, config.lens_error),
+        _pose_if_cropped(hessian, score, scale, lens_prior, correction, error),
         _focal_step(hessian, score),
     )
 
@@ -217,7 +223,7 @@ def _normal_equations(
         jacobian, weights, residuals, level.pixels, inner, config.l1_floor, uncertainty.cell_px
     )
     found = jackknife_variance_scale(scores[:, :FOCAL], hessians[:, :FOCAL, :FOCAL], places, uncertainty)
-    scale = uncertainty.variance_share * max(found, uncertainty.min_variance_scale)
+    scale = max(found, uncertainty.min_variance_scale)
     return scores.sum(0), hessians.sum(0), scale
 
 
@@ -258,17 +264,15 @@ def _with_prior(
 
 
 def _with_lens_error(
-    covariance: Float64[np.ndarray, "10 10"], error: LensErrorConfig, prior_variance: Float64[np.ndarray, "4"]
+    covariance: Float64[np.ndarray, "10 10"], errors: Float64[np.ndarray, "4"], prior_variance: Float64[np.ndarray, "4"]
 ) -> Float64[np.ndarray, "10 10"]:
     """Return the covariance with independent errors of the intrinsics, which the pose follows as it says, added.
 
     No more than makes the intrinsics as uncertain as before: the prior from other photos includes their errors.
     """
     by_lens = np.linalg.solve(covariance[6:, 6:], covariance[6:]).T
-    shift = error.principal_point
-    errors = np.array([error.log_focal, error.k1, shift, shift]) ** 2
     left = np.maximum(prior_variance - covariance.diagonal()[6:], 0.0)
-    return covariance + by_lens * np.minimum(errors, left) @ by_lens.T
+    return covariance + by_lens * np.minimum(errors**2, left) @ by_lens.T
 
 
 def _covariance(information: Float64[np.ndarray, "n n"], scale: float) -> Float64[np.ndarray, "k k"] | None:
