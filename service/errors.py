@@ -3,6 +3,7 @@
     SplatfixError
       |-- BadInput           the caller's mistake
       |     |-- InvalidImage, InvalidIntrinsics, InvalidPrior, InvalidOptions, InvalidRequest
+      |     |-- RegistrationFailed  (what is known of a scene's place determines nothing)
       |     `-- UnknownName  (a plug-in, scene or modification that does not exist; lists what does)
       |-- SceneError
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
@@ -75,6 +76,10 @@ class InvalidOptions(BadInput):
 
 class UnknownName(BadInput):
     code = "unknown_name"
+
+
+class RegistrationFailed(BadInput):
+    code = "registration_failed"
 
 
 class SceneError(SplatfixError):
