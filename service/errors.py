@@ -14,6 +14,7 @@
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
       |-- PhotoGone          deleted after the job
       |-- LensNotFound       no such lens is remembered
+      |-- RegistrationNotFound  the scene isn't registered
       |-- IdempotencyConflict  a key was used for another request
       |-- DeadlineExceeded, Interrupted  why a job ended without a result
       |-- StorageFailed      the disk is full or broken; nothing was accepted
@@ -128,6 +129,10 @@ class RecordNotFound(SplatfixError):
 
 class LensNotFound(SplatfixError):
     code = "lens_not_found"
+
+
+class RegistrationNotFound(SplatfixError):
+    code = "registration_not_found"
 
 
 class JobNotReady(SplatfixError):

@@ -20,10 +20,13 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 # Package -> its floors, bottom to top: a module imports from the floors below its own, and from itself.
 FLOORS = {
     "service": [
-        {"types", "results", "errors", "plugins", "logs", "versions", "distortion", "client", "operating_system"},
-        {"interfaces", "geometry", "jit", "photos"},
+        {
+            *("types", "results", "errors", "plugins", "logs", "versions", "distortion", "client", "codec"),
+            "operating_system",
+        },
+        {"interfaces", "geometry", "geodesy", "jit", "photos"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
-        {"estimators"},
+        {"estimators", "registration"},
         {"localize"},
         {"tracking", "smoothing", "multi_scene"},
         {"scene_manager"},
@@ -56,6 +59,7 @@ SAME_FLOOR = {
         ("results", "types"),
         ("plugins", "errors"),
         ("photos", "geometry"),
+        ("geodesy", "geometry"),
     },
     "service/pose": set(),
     "service/web": set(),
@@ -99,7 +103,7 @@ WRAPPED = {
     "limits": {"service/web/middleware/limits.py"},
     "prometheus_client": {"service/web/metrics.py"},
     "structlog": {"service/logs.py"},
-    "pyproj": {"service/web/schemas/geodesy.py"},
+    "pyproj": {"service/geodesy.py"},
     "yaml": {"service/web/openapi.py"},
     "websockets": {"service/web/viewer_relay.py"},
     "httpx": {"service/web/viewer_relay.py", "service/client.py"},

@@ -19,7 +19,7 @@ from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import GeoAnchor, Intrinsics, Pose
 from service.web.schemas.conversion import frame_out, geopose_out, result_out
 from service.web.schemas.exports import exported
-from service.web.schemas.geodesy import geographic
+from service.geodesy import geographic
 from service.web.schemas.job_results import Result
 
 CREATED = datetime(2026, 1, 2, 3, 4, 5, 250_000, tzinfo=UTC)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from service.jobs.codec import decode, encode
+from service.codec import decode, encode
 from service.jobs.sqlite_database import Connection, Database
 from service.lenses.lens_estimate import LensEstimate
 from service.lenses.lens_key import LensKey

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from service.errors import Failure, IdempotencyConflict, JobNotFound
-from service.jobs.codec import decode, encode
+from service.codec import decode, encode
 from service.jobs.migrate_0_1 import old_failure, old_photo, old_result, old_spec
 from service.jobs.model import (
     ENDED,

@@ -45,7 +45,9 @@ class ConsensusConfig:
 CONSENSUS = ConsensusConfig()
 
 
-def agreeing(evidence: Evidence, rng: np.random.Generator, config: ConsensusConfig = CONSENSUS) -> tuple[Fit, list[int]]:
+def agreeing(
+    evidence: Evidence, rng: np.random.Generator, config: ConsensusConfig = CONSENSUS
+) -> tuple[Fit, list[int]]:
     """Return the fit to the observations that agree, and their numbers. Needs at least one observation or direction."""
     observations = evidence.observations
     count, noise = len(observations), unknown_noise(observations)

@@ -17,6 +17,7 @@ from service.registration.observations import Evidence
 from service.registration.registration import PARTS, Part
 from service.registration.similarity_fit import PARAMETERS, Fit, fit_similarity
 
+
 @dataclass(frozen=True, slots=True)
 class DeterminacyConfig:
     """When a part counts as determined; below, its standard deviation tells the rest."""
@@ -135,4 +136,3 @@ def _reason(
         why = f"up is uncertain by {np.degrees(min(tilt_sigma, np.pi)):.0f} degrees"
         why += f", the heading by {np.degrees(min(heading_sigma, np.pi)):.0f}"
     return f"{missing} can't be determined: {why}."
-

@@ -116,7 +116,9 @@ class Fit:
         return float(mine.sum() - np.trace(self.hat[np.ix_(mine, mine)]))
 
     def of_kind(self, kind: Kind) -> np.ndarray:
-        return np.concatenate([np.full(len(row.residual), row.kind == kind) for row in self.rows] or [np.zeros(0, bool)])
+        return np.concatenate(
+            [np.full(len(row.residual), row.kind == kind) for row in self.rows] or [np.zeros(0, bool)]
+        )
 
 
 def fit_similarity(

@@ -13,7 +13,7 @@ from service.lenses.lens_memory import RecalledLens
 from service.lenses.lens_store import StoredLens
 from service.results import HINTS, IterationRecord, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
-from service.web.schemas.geodesy import geographic
+from service.geodesy import geographic
 from service.web.schemas.job_results import (
     Alternative,
     CandidatesOut,

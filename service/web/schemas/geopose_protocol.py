@@ -21,7 +21,7 @@ from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
 from service.scene_manager.status import SceneStatus
 from service.types import GeoAnchor
 from service.web.api_model import Model
-from service.web.schemas.geodesy import pose_on_earth
+from service.geodesy import pose_on_earth
 from service.web.schemas.job_results import Result
 from service.web.schemas.poses import GeoPose
 from service.web.schemas.requests import PriorIn

@@ -54,6 +54,17 @@ def pose_on_earth(
     return Pose(world_from_camera)
 
 
+def enu_from_geographic(
+    origin: Float64[np.ndarray, "3"], positions: Float64[np.ndarray, "n 3"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Return metres east, north and up of an origin; all on WGS84: latitude and longitude in degrees, height in metres
+    above the ellipsoid."""
+    ecef_from_geodetic = Transformer.from_crs("EPSG:4979", "EPSG:4978")
+    there = np.stack(ecef_from_geodetic.transform(*positions.T), -1)
+    here = np.array(ecef_from_geodetic.transform(*origin))
+    return (there - here) @ _ecef_from_enu(origin[0], origin[1])
+
+
 def _ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3 3"]:
     """Return the unit vectors east, north and up at a position, as columns, in the Earth-centred frame."""
     (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians([latitude_deg, longitude_deg])) for f in (np.sin, np.cos))

@@ -1,0 +1,122 @@
+"""A scene's registrations on disk: `registration.json` beside the scene, or in the data folder where that can't be.
+
+The file holds the latest revisions, the last of which is in force; undoing drops it, and its number isn't used again.
+It is no part of the scene's digest: a registration changes no render, so no index is made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from service.codec import decode, encode
+from service.errors import CorruptScene, RegistrationNotFound, StorageFailed
+from service.registration.registration import Registration
+
+FILE = "registration.json"
+KEPT = 20
+"""Revisions; older ones are dropped."""
+_MAX_BYTES = 16 * 1024 * 1024
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    last_revision: int = 0
+    """The highest number that was ever given."""
+    revisions: tuple[Registration, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationFile:
+    """The file of one scene; safe from several threads; readers never see half a file."""
+
+    scene: Path
+    """Scene folder or scene file."""
+    data_folder: Path | None = None
+    """Where the file goes if it can't be written beside the scene."""
+
+    @property
+    def beside(self) -> Path:
+        return self.scene / FILE if self.scene.is_dir() else self.scene.with_suffix(f".{FILE}")
+
+    @property
+    def elsewhere(self) -> Path | None:
+        place = hashlib.sha256(str(self.scene.resolve()).encode()).hexdigest()[:16]
+        return self.data_folder and self.data_folder / "registrations" / f"{place}.json"
+
+    @property
+    def path(self) -> Path:
+        """Where the registrations are: once they were written to the data folder they stay there."""
+        elsewhere = self.elsewhere
+        return elsewhere if elsewhere is not None and elsewhere.is_file() else self.beside
+
+    def current(self) -> Registration | None:
+        """Return the registration in force. Raises CorruptScene."""
+        revisions = self.history().revisions
+        return revisions[-1] if revisions else None
+
+    def history(self) -> History:
+        """Return all revisions that are kept. Raises CorruptScene."""
+        path = self.path
+        try:
+            if path.stat().st_size > _MAX_BYTES:
+                raise CorruptScene(f"larger than {_MAX_BYTES} bytes.", where=path.name)
+            return decode(History, path.read_text("utf-8"))
+        except FileNotFoundError:
+            return History()
+        except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
+            raise CorruptScene(
+                f"no registrations can be read: {str(error)[:200]}.", where=path.name, hint="Delete it, register again."
+            ) from None
+
+    def add(self, registration: Registration) -> Registration:
+        """Put a registration in force; return it with its revision. Raises StorageFailed, CorruptScene."""
+        with _LOCK:
+            before = self.history()
+            number = before.last_revision + 1
+            added = replace(registration, revision=number)
+            self._write(History(number, (*before.revisions, added)[-KEPT:]))
+        return added
+
+    def undo(self) -> Registration | None:
+        """Drop the registration in force; return the one before it, if there is one.
+
+        Raises RegistrationNotFound, StorageFailed, CorruptScene.
+        """
+        with _LOCK:
+            before = self.history()
+            if not before.revisions:
+                raise RegistrationNotFound("the scene is not registered.", where="scene")
+            self._write(replace(before, revisions=before.revisions[:-1]))
+        return before.revisions[-2] if len(before.revisions) > 1 else None
+
+    def _write(self, history: History) -> None:
+        text = encode(history) + "\n"
+        places = [self.path, *([self.elsewhere] if self.elsewhere else [])]
+        for number, path in enumerate(places, 1):
+            try:
+                _replace(path, text)
+            except OSError as error:
+                if number == len(places):
+                    raise StorageFailed(
+                        f"the registration can't be written to {path.name}: {error.strerror}."
+                    ) from error
+            else:
+                return
+
+
+def _replace(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        with draft.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
