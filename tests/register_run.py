@@ -1,14 +1,11 @@
 """50 seeds of each layout: errors against least squares without the outlier, and how often the truth is in the region.
 
-python tests/register_run.py [SEEDS]
+PYTHONPATH=.:tests python tests/register_run.py [SEEDS]
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
-
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
 import numpy as np
 from registration_layouts import evidence
@@ -53,7 +50,6 @@ def row(kind, what, count, seeds):
         plain = fit_similarity(without, range(count - 1), start.similarity, unknown_noise(without.observations))
         ideal.append(errors(plain.similarity.matrix, plain.similarity.centre_in_world, truth))
         rejected = [r.name for r in done.residuals if not r.used]
-        wrong = [a.name for a, b in zip(bad.observations, [*without.observations, None]) if b is None or a != b]
         found.append(len(rejected))
         whole.append(done.is_complete)
     return summary(mine), summary(ideal), np.mean(inside), np.bincount(found).tolist(), np.mean(whole)
@@ -72,6 +68,7 @@ if __name__ == "__main__":
         ratio = mine / ideal
         print(
             f"{kind:8}{what:10}{count:3} | rms {mine[0]:.3f} deg {mine[1]:.4f} m {mine[2]:.2%} scale | over ideal "
-            f"{ratio[0]:.2f} {ratio[1]:.2f} {ratio[2]:.2f} | in region {inside:.0%} | complete {whole:.0%} | rejected {found}",
+            f"{ratio[0]:.2f} {ratio[1]:.2f} {ratio[2]:.2f} | in region {inside:.0%} | complete {whole:.0%} | "
+            f"rejected {found}",
             flush=True,
         )

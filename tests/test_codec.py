@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
-from service.errors import Failure
 from service.codec import VERSION, decode, encode
+from service.errors import Failure
 from service.jobs.model import JobRecord, JobSpec, SequenceFrame
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
 from service.types import BoxPrior, Camera, GaussianPosePrior, Intrinsics, LensPrior, Pose

@@ -33,9 +33,9 @@ from test_scenes import TRANSFORMS, ply
 
 import service.jobs.photo_store
 import service.scene_manager.scene_store
+from service.codec import encode
 from service.errors import BadInput, SceneError, SplatfixError
 from service.estimators import ESTIMATORS
-from service.codec import encode
 from service.localize import LoadedScene
 from service.scene_manager.manager import Entry
 from service.web.api_keys import add_key

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from service.cli.result_tables import write_frame_table
 from service.errors import NoGeoAnchor
+from service.geodesy import geographic
 from service.geometry import look_at, rotation_from_quat
 from service.geometry import moved as along
 from service.jobs.model import JobResult, SequenceFrame
@@ -19,7 +20,6 @@ from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import GeoAnchor, Intrinsics, Pose
 from service.web.schemas.conversion import frame_out, geopose_out, result_out
 from service.web.schemas.exports import exported
-from service.geodesy import geographic
 from service.web.schemas.job_results import Result
 
 CREATED = datetime(2026, 1, 2, 3, 4, 5, 250_000, tzinfo=UTC)

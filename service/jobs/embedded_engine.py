@@ -17,9 +17,11 @@ from service.jobs.trajectory import Trajectory
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import read_sequence
+from service.registration.registration import Registration
 from service.results import PoseEstimate
 from service.scene_manager import scene_images
 from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
 from service.scene_manager.splat_sample import packed_splats
 from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
 from service.tracking import localize_sequence
@@ -39,6 +41,16 @@ class EngineConfig:
     """Where view indexes and scenes in mappable form are kept between runs; None: nowhere."""
     memory_bytes: int | None = None
     """Of all scenes together; None: any number."""
+    data_folder: Path | None = None
+    """Where registrations are that can't be beside their scenes."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """Scenes that stay in memory, and the registrations in force when they were asked for."""
+
+    scenes: tuple[LoadedScene, ...]
+    registrations: tuple[Registration | None, ...]
 
 
 class EmbeddedEngine:
@@ -52,7 +64,8 @@ class EmbeddedEngine:
             rasterizer=config.rasterizer,
             memory_bytes=config.memory_bytes,
         )
-        self._held: dict[str, tuple[LoadedScene, ...]] = {}
+        self._registrations = SceneRegistrations(config.data_folder)
+        self._held: dict[str, _Held] = {}
         self._cancels: dict[str, threading.Event] = {}
         """By the id of the attempt that runs."""
 
@@ -75,16 +88,17 @@ class EmbeddedEngine:
         self._manager.remove(scene_id)
 
     def scenes(self) -> list[SceneStatus]:
-        return [entry.status() for entry in self._manager.entries()]
+        return [self._status(entry) for entry in self._manager.entries()]
 
     def scene(self, scene_id: str | None) -> SceneStatus:
-        return self._manager.entry(scene_id).status()
+        return self._status(self._manager.entry(scene_id))
 
     def contents(self, scene_id: str) -> SceneContents | None:
         return self._manager.contents(scene_id)
 
     def require(self, scene_id: str) -> SceneInfo:
-        return self._manager.get(scene_id).scene.info
+        info = self._manager.get(scene_id).scene.info
+        return registered_info(info, self._registrations.of(self._manager.entry(scene_id).path, info))
 
     def readiness(self) -> SceneReadiness:
         return self._manager.readiness()
@@ -92,12 +106,12 @@ class EmbeddedEngine:
     def load(self, scene_id: str) -> SceneStatus:
         entry = self._manager.entry(scene_id)
         self._manager.load(entry)
-        return entry.status()
+        return self._status(entry)
 
     def unload(self, scene_id: str) -> SceneStatus:
         entry = self._manager.entry(scene_id)
         self._manager.unload(entry)
-        return entry.status()
+        return self._status(entry)
 
     def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
         self._manager.when_settled(scene_id, do)
@@ -106,11 +120,15 @@ class EmbeddedEngine:
         ids = self._manager.chosen(asked)
         # A token instead of the scenes, so that an engine in another process can have the same interface.
         held, token = self._manager.acquire(ids), secrets.token_hex(8)
-        self._held[token] = held
+        paths = [self._manager.entry(scene_id).path for scene_id in ids]
+        pairs = zip(paths, held, strict=True)
+        registrations = tuple(self._registrations.of(path, loaded.scene.info) for path, loaded in pairs)
+        self._held[token] = _Held(held, registrations)
         return HeldScenes(token, tuple(ids), held[0].scene.info.background_rgb)
 
     def release(self, token: str) -> None:
-        self._manager.release(self._held.pop(token, ()))
+        held = self._held.pop(token, None)
+        self._manager.release(held.scenes if held else ())
 
     # ------------------------------------------------------------------ work
 
@@ -120,11 +138,17 @@ class EmbeddedEngine:
             raise SceneNotReady("the job's scenes are not in memory any more.", where="scene")
         cancel = self._cancels[task.id] = threading.Event()
         try:
-            result, loaded = run_task(task, held, on_record, cancel)
+            result, loaded = run_task(task, held.scenes, on_record, cancel, held.registrations)
         finally:
             # Also after an error: a later attempt has another id, so the entry would stay for ever.
             del self._cancels[task.id]
         return EngineAnswer(result, self._manager.id_of(loaded))
+
+    def _status(self, entry: Entry) -> SceneStatus:
+        status = entry.status()
+        if status.info is None:
+            return status
+        return replace(status, info=registered_info(status.info, self._registrations.of(entry.path, status.info)))
 
     def cancel(self, task_id: str) -> None:
         if cancel := self._cancels.get(task_id):
@@ -145,22 +169,36 @@ def run_task(
     scenes: Sequence[LoadedScene],
     on_record: OnRecord | None = None,
     cancel: threading.Event | None = None,
+    registrations: Sequence[Registration | None] = (),
 ) -> tuple[JobResult, LoadedScene]:
     """Localize on this thread, in one scene or in the one of several that the photo shows; return that scene, too.
 
-    A sequence is localized in the first scene.
+    A sequence is localized in the first scene. `registrations` are the scenes', which the result's pose is placed by.
     """
     options = ESTIMATORS.load(task.estimator).Options(**task.options)
     request = Request(task.estimator, options, seed=task.seed, budget_s=task.budget_s, cancel=cancel)
     if isinstance(task.source, SequenceSource):
-        return _run_sequence(task.source, request, scenes[0], on_record), scenes[0]
+        sequence = _run_sequence(task.source, request, scenes[0], on_record)
+        return _registered(sequence, scenes, scenes[0], registrations), scenes[0]
     step = (lambda record: on_record(JobRecord(record), None)) if on_record else None
     if len(scenes) > 1:
         found = localize_in_scenes(task.source, scenes, request, step)
     else:
         found = SceneEstimate(localize(task.source, scenes[0], request, step), scenes[0])
     anchor = found.loaded.scene.info.geo_anchor
-    return JobResult(with_last_record_only(found.estimate), task.decode, anchor, versions()), found.loaded
+    result = JobResult(with_last_record_only(found.estimate), task.decode, anchor, versions())
+    return _registered(result, scenes, found.loaded, registrations), found.loaded
+
+
+def _registered(
+    result: JobResult, scenes: Sequence[LoadedScene], shown: LoadedScene, registrations: Sequence[Registration | None]
+) -> JobResult:
+    """Return the result with the registration of the scene that the photo shows, whose place on Earth counts."""
+    # By identity: comparing scenes would compare their arrays.
+    found = next((r for loaded, r in zip(scenes, registrations, strict=False) if loaded is shown), None)
+    if found is None:
+        return result
+    return replace(result, registration=replace(found, residuals=()), geo_anchor=found.geo_anchor or result.geo_anchor)
 
 
 def _run_sequence(

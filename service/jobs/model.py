@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from service.errors import Failure
 from service.lenses.lens_memory import RecalledLens
+from service.registration.registration import Registration
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status
 from service.scene_manager.status import AUTO
 from service.types import GeoAnchor, Intrinsics, Pose, PriorRegion
@@ -120,6 +121,8 @@ class JobResult:
     """Of the packages that the result depends on."""
     frames: tuple[SequenceFrame, ...] | None = None
     """Of a sequence: each photo's answer; the estimate is the last that was localized."""
+    registration: Registration | None = None
+    """Of the scene, without residuals: the revision in force when the attempt began."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from service.errors import Failure, IdempotencyConflict, JobNotFound
 from service.codec import decode, encode
+from service.errors import Failure, IdempotencyConflict, JobNotFound
 from service.jobs.migrate_0_1 import old_failure, old_photo, old_result, old_spec
 from service.jobs.model import (
     ENDED,

@@ -267,4 +267,5 @@ def umeyama(
 
 
 def free_parameters(evidence: Evidence) -> int:
+    """Return how many parameters are estimated."""
     return PARAMETERS - (evidence.metres_per_unit is not None)

@@ -108,6 +108,8 @@ class Evidence:
     """The target frame's up axis; None: not known."""
     metres_per_unit: float | None = None
     """Of the scene, where it is certain: then it isn't estimated."""
+    may_be_turned: bool = False
+    """All photos may have been turned by the same quarter turns after their poses were taken."""
     drift: float = 0.0
     """By how much the observations' places drift, as a share of the path between them: a random walk, whose standard
     deviation at the end of the path is this share of its length. For odometry and AR sessions; in order of time."""

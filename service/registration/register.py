@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from service.errors import RegistrationFailed
+from service.geometry import so3_exp
 from service.registration.consensus import agreeing, free_parameters, umeyama
 from service.registration.determinacy import determined
 from service.registration.observations import Evidence, Observation
@@ -15,6 +17,8 @@ from service.registration.registration import Registration, Residual
 from service.registration.similarity_fit import KINDS, Fit, Noise, Similarity, is_stated, observation_rows
 
 _REGION = 0.95
+_TURNED = 0.3
+"""rad: with larger differences of the rotations, the photos are tried turned."""
 _MIRRORED = 0.2
 """A reflection that leaves less than this share of the residuals: the coordinates are left-handed."""
 
@@ -25,7 +29,7 @@ def register(evidence: Evidence, rng: np.random.Generator) -> Registration:
     Raises RegistrationFailed where it determines nothing, contradicts itself or is in a left-handed frame.
     """
     _check(evidence)
-    fit, used = agreeing(evidence, rng)
+    evidence, quarter_turns, (fit, used) = _as_turned(evidence, rng)
     _require_right_handed(evidence, fit, used)
     parts, reason, covariance = determined(fit, evidence, used)
     if not parts:
@@ -41,8 +45,33 @@ def register(evidence: Evidence, rng: np.random.Generator) -> Registration:
         residuals=tuple(_residual(o, i in set(used), fit.similarity) for i, o in enumerate(evidence.observations)),
         up_in_target=evidence.up,
         noise=_noise(fit, evidence),
-        warnings=_warnings(evidence, used, reason),
+        warnings=_warnings(evidence, used, reason, quarter_turns),
     )
+
+
+def _as_turned(evidence: Evidence, rng: np.random.Generator) -> tuple[Evidence, int, tuple[Fit, list[int]]]:
+    """Return evidence and fit with the photos turned as fits best: by no or several quarter turns clockwise."""
+    best = evidence, 0, agreeing(evidence, rng)
+    if not evidence.may_be_turned or _turn_error(best[2][0]) < _TURNED:
+        return best
+    for quarter_turns in (1, 2, 3):
+        angle = quarter_turns * np.pi / 2
+        turn = so3_exp(np.array([0.0, 0.0, -angle]))
+        seen = [
+            o if o.target_from_camera is None else replace(o, target_from_camera=o.target_from_camera @ turn)
+            for o in evidence.observations
+        ]
+        tried = replace(evidence, observations=seen)
+        found = tried, quarter_turns, agreeing(tried, rng)
+        if _turn_error(found[2][0]) < _turn_error(best[2][0]):
+            best = found
+    return best
+
+
+def _turn_error(fit: Fit) -> float:
+    """Return the mean angle in rad between the rotations that are given and those of the fit."""
+    angles = [float(np.linalg.norm(row.residual)) for row in fit.rows if row.kind == "rotation"]
+    return float(np.mean(angles)) if angles else 0.0
 
 
 def _check(evidence: Evidence) -> None:
@@ -114,8 +143,10 @@ def _residual(seen: Observation, used: bool, similarity: Similarity) -> Residual
     )
 
 
-def _warnings(evidence: Evidence, used: Sequence[int], reason: str) -> tuple[str, ...]:
+def _warnings(evidence: Evidence, used: Sequence[int], reason: str, quarter_turns: int) -> tuple[str, ...]:
     found = [reason] if reason else []
+    if quarter_turns:
+        found.append(f"the photos are taken to be turned by {90 * quarter_turns} degrees clockwise from their poses.")
     placed = [i for i in used if evidence.observations[i].position is not None]
     if not is_stated("position", evidence.observations) and 0 < len(placed) < 4:
         found.append("with fewer than four places none can be found to be wrong.")

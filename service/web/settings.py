@@ -176,7 +176,12 @@ class Settings(BaseSettings):
     def engine(self) -> EngineConfig:
         """The part of the settings for the embedded engine."""
         return EngineConfig(
-            self.estimator, self.matcher, self.rasterizer, self.cache_dir, memory_bytes=self.scene_memory_bytes
+            self.estimator,
+            self.matcher,
+            self.rasterizer,
+            self.cache_dir,
+            memory_bytes=self.scene_memory_bytes,
+            data_folder=self.data_dir,
         )
 
     @property

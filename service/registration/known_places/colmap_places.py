@@ -1,4 +1,4 @@
-"""Poses of the photos of a COLMAP model: the folder with `images.bin` or `images.txt`, or one that has it in `sparse/0`.
+"""Poses of the photos of a COLMAP model: of the folder with `images.bin` or `images.txt`, or with a `sparse/0`.
 
 The target frame is the model's, in metres if it was georegistered or scaled.
 """

@@ -65,14 +65,16 @@ class KnownPlaces:
 
 
 def in_metres(known: KnownPlaces, origin: Origin | None = None) -> tuple[KnownPlaces, Origin | None]:
-    """Return geographic places in East-North-Up of an origin (by default their mean), and the origin; others as they
-    are."""
+    """Return geographic places in East-North-Up of an origin, and the origin; others as they are.
+
+    The origin is by default their median, which no outlier moves.
+    """
     if not known.is_geographic:
         return known, None
     numbers = np.array([p.position for p in known.places if p.position is not None]).reshape(-1, 3)
     if not len(numbers):
         return replace(known, is_geographic=False), None
-    place = origin or Origin(*(float(v) for v in numbers.mean(0)))
+    place = origin or Origin(*(float(v) for v in np.median(numbers, axis=0)))
     zero = np.array([place.latitude_deg, place.longitude_deg, place.height_m])
 
     def moved(p: KnownPlace) -> KnownPlace:

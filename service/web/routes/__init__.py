@@ -15,6 +15,7 @@ PUT    /scenes/{id}                           upload; POST .../load, .../unload;
 GET    /scenes/{id}/thumbnail.jpg             small JPEG
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
 POST   /scenes/{id}/render                    colour or depth from any pose
+POST   /scenes/{id}/registration              where the scene is; GET, DELETE (undo)
 GET    /lenses                                DELETE /lenses, /lenses/{id}
 POST   /tokens                                short-lived, for pages
 GET    /capabilities, /version, /livez, /readyz, /metrics
@@ -24,8 +25,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.web.routes import geopose, jobs, lenses, localize, scenes, system
+from service.web.routes import geopose, jobs, lenses, localize, registrations, scenes, system
 
 router = APIRouter()
-for part in (localize, geopose, jobs, scenes, lenses, system):
+for part in (localize, geopose, jobs, scenes, registrations, lenses, system):
     router.include_router(part.router)

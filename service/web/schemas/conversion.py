@@ -7,13 +7,14 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from service.geodesy import geographic
 from service.geometry import quat_from_rotation
 from service.jobs.model import JobResult, SequenceFrame
 from service.lenses.lens_memory import RecalledLens
 from service.lenses.lens_store import StoredLens
+from service.registration.registration import Registration
 from service.results import HINTS, IterationRecord, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
-from service.geodesy import geographic
 from service.web.schemas.job_results import (
     Alternative,
     CandidatesOut,
@@ -42,6 +43,7 @@ from service.web.schemas.poses import (
     RegionOut,
     Transform,
 )
+from service.web.schemas.registrations import RegisteredOut
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Changes camera axes: OpenGL's y points up and its z backwards. It is its own inverse."""
@@ -80,6 +82,30 @@ def geopose_out(anchor: GeoAnchor, pose: Pose) -> GeoPose:
     (latitude, longitude, height), (w, x, y, z) = geographic(anchor, pose)
     position = GeoPosition(lat=latitude, lon=longitude, h=height)
     return GeoPose(position=position, quaternion=GeoQuaternion(x=x, y=y, z=z, w=w))
+
+
+def registered_out(registration: Registration, pose: Pose, covariance: np.ndarray | None) -> RegisteredOut:
+    """Convert a pose to the frame of its scene's registration; `covariance` is the pose's own, as a verdict's."""
+    placed = registration.placed(pose, covariance)
+    scale, own = registration.metres_per_unit, covariance
+    sigma_m = sigma_deg = None
+    # Without its own covariance a pose has no uncertainty that would mean anything.
+    if own is not None:
+        whole = own if placed is None else placed.covariance
+        metres = scale if placed is None else 1.0
+        sigma_m = None if metres is None else metres * float(np.sqrt(np.trace(whole[3:, 3:])))
+        sigma_deg = float(np.degrees(np.sqrt(np.trace(whole[:3, :3]))))
+    return RegisteredOut(
+        revision=registration.revision,
+        determined=list(registration.determined),
+        frame="local" if registration.origin is None else "enu",
+        metres_per_unit=scale,
+        metres_per_unit_sigma=registration.metres_per_unit_sigma,
+        target_from_camera=placed and transform_out(placed.pose.world_from_camera),
+        position_covariance=rows(placed.position_covariance) if placed and own is not None else None,
+        sigma_m=sigma_m,
+        sigma_deg=sigma_deg,
+    )
 
 
 def intrinsics_out(intrinsics: Intrinsics) -> IntrinsicsOut:
@@ -229,6 +255,7 @@ def result_out(result: JobResult) -> Result:
         pose=pose_out(estimate.pose),
         alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),
+        registered=result.registration and registered_out(result.registration, estimate.pose, verdict.covariance),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
         # Sent back, they are a start of an estimate, not a calibration.

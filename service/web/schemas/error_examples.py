@@ -84,6 +84,15 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         f"{_JOB}/iterations/12/render.jpg",
     ),
     (e.LensNotFound("you have no lens '0123456789abcdef'.", where="lens"), "/lenses/0123456789abcdef"),
+    (
+        e.RegistrationFailed(
+            "scale, up, heading, position can't be determined: all 4 places are one, as far as their noise tells.",
+            where="registration",
+            hint="Add places elsewhere, photos with poses, a length, or what is up.",
+        ),
+        f"{_SCENE}/registration",
+    ),
+    (e.RegistrationNotFound("the scene is not registered.", where="scene"), f"{_SCENE}/registration"),
     (e.JobNotReady("the job is running.", where="job"), f"{_JOB}/export/colmap"),
     (
         e.NoPose("the job found no pose that could be used.", where="job", hint="See its reason: GET /jobs/ID."),

@@ -17,11 +17,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from service.errors import InvalidIntrinsics, InvalidPrior, InvalidRequest, NoGeoAnchor
+from service.geodesy import pose_on_earth
 from service.photos.intrinsics import DISTORTION_COUNTS, ONE_FOCAL
 from service.scene_manager.status import SceneStatus
 from service.types import GeoAnchor
 from service.web.api_model import Model
-from service.geodesy import pose_on_earth
 from service.web.schemas.job_results import Result
 from service.web.schemas.poses import GeoPose
 from service.web.schemas.requests import PriorIn
@@ -212,7 +212,11 @@ def response_of(request: GeoPoseRequest, result: Result, anchor: GeoAnchor) -> G
     """Return the protocol's response to a result with a geopose."""
     assert result.geopose
     accuracy = None
-    if result.covariance is not None:
+    registered = result.registered
+    if registered and registered.sigma_m is not None and registered.sigma_deg is not None:
+        # Of three components each.
+        accuracy = GeoPoseAccuracy(position=registered.sigma_m / 3**0.5, orientation=registered.sigma_deg / 3**0.5)
+    elif result.covariance is not None:
         variance = np.diag(np.array(result.covariance.matrix))
         metres = _metres_per_unit(anchor)
         accuracy = GeoPoseAccuracy(

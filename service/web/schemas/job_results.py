@@ -17,6 +17,7 @@ from service.web.schemas.poses import (
     PoseOut,
     Transform,
 )
+from service.web.schemas.registrations import RegisteredOut
 
 
 class MatchesOut(Model):
@@ -140,7 +141,9 @@ class Result(Model):
     """Other poses that explain the photo, most probable first. If one of them is nearly as probable as `pose`, the
     result is `uncertain` and its reason `ambiguous`."""
     geopose: GeoPose | None
-    """The pose on Earth, for scenes whose manifest has a `geo_anchor`."""
+    """The pose on Earth, for scenes that are registered there, or whose manifest has a `geo_anchor`."""
+    registered: RegisteredOut | None = None
+    """The pose in metres, for scenes that are registered."""
     intrinsics: IntrinsicsOut
     """Camera model used for the whole upright photo."""
     intrinsics_source: IntrinsicsSource
