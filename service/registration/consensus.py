@@ -9,12 +9,13 @@ of the fit, is F-distributed. Fits with few observations so keep honest threshol
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float64
 
+from service.geometry import hat, so3_exp
 from service.registration.observations import Evidence, Observation
 from service.registration.quantiles import f_quantile
 from service.registration.similarity_fit import (
@@ -32,7 +33,7 @@ from service.registration.similarity_fit import (
 
 @dataclass(frozen=True, slots=True)
 class ConsensusConfig:
-    samples: int = 600
+    samples: int = 200
     """Minimal samples, at most; all of them where there are fewer."""
     refined: int = 4
     """The best samples, which are refined on their best halves."""
@@ -49,22 +50,16 @@ def agreeing(
     evidence: Evidence, rng: np.random.Generator, config: ConsensusConfig = CONSENSUS
 ) -> tuple[Fit, list[int]]:
     """Return the fit to the observations that agree, and their numbers. Needs at least one observation or direction."""
-    observations = evidence.observations
-    count, noise = len(observations), unknown_noise(observations)
-    everyone = list(range(count))
-    starts = list(_starts(evidence, rng, config))
+    count, noise = len(evidence.observations), unknown_noise(evidence.observations)
     half = count if count < 4 else max((count + 3) // 2, min(count - 1, 4))
-    trimmed = [np.sort(_distances(evidence, start, noise))[:half].sum() for start in starts]
-    best: tuple[float, list[int], Fit] | None = None
-    for index in np.argsort(trimmed)[: config.refined]:
-        order, fit = _concentrated(evidence, starts[index], noise, half)
-        score = float(np.sort(_distances(evidence, fit.similarity, noise))[:half].sum())
-        if best is None or score < best[0]:
-            best = score, order, fit
-    assert best is not None
-    _, order, core = best
+    starts = list(_starts(evidence, rng, config))
+    trimmed = [_trimmed(evidence, start, noise, half) for start in starts]
+    refined = [_concentrated(evidence, starts[i], noise, half) for i in np.argsort(trimmed)[: config.refined]]
+    core = min(refined, key=lambda fit: fit.cost)
     if count < 4:
+        everyone = list(range(count))
         return fit_similarity(evidence, everyone, core.similarity, noise), everyone
+    order = np.argsort(_distances(evidence, core.similarity, noise), kind="stable").tolist()
     core = fit_similarity(evidence, sorted(order[:half]), core.similarity, noise)
     core_variance = _variance(core)
     for size in range(count, half - 1, -1):
@@ -85,9 +80,13 @@ def _distances(evidence: Evidence, similarity: Similarity, noise: Noise) -> Floa
     return np.array(total)
 
 
-def _concentrated(evidence: Evidence, start: Similarity, noise: Noise, half: int) -> tuple[list[int], Fit]:
-    """Fit to the best half, and again to the half that then is best; return all by their residuals, and the fit."""
-    chosen: list[int] = []
+def _trimmed(evidence: Evidence, similarity: Similarity, noise: Noise, half: int) -> float:
+    return float(np.sort(_distances(evidence, similarity, noise))[:half].sum())
+
+
+def _concentrated(evidence: Evidence, start: Similarity, noise: Noise, half: int) -> Fit:
+    """Fit to the best half, and again to the half that then is best, until that stays."""
+    chosen: list[int] | None = None
     similarity = start
     for _ in range(5):
         order = np.argsort(_distances(evidence, similarity, noise), kind="stable").tolist()
@@ -96,8 +95,7 @@ def _concentrated(evidence: Evidence, start: Similarity, noise: Noise, half: int
         chosen = sorted(order[:half])
         fit = fit_similarity(evidence, chosen, similarity, noise, estimate_noise=False)
         similarity = fit.similarity
-    order = np.argsort(_distances(evidence, similarity, noise), kind="stable").tolist()
-    return order, fit
+    return fit
 
 
 def _floor(evidence: Evidence) -> float:
@@ -150,16 +148,19 @@ def _starts(evidence: Evidence, rng: np.random.Generator, config: ConsensusConfi
     seen = evidence.observations
     placed = [i for i, o in enumerate(seen) if o.position is not None]
     turned = [i for i, o in enumerate(seen) if o.target_from_camera is not None]
-    yield _of_all(evidence, placed, turned)
+    starting = _of_all(evidence, placed, turned)
+    yield starting
     fixed = evidence.metres_per_unit
     for i, j in _subsets(placed, 2, rng, config.samples):
         a, b = seen[i], seen[j]
-        yield from (_through(o, a, b, fixed) for o in (a, b) if o.target_from_camera is not None)
+        yield from (_scaled(_rotation(o), a, b, fixed) for o in (a, b) if o.target_from_camera is not None)
         if evidence.directions:
             yield _upright(evidence, a, b)
     if not turned:
         for triple in _subsets(placed, 3, rng, config.samples):
             yield umeyama(*_pairs(seen, triple), fixed)
+    if evidence.directions:
+        yield from (_facing(evidence, o, starting) for o in seen if o.heading is not None)
     for i in turned[: config.samples] if len(placed) < 2 else ():
         yield Similarity(_rotation(seen[i]), fixed or 1.0, np.zeros(3), np.zeros(3))
 
@@ -205,11 +206,6 @@ def _mean_rotation(rotations: Sequence[np.ndarray]) -> Float64[np.ndarray, "3 3"
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 
-def _through(turned: Observation, a: Observation, b: Observation, fixed: float | None) -> Similarity:
-    """Return the similarity by the rotation of one pose and the distance of two positions."""
-    return _scaled(_rotation(turned), a, b, fixed)
-
-
 def _upright(evidence: Evidence, a: Observation, b: Observation) -> Similarity:
     """Return the similarity by a known direction, about which it turns one position onto another."""
     direction = evidence.directions[0]
@@ -219,14 +215,23 @@ def _upright(evidence: Evidence, a: Observation, b: Observation) -> Similarity:
     # Both across the direction.
     level = np.eye(3) - np.outer(up, up)
     here, there = level @ first @ (b.position_in_world - a.position_in_world), level @ (b.position - a.position)
-    angle = np.arctan2(up @ np.cross(here, there), here @ there)
-    x, y, z = up
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    about = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return _scaled(about @ first, a, b, evidence.metres_per_unit)
+    angle = float(np.arctan2(up @ np.cross(here, there), here @ there))
+    return _scaled(so3_exp(angle * up) @ first, a, b, evidence.metres_per_unit)
+
+
+def _facing(evidence: Evidence, seen: Observation, similarity: Similarity) -> Similarity:
+    """Return the similarity turned about a known direction so that a photo has its heading."""
+    direction = evidence.directions[0]
+    first = turning(direction.in_world, direction.in_target)
+    assert seen.world_from_camera is not None
+    assert seen.heading is not None
+    x, y, _ = first @ seen.world_from_camera[:, 2]
+    # Azimuths run clockwise, rotations the other way.
+    return replace(similarity, rotation=so3_exp((np.arctan2(x, y) - seen.heading) * direction.in_target) @ first)
 
 
 def _scaled(rotation: np.ndarray, a: Observation, b: Observation, fixed: float | None) -> Similarity:
+    """Return the similarity by a rotation and two positions."""
     assert a.position is not None
     assert b.position is not None
     here = float(np.linalg.norm(a.position_in_world - b.position_in_world))
@@ -241,8 +246,7 @@ def turning(source: Float64[np.ndarray, "3"], target: Float64[np.ndarray, "3"]) 
     if cosine < -1 + 1e-9:  # opposite: half a turn about any axis across
         axis = np.linalg.svd(source[None])[2][1]
         return 2 * np.outer(axis, axis) - np.eye(3)
-    x, y, z = np.cross(source, target)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = hat(np.cross(source, target))
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 

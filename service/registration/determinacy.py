@@ -32,6 +32,7 @@ class DeterminacyConfig:
 
 
 DETERMINACY = DeterminacyConfig()
+_ROUNDING = 1e-9
 
 
 def determined(
@@ -41,15 +42,18 @@ def determined(
     fit's parameters, that of the wide prior in what isn't determined."""
     axes = principal_extents(fit, evidence, used)
     information = _information_without_noise(fit, evidence, used)
-    spread = max(axes[0] * fit.similarity.scale, fit.noise.position_sigma, 1e-12)
+    stated = [o.position_covariance for o in evidence.observations if o.position_covariance is not None]
+    noise = float(np.sqrt(np.max([np.trace(c) for c in stated]))) if stated else fit.noise.position_sigma
+    spread = max(axes[0] * fit.similarity.scale, noise, 1e-12)
     prior = np.array(
         [*3 * [config.prior_rotation], *3 * [config.prior_position * spread], config.prior_log_scale], np.float64
     )
     # Scaled by the prior, the matrix is well conditioned: nothing is lost by its inverse.
     covariance = np.linalg.inv(information * np.outer(prior, prior) + np.eye(PARAMETERS)) * np.outer(prior, prior)
+    if evidence.metres_per_unit is not None:
+        covariance[6], covariance[:, 6] = 0.0, 0.0
     parts: list[Part] = []
-    scale_sigma = 0.0 if evidence.metres_per_unit is not None else np.sqrt(covariance[6, 6])
-    if scale_sigma < config.log_scale:
+    if np.sqrt(covariance[6, 6]) < config.log_scale:
         parts.append("scale")
     up = np.array(evidence.up if evidence.up else (0.0, 0.0, 1.0))
     across = np.eye(3) - np.outer(up, up)
@@ -83,6 +87,8 @@ def _denoised(fit: Fit, evidence: Evidence, used: Sequence[int]) -> tuple[np.nda
     _, singular, vt = np.linalg.svd(places - centre)
     power = np.zeros(3)
     power[: len(singular)] = singular**2
+    # Below: rounding of the positions themselves.
+    power[power < len(places) * (_ROUNDING * np.abs(places).max()) ** 2] = 0.0
     noise = len(places) * _noise_variance(fit, evidence, numbers)
     left = np.maximum(power - noise, 0.0)
     shrink = np.sqrt(left / np.maximum(power, 1e-300))

@@ -66,7 +66,7 @@ class RegistrationFile:
             if path.stat().st_size > _MAX_BYTES:
                 raise CorruptScene(f"larger than {_MAX_BYTES} bytes.", where=path.name)
             return decode(History, path.read_text("utf-8"))
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return History()
         except (ValueError, KeyError, TypeError, AttributeError, OSError) as error:
             raise CorruptScene(

@@ -27,6 +27,7 @@ KINDS: tuple[Kind, ...] = ("position", "rotation", "heading")
 _SHARE_OF_SPREAD = 0.01
 """Noise of positions, relative to their spread, from which the estimate of an unknown one starts."""
 _STEPS = 40
+_NO_HAT = np.zeros((0, 0))
 _DAMPING = 1e-9
 """Relative to the diagonal: keeps what is undetermined where it was."""
 
@@ -99,9 +100,8 @@ class Fit:
     """Residuals over their standard deviations, uncorrelated if the model holds; block by block as `rows`."""
     jacobian: Float64[np.ndarray, "m 7"]
     """Whitened likewise."""
-    hat: Float64[np.ndarray, "m m"]
-    """Projection onto the columns of `jacobian`."""
-    drift_covariance: Float64[np.ndarray, "m m"]
+    hat: Float64[np.ndarray, "h h"]
+    """Projection onto the columns of `jacobian`; empty before the minimum is reached."""
 
     @property
     def information(self) -> Float64[np.ndarray, "7 7"]:
@@ -183,7 +183,9 @@ def _minimize(
             damping = max(10 * damping, 1e-4)
             if damping > 1e6:
                 break
-    return similarity, fit
+    # Not at each step: it costs more than the step.
+    projection = fit.jacobian @ np.linalg.pinv(fit.jacobian, rcond=1e-12) if len(fit.jacobian) else _NO_HAT
+    return similarity, replace(fit, hat=projection)
 
 
 def _free(evidence: Evidence) -> list[int]:
@@ -196,8 +198,7 @@ def _evaluated(evidence: Evidence, used: Sequence[int], similarity: Similarity, 
     residual = np.concatenate([row.residual for row in rows]) if rows else np.zeros(0)
     jacobian = np.concatenate([row.jacobian for row in rows]) if rows else np.zeros((0, PARAMETERS))
     jacobian = jacobian * np.isin(np.arange(PARAMETERS), _free(evidence))
-    drift = drift_covariance(rows, evidence, used, noise, size)
-    covariance = drift.copy()
+    covariance = _drift_covariance(rows, evidence, used, noise, size)
     at = 0
     for row in rows:
         end = at + len(row.residual)
@@ -205,8 +206,7 @@ def _evaluated(evidence: Evidence, used: Sequence[int], similarity: Similarity, 
         at = end
     lower = np.linalg.cholesky(covariance) if size else covariance
     whitened, white_jacobian = np.linalg.solve(lower, residual), np.linalg.solve(lower, jacobian)
-    projection = white_jacobian @ np.linalg.pinv(white_jacobian, rcond=1e-12) if size else np.zeros((0, 0))
-    return Fit(similarity, noise, tuple(rows), whitened, white_jacobian, projection, drift)
+    return Fit(similarity, noise, tuple(rows), whitened, white_jacobian, _NO_HAT)
 
 
 def _rows(evidence: Evidence, used: Sequence[int], similarity: Similarity, noise: Noise):
@@ -266,7 +266,7 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         yield Row("heading", number, np.array([error]), jacobian, np.array([[sigma**2]]))
 
 
-def drift_covariance(
+def _drift_covariance(
     rows: Sequence[Row], evidence: Evidence, used: Sequence[int], noise: Noise, size: int
 ) -> Float64[np.ndarray, "m m"]:
     """Return the covariance of residuals by drift: a random walk along the path, of positions and of rotations.
