@@ -224,6 +224,29 @@ def interrupted_geopose(s: SimpleNamespace) -> httpx.Response:
         return geopose(s)
 
 
+LENGTH = {"from_in_world": [0, 0, 0], "to_in_world": [1, 0, 0], "metres": 2}
+
+
+def register(s: SimpleNamespace, scene: str = "good", **places) -> httpx.Response:
+    return s.client.post(f"/scenes/{scene}/registration", json=places or {"lengths": [LENGTH]})
+
+
+def damaged_registration(s: SimpleNamespace, method: str) -> httpx.Response:
+    path = s.folder / "scenes" / "good" / "registration.json"
+    path.write_text("{")
+    try:
+        return s.client.request(method, "/scenes/good/registration")
+    finally:
+        path.unlink()
+
+
+def undo_with_full_disk(s: SimpleNamespace) -> httpx.Response:
+    assert register(s).status_code == 201
+    refused = with_full_disk(s, lambda: s.client.delete("/scenes/good/registration"))
+    (s.folder / "scenes" / "good" / "registration.json").unlink()
+    return refused
+
+
 # (operation, code) -> what provokes it; what is alike in all operations comes further down.
 PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("localize_photo", "invalid_request"): lambda s: send_photo(s, seed="x"),
@@ -284,6 +307,24 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ),
     ("render_scene", "invalid_intrinsics"): lambda s: render(s, intrinsics={}),
     ("render_scene", "invalid_prior"): lambda s: render(s, pose={}),
+    ("register_scene", "invalid_request"): lambda s: register(s, photos=[]),
+    ("register_scene", "bad_request"): lambda s: s.client.post(
+        "/scenes/good/registration", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("register_scene", "bad_input"): lambda s: register(fileless(s), "hall"),
+    ("register_scene", "job_not_found"): lambda s: register(s, photos=[{"job": "none", "x": 0, "y": 0, "z": 0}]),
+    ("register_scene", "job_not_ready"): lambda s: register(s, photos=[{"job": s.running, "x": 0, "y": 0, "z": 0}]),
+    ("register_scene", "registration_failed"): lambda s: register(
+        s, points=[{"in_world": [0, 0, 0], "x": 1, "y": 2, "z": 3}] * 4
+    ),
+    ("register_scene", "storage_failed"): lambda s: with_full_disk(s, lambda: register(s)),
+    ("get_registration", "scene_not_found"): lambda s: s.client.get("/scenes/none/registration"),
+    ("get_registration", "registration_not_found"): lambda s: s.client.get("/scenes/good/registration"),
+    ("get_registration", "corrupt_scene"): lambda s: damaged_registration(s, "GET"),
+    ("undo_registration", "scene_not_found"): lambda s: s.client.delete("/scenes/none/registration"),
+    ("undo_registration", "registration_not_found"): lambda s: s.client.delete("/scenes/good/registration"),
+    ("undo_registration", "corrupt_scene"): lambda s: damaged_registration(s, "DELETE"),
+    ("undo_registration", "storage_failed"): undo_with_full_disk,
     ("delete_lens", "lens_not_found"): lambda s: s.client.delete("/lenses/0123456789abcdef"),
     ("delete_lens", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses/0")),
     ("delete_lenses", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses")),
@@ -299,6 +340,7 @@ for _code, _scene in SCENES.items():
         ("scene_thumbnail", _code): lambda s, scene=_scene: s.client.get(f"/scenes/{scene}/thumbnail.jpg"),
         ("scene_splats", _code): lambda s, scene=_scene: s.client.get(f"/scenes/{scene}/splats"),
         ("render_scene", _code): lambda s, scene=_scene: render(s, scene),
+        ("register_scene", _code): lambda s, scene=_scene: register(s, scene),
     }
 for _name in ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose"):
     PROVOKED[_name, "job_not_found"] = lambda s, name=_name: plainly(s.client, name, job="none")
@@ -349,6 +391,8 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
         "scene_exists": "upload_scene",
         "no_keys": "make_token",
         "lens_not_found": "delete_lens",
+        "registration_failed": "register_scene",
+        "registration_not_found": "get_registration",
         "interrupted": "see test_durable",
     },
 }

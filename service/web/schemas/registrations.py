@@ -7,7 +7,6 @@ from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from annotated_types import Len
 from pydantic import Field
 
 from service.errors import InvalidRequest
@@ -21,7 +20,7 @@ from service.types import Pose
 from service.web.api_model import Model
 from service.web.schemas.poses import Matrix, Transform
 
-Point = Annotated[list[float], Len(3, 3)]
+Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class PlaceIn(Model):
