@@ -20,12 +20,14 @@ from service.cli.terminal import (
     print_json,
     read_file,
     say,
+    scene_registrations,
 )
 from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from service.jobs.model import JobRecord
     from service.localize import LoadedScene
+    from service.registration.registration import Registration
     from service.results import Status
     from service.web.schemas.job_results import Result
     from service.web.schemas.request_body import Body
@@ -97,12 +99,13 @@ def localize(
         _require_one_scene(paths)
     # Last: faults of photos and fields are reported without waiting for it.
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
+    registrations = scene_registrations(paths, loaded)
     output = _Output(as_json, csv_file, tum_file, smooth)
     if track_camera:
-        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], output)
+        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], registrations, output)
     else:
         bodies = [Body(data, name, {}) for name, data in files]
-        statuses = _localize_each(bodies, fields, loaded, output, learn_lenses=learn_lenses)
+        statuses = _localize_each(bodies, fields, loaded, registrations, output, learn_lenses=learn_lenses)
     if fail and any(status != Status.LOCALIZED for status in statuses):
         raise typer.Exit(1)
 
@@ -132,7 +135,13 @@ def _require_one_scene(paths: list[Path]) -> None:
 
 
 def _localize_each(
-    bodies: list[Body], fields: LocalizeFields, loaded: list[LoadedScene], output: _Output, *, learn_lenses: bool
+    bodies: list[Body],
+    fields: LocalizeFields,
+    loaded: list[LoadedScene],
+    registrations: list[Registration | None],
+    output: _Output,
+    *,
+    learn_lenses: bool,
 ) -> list[Status]:
     """Localize every photo by itself, in the one scene or in each of several; return their statuses."""
     from service.cli import result_tables
@@ -149,7 +158,7 @@ def _localize_each(
         spec = job_spec(fields)
         recall = partial(lenses.recall, "", None) if lenses else None
         photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb, recall=recall)
-        result, _ = run_task(photo.task(spec), loaded)
+        result, _ = run_task(photo.task(spec), loaded, registrations=registrations)
         if lenses:
             lenses.learn("", None, photo.camera, photo.recalled, result.estimate)
         results.append((body.name, result_out(result)))
@@ -164,7 +173,9 @@ def _localize_each(
     return [result.status for _, result in results]
 
 
-def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, output: _Output) -> list[Status]:
+def _localize_sequence(
+    body: Body, fields: LocalizeFields, loaded: LoadedScene, registrations: list[Registration | None], output: _Output
+) -> list[Status]:
     """Track the camera of a video, or of photos in their order, through a scene; return the frames' statuses."""
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
@@ -184,7 +195,7 @@ def _localize_sequence(body: Body, fields: LocalizeFields, loaded: LoadedScene, 
         if record.frame and not output.as_json:
             say(result_tables.frame_line(frame_out(record.frame)))
 
-    found, _ = run_task(photo.task(spec), [loaded], show)
+    found, _ = run_task(photo.task(spec), [loaded], show, registrations=registrations)
     result = result_out(found)
     if output.as_json:
         print_json({"photo": body.name, **result.model_dump(mode="json")})

@@ -1,4 +1,4 @@
-"""`splatfix scenes list | inspect`: what scenes there are, and what is in one."""
+"""`splatfix scenes list | inspect | register`: what scenes there are, what is in one, and where it is."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
+from service.cli.scenes_register import register_scene
 from service.cli.terminal import err, print_json, say
 
-scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes.")
+scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes, and register them.")
+scenes_app.command("register")(register_scene)
 
 
 @scenes_app.command("list")

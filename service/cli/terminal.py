@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,6 +15,7 @@ from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from service.localize import LoadedScene
+    from service.registration.registration import Registration
     from service.web.settings import Settings
 
 out, err = Console(), Console(stderr=True)
@@ -81,6 +82,21 @@ def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -
             status.update("preparing")
             loaded.prepare(estimator)
     return loaded
+
+
+def scene_registrations(paths: Sequence[Path], loaded: Sequence[LoadedScene]) -> list[Registration | None]:
+    """Return the registrations in force of loaded scenes."""
+    from service.scene_manager.scene_registrations import SceneRegistrations
+
+    known = SceneRegistrations(registrations_folder())
+    return [known.of(path, scene.scene.info) for path, scene in zip(paths, loaded, strict=True)]
+
+
+def registrations_folder() -> Path:
+    """Return the data folder, where registrations are that can't be beside their scenes."""
+    from service.web.settings import DATA_HOME
+
+    return settings_of({}).data_dir or DATA_HOME
 
 
 def scene_arguments(given: list[str], named_by_photos: bool = False) -> dict[str, tuple[Path, Path | None]]:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from io import BytesIO
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -77,6 +77,15 @@ class OpenedPhoto:
     image: Image.Image
     camera: CameraIdentity
     """What the header tells of its camera."""
+
+    @property
+    def gps(self) -> dict[int, Any]:
+        """EXIF's GPS directory, values by tag; empty if there is none. Nothing of it is checked."""
+        try:
+            return dict(_exif(self.image).get_ifd(ExifTags.IFD.GPSInfo))
+        except Exception as error:  # whatever a hostile file makes Pillow raise
+            log.info("GPS ignored: %s", _short(error))
+            return {}
 
     def query(
         self,

@@ -37,7 +37,7 @@ class ConsensusConfig:
     """Minimal samples, at most; all of them where there are fewer."""
     refined: int = 4
     """The best samples, which are refined on their best halves."""
-    false_rejection: float = 0.01
+    false_rejection: float = 0.001
     """Probability of calling any observation an outlier where there is none."""
     masked: float = 30.0
     """Ratio of the variance of all to that of the best half above which several outliers hide one another."""
