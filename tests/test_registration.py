@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -170,6 +172,12 @@ def test_the_covariance_of_a_placed_pose_is_that_of_its_parts():
         samples.append((moved.matrix @ at)[:3])
     assert np.cov(np.array(samples).T) == pytest.approx(placed.position_covariance, rel=0.2, abs=2e-4 * truth.scale**2)
     assert placed.pose.position_in_world == pytest.approx((truth.matrix @ [1, 2, 0.5, 1])[:3])
+
+
+def test_the_worked_example_prints_what_the_page_says(capsys):
+    text = (Path(__file__).parents[1] / "docs" / "registration.md").read_text("utf-8")
+    exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})
+    assert f"```text\n{capsys.readouterr().out}```" in text
 
 
 def complete() -> Registration:

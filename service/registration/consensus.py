@@ -117,6 +117,7 @@ def _outliers(fit: Fit, evidence: Evidence, used: Sequence[int], config: Consens
     """Return the observations that the others contradict: externally studentized residuals, by kind."""
     observations = [evidence.observations[i] for i in used]
     owners = np.concatenate([np.full(len(row.residual), row.owner) for row in fit.rows])
+    shares = {(row.owner, row.kind): row.localized_share for row in fit.rows}
     found = []
     for kind in KINDS:
         mine = fit.of_kind(kind)
@@ -135,9 +136,10 @@ def _outliers(fit: Fit, evidence: Evidence, used: Sequence[int], config: Consens
             explained = float(residual @ np.linalg.solve(kept, residual))
             variance = max(square - explained, 0.0) / freedom
             limit = f_quantile(1 - config.false_rejection / len(used), size, freedom)
-            if is_stated(kind, observations) and variance * fit.noise.factors[kind] ** 2 < 1:
-                variance = 1 / fit.noise.factors[kind] ** 2
-                limit = f_quantile(1 - config.false_rejection / len(used), size, 1e7)
+            # Noise that is stated, in the target or by localization, is there even where the others agree better.
+            stated = 1 / fit.noise.factors[kind] ** 2 if is_stated(kind, observations) else shares[number, kind]
+            if variance < stated:
+                variance, limit = stated, f_quantile(1 - config.false_rejection / len(used), size, 1e7)
             if explained / size > limit * variance:
                 found.append(number)
     return found

@@ -87,6 +87,8 @@ class Row:
     residual: Float64[np.ndarray, "k"]
     jacobian: Float64[np.ndarray, "k 7"]
     covariance: Float64[np.ndarray, "k k"]
+    localized_share: float = 0.0
+    """Of the covariance, what localization states: the rest may be estimated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,9 +245,10 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         stated = seen.position_covariance
         target = noise.position_sigma**2 * np.eye(3) if stated is None else stated
         covariance = target * noise.factors["position"] ** 2
-        covariance = covariance + scale**2 * rotation @ seen.world_covariance @ rotation.T
+        own = scale**2 * rotation @ seen.world_covariance @ rotation.T
         jacobian = np.concatenate([-hat(arm), np.eye(3), arm[:, None]], 1)
-        yield Row("position", number, arm + similarity.shift - seen.position, jacobian, covariance)
+        error = arm + similarity.shift - seen.position
+        yield Row("position", number, error, jacobian, covariance + own, _share(own, covariance))
     if seen.world_from_camera is None:
         return
     turned = rotation @ seen.world_from_camera
@@ -253,8 +256,8 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         sigma = (seen.rotation_sigma or noise.rotation_sigma) * noise.factors["rotation"]
         error = so3_log(turned @ seen.target_from_camera.T)
         jacobian = np.concatenate([np.eye(3), np.zeros((3, 4))], 1)
-        covariance = sigma**2 * np.eye(3) + turned @ seen.turn_covariance @ turned.T
-        yield Row("rotation", number, error, jacobian, covariance)
+        covariance, own = sigma**2 * np.eye(3), turned @ seen.turn_covariance @ turned.T
+        yield Row("rotation", number, error, jacobian, covariance + own, _share(own, covariance))
     if seen.heading is not None:
         x, y, _ = turned[:, 2]
         level = max(float(np.hypot(x, y)), 1e-3)
@@ -264,6 +267,10 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         # The nearer to straight up or down, the less its azimuth means.
         sigma = seen.heading_sigma * noise.factors["heading"] / level
         yield Row("heading", number, np.array([error]), jacobian, np.array([[sigma**2]]))
+
+
+def _share(own: Float64[np.ndarray, "3 3"], other: Float64[np.ndarray, "3 3"]) -> float:
+    return float(np.trace(own) / (np.trace(own) + np.trace(other)))
 
 
 def _drift_covariance(
