@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import hashlib
 import io
 import json
@@ -90,6 +91,49 @@ def test_json_and_form_are_the_same_request(shared):
         job["result"].pop("timings")
     assert by_json == by_form
     assert by_form["result"]["intrinsics_source"] == "given"
+
+
+@pytest.mark.parametrize("form", ["data:image/jpeg;base64,{}", "lines", "url", "unpadded"])
+def test_a_photo_is_taken_in_every_form_of_base64(shared, form):
+    data = photo()
+    text = base64.b64encode(data).decode()
+    if form == "lines":  # RFC 2045, as Android's default
+        text = base64.encodebytes(data).decode()
+    elif form == "url":
+        text = base64.urlsafe_b64encode(data).decode()
+        assert text != base64.b64encode(data).decode()
+    else:
+        text = form.format(text) if "{" in form else text.rstrip("=")
+    answer = shared.post("/localize", json={"photo": text, "scene": "room"}, headers={"Prefer": "wait=20"})
+    assert (answer.status_code, answer.json()["state"]) == (200, "succeeded")
+
+
+def test_a_packed_body_is_refused_by_the_name_of_its_encoding(shared):
+    answer = shared.post(
+        "/localize",
+        content=gzip.compress(b"{}"),
+        headers={"Content-Type": "application/json", "Content-Encoding": "gzip"},
+    )
+    assert answer.status_code == 415
+    assert "Content-Encoding 'gzip'" in answer.json()["detail"]
+
+
+def test_a_quaternion_of_another_length_is_told_where_it_is(shared):
+    answer = post(shared, prior={"position": [0, 0, 0], "quaternion_wxyz": [0, 0, 0, 0]})
+    assert (answer.status_code, answer.json()["where"]) == (422, "prior.quaternion_wxyz")
+
+
+@pytest.mark.parametrize("path", ["/livez", "/readyz", "/", "/scenes", "/scenes/room/thumbnail.jpg"])
+def test_head_has_the_head_of_get_and_no_body(shared, path):
+    got, head = shared.get(path), shared.head(path)
+    assert (head.status_code, head.content) == (got.status_code, b"")
+    assert head.headers["content-type"] == got.headers["content-type"]
+    assert head.headers["content-length"] == got.headers["content-length"]
+
+
+def test_head_of_a_stream_ends(shared):
+    job = post(shared).json()
+    assert shared.head(job["links"]["events"]).headers["content-type"].startswith("text/event-stream")
 
 
 def test_prefer_wait_answers_at_once_or_accepts(client, stepping):

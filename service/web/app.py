@@ -39,6 +39,7 @@ from service.web.api_keys import VIEWER_KEY, KeyRing
 from service.web.api_page import add_api_page
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
+from service.web.middleware.head_requests import HeadRequests
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Proxy
 from service.web.middleware.route_lookup import RouteLookup
@@ -162,6 +163,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Me
             allow_headers=["*"],
             expose_headers=["Location", "Retry-After"],
         )
+    app.add_middleware(HeadRequests)
     app.add_middleware(Proxy, metrics=metrics, default_root=settings.root_path, send_s=settings.send_s)
 
 

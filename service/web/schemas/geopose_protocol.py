@@ -7,7 +7,6 @@ prior; with an accuracy it is a Gaussian. Readings of other sensors are accepted
 
 from __future__ import annotations
 
-import base64
 import math
 import time
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from service.types import GeoAnchor
 from service.web.api_model import Model
 from service.web.schemas.job_results import Result
 from service.web.schemas.poses import GeoPose
+from service.web.schemas.request_body import decoded_base64
 from service.web.schemas.requests import PriorIn
 
 _EARTH_M = 6_371_000.0
@@ -128,11 +128,7 @@ def image_of(request: GeoPoseRequest) -> tuple[bytes, dict[str, Any] | None]:
     if not request.sensorReadings.cameraReadings:
         raise InvalidRequest("at least one is required.", where="sensorReadings.cameraReadings")
     reading = request.sensorReadings.cameraReadings[0]
-    try:
-        data = base64.b64decode(reading.imageBytes, validate=True)
-    except ValueError as error:
-        raise InvalidRequest(f"not base64: {error}.", where="cameraReadings.0.imageBytes") from error
-    return data, _intrinsics(reading)
+    return decoded_base64(reading.imageBytes, "cameraReadings.0.imageBytes"), _intrinsics(reading)
 
 
 def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:

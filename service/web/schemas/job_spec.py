@@ -165,7 +165,7 @@ def pose_from(given_pose: PoseIn, where: str) -> Pose:
     try:
         pose = _as_given(given_pose)
     except InvalidPrior as error:
-        error.where = f"{where}.{given[0]}"
+        error.where = f"{where}.{error.where if error.where == 'quaternion_wxyz' else given[0]}"
         raise
     # A given camera_from_world was read as if it were world_from_camera, so its inverse is the pose.
     matrix = pose.camera_from_world if given_pose.camera_from_world else pose.world_from_camera
@@ -178,7 +178,7 @@ def _as_given(given: PoseIn) -> Pose:
         return Pose(np.array(given.world_from_camera or given.camera_from_world, np.float64))
     # 1e-3, as for matrices: accepts numbers printed with 3 or 4 digits. NaN fails the comparison.
     if not abs(np.linalg.norm(given.quaternion_wxyz) - 1) < 1e-3:
-        raise InvalidPrior("quaternion_wxyz must have length 1.")
+        raise InvalidPrior("quaternion_wxyz must have length 1.", where="quaternion_wxyz")
     matrix = np.eye(4)
     matrix[:3, :3] = rotation_from_quat(np.array(given.quaternion_wxyz))
     matrix[:3, 3] = given.position

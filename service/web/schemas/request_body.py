@@ -18,6 +18,7 @@ from service.jobs.read_photo import MAX_FRAMES
 from service.photos.sequence import is_packed, is_sequence, packed
 from service.web.schemas.requests import FIELD_ERRORS, LocalizeIn
 
+_URL_SAFE = str.maketrans("-_", "+/")
 _FIELDS = frozenset(LocalizeIn.model_fields)
 
 
@@ -35,6 +36,9 @@ class Body:
 
 async def read_body(request: Request, max_frames: int = MAX_FRAMES) -> Body:
     """Read a multipart form or a JSON body. Raises InvalidRequest, InvalidImage; HTTPException 415 for other types."""
+    encoding = request.headers.get("content-encoding", "identity").strip().lower()
+    if encoding != "identity":
+        raise HTTPException(415, f"Send the body as it is: Content-Encoding '{encoding[:40]}' is not read.")
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type == "multipart/form-data":
         return await _form_body(request, max_frames)
@@ -71,11 +75,23 @@ def _json_body(text: bytes) -> Body:
     photo = value.pop("photo", None)
     if not isinstance(photo, str):
         raise InvalidRequest("the photo as base64 text is required here.", where="photo")
+    return body_of([("", decoded_base64(photo, "photo"))], {name: v for name, v in value.items() if v is not None})
+
+
+def decoded_base64(text: str, where: str) -> bytes:
+    """Decode base64 in any of its forms: in lines (RFC 2045), URL-safe, unpadded, or as a data URI. Raises InvalidRequest.
+
+    Browsers, Android and command-line tools each write another one.
+    """
+    if text.startswith("data:"):
+        head, comma, text = text.partition(",")
+        if not comma or not head.endswith(";base64"):
+            raise InvalidRequest("a data URI that is not base64.", where=where)
+    digits = "".join(text.split()).translate(_URL_SAFE).rstrip("=")
     try:
-        data = base64.b64decode(photo, validate=True)
+        return base64.b64decode(digits + "=" * (-len(digits) % 4), validate=True)
     except ValueError as error:
-        raise InvalidRequest(f"not base64: {error}.", where="photo") from error
-    return body_of([("", data)], {name: v for name, v in value.items() if v is not None})
+        raise InvalidRequest(f"not base64: {error}.", where=where) from error
 
 
 def body_of(files: Sequence[tuple[str, bytes]], fields: Mapping[str, Any]) -> Body:
