@@ -38,6 +38,7 @@ from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
+from service.scene_origin import estimate_in_world, query_in_scene, record_in_world
 from service.types import GaussianScene, Pose, Query
 
 DEFAULT_ESTIMATOR = "view_index"
@@ -201,7 +202,28 @@ def localize(
     request: Request | None = None,
     on_record: Callable[[IterationRecord], None] | None = None,
 ) -> PoseEstimate:
-    """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing."""
+    """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing.
+
+    Poses are in the world, those of the query and of what is returned and reported.
+    """
+    origin = loaded.scene.info.origin_in_world
+    if not any(origin):
+        return localize_in_scene(query, loaded, request, on_record)
+
+    def report(record: IterationRecord) -> None:
+        if on_record:
+            on_record(record_in_world(record, origin))
+
+    return estimate_in_world(localize_in_scene(query_in_scene(query, origin), loaded, request, report), origin)
+
+
+def localize_in_scene(
+    query: Query,
+    loaded: LoadedScene,
+    request: Request | None = None,
+    on_record: Callable[[IterationRecord], None] | None = None,
+) -> PoseEstimate:
+    """Localize as `localize` does, with all positions relative to the scene's origin (`service/scene_origin.py`)."""
     request = request or Request()
     loaded = loaded.as_seen_by(query)
     plugin = ESTIMATORS.load(request.estimator)

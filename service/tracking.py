@@ -28,7 +28,7 @@ from service.localize import (
     LoadedScene,
     Request,
     estimate_of,
-    localize,
+    localize_in_scene,
     rasterizer_for,
     render_and_verify,
 )
@@ -44,6 +44,7 @@ from service.pose.verification.gate import VERIFICATION, VerificationConfig, pho
 from service.pose.verification.signals import geometry_signals
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
+from service.scene_origin import estimate_in_world, query_in_scene
 from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, LensPrior, Pose, Query
 
 
@@ -126,6 +127,13 @@ class Tracker:
         The photos' intrinsics are one camera's: what one of them adds to approximate ones holds for the next. Raises
         what `localize` raises.
         """
+        origin = self._loaded.scene.info.origin_in_world
+        if not any(origin):
+            return self._track(query, time_s)
+        return estimate_in_world(self._track(query_in_scene(query, origin), time_s), origin)
+
+    def _track(self, query: Query, time_s: float | None) -> PoseEstimate:
+        """Track with positions relative to the scene's origin."""
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled
         self._loaded = self._loaded.as_seen_by(query)
@@ -190,7 +198,7 @@ class Tracker:
         """Localize the photo like a single one, with the expected pose as prior; return the better answer."""
         seconds, renders = self._left()
         request = replace(self._request, budget_s=seconds, budget_renders=renders)
-        found = localize(replace(query, prior=expected or query.prior), self._loaded, request)
+        found = localize_in_scene(replace(query, prior=expected or query.prior), self._loaded, request)
         if followed is not None:
             spent = {"timings": followed.timings + found.timings, "renders": followed.renders + found.renders}
             # Both were verified by the same gate, so their scores compare.

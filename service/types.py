@@ -241,6 +241,10 @@ class SceneInfo:
     """Long side of the training photos, where the focal length is unknown."""
     geo_anchor: GeoAnchor | None = None
     warnings: tuple[str, ...] = ()
+    origin_in_world: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What positions inside of the scene are relative to; see `service/scene_origin.py`."""
+    near_plane: float = 0.01
+    """Units: nothing nearer to a camera is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +252,7 @@ class GaussianScene:
     """Gaussians with activated values: no exp or sigmoid left to do. In memory, read-only."""
 
     means: Float32[np.ndarray, "n 3"]
-    """World frame."""
+    """World frame, less `info.origin_in_world`; so are the cameras."""
     quats: Float32[np.ndarray, "n 4"]
     """Unit, wxyz, world_from_gaussian."""
     scales: Float32[np.ndarray, "n 3"]

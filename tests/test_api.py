@@ -530,7 +530,7 @@ BAD_FIELDS = [
     ({"prior": {"camera_from_world": MIRRORED}}, 422, "invalid_prior", "prior.camera_from_world"),
     ({"prior": {"world_from_camera": [[1]]}}, 422, "invalid_prior", None),
     ({"prior": '{"position": [0, 0, NaN], "quaternion_wxyz": [1, 0, 0, 0]}'}, 422, "invalid_prior", "prior.position"),
-    ({"prior": {"position": [0, 0, 0], "quaternion_wxyz": [2, 0, 0, 0]}}, 422, "invalid_prior", "prior.position"),
+    ({"prior": {"position": [0] * 3, "quaternion_wxyz": [2, 0, 0, 0]}}, 422, "invalid_prior", "prior.quaternion_wxyz"),
     ({"prior": {"position": [0, 0, 0]}}, 422, "invalid_prior", "prior"),
     ({"prior": {}}, 422, "invalid_prior", "prior"),
     ({"prior": {"box": [[0, 0, 0]]}}, 422, "invalid_prior", "prior.box"),

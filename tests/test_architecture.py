@@ -24,7 +24,7 @@ FLOORS = {
             *("types", "results", "errors", "plugins", "logs", "versions", "distortion", "client", "codec"),
             "operating_system",
         },
-        {"interfaces", "geometry", "geodesy", "jit", "photos"},
+        {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
         {"localize"},

@@ -128,10 +128,11 @@ def test_what_no_route_serves_is_denied(locked, keys, method, path):
 def test_head_and_options_have_the_policy_of_get(keys, method):
     app = create_app(settings(estimator="view_index", keys_file=keys["file"]))
     app.add_api_route("/more", declare(lambda: None, RoutePolicy(role="localize")))
-    assert status_of_head(app, method, "/livez") == 405
+    served = 200 if method == "HEAD" else 405
+    assert status_of_head(app, method, "/livez") == served
     assert status_of_head(app, method, "/more") == 401
     assert status_of_head(app, method, "/more", keys["read"]) == 403
-    assert status_of_head(app, method, "/more", keys["localize"]) == 405
+    assert status_of_head(app, method, "/more", keys["localize"]) == served
 
 
 def test_a_socket_where_no_route_is_is_denied(locked):

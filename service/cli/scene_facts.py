@@ -25,7 +25,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
     rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(scene)
     info = scene.info
     # Quantiles: a few stray Gaussians would make the bounds meaningless.
-    low, high = np.quantile(scene.means, [0.01, 0.99], axis=0)
+    low, high = np.quantile(scene.means, [0.01, 0.99], axis=0) + info.origin_in_world
     facts: dict[str, Any] = {
         "id": info.id,
         "name": info.name,
@@ -35,7 +35,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "sh_degree": scene.sh_degree,
         "render_mode": info.render_mode,
         "memory_bytes": {"scene": scene.nbytes, "renderer": rasterizer.nbytes},
-        "bounds": [scene.means.min(0).tolist(), scene.means.max(0).tolist()],
+        "bounds": [(end + np.array(info.origin_in_world)).tolist() for end in (scene.means.min(0), scene.means.max(0))],
         "middle_98_percent": [low.tolist(), high.tolist()],
         "extent": float(np.linalg.norm(high - low)),
         "floaters": floaters(scene),

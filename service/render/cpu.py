@@ -38,8 +38,6 @@ class RenderConfig:
 
     dilation_px2: float = 0.3
     """Added to the covariance in the image, at the training resolution (3DGS, Kerbl et al. 2023, section 6)."""
-    near: float = 0.01
-    """Scene units; gsplat's default."""
     assumed_training_long_side_px: int = 1000
     """Where neither training cameras nor the manifest have the resolution that a scene was trained at."""
     approximate_t_min: float = 0.03
@@ -219,8 +217,8 @@ class CpuRasterizer:
         tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
         s.visible, count = project(
             packed.geometry, packed.sh, packed.spheres, packed.sh_degree,
-            *_view_and_intrinsics(camera), k.width, k.height, *self._dilation(camera), np.float32(DEFAULTS.near),
-            tile_depths, s.records, s.depths, s.rects, s.local,
+            *_view_and_intrinsics(camera), k.width, k.height, *self._dilation(camera),
+            np.float32(self.scene.info.near_plane), tile_depths, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:

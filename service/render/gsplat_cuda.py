@@ -26,7 +26,7 @@ from torch import Tensor
 
 from service.errors import BackendMissing
 from service.interfaces import Frame, SceneGradients
-from service.render.cpu import DEFAULTS, dilation_for
+from service.render.cpu import dilation_for
 from service.types import Camera, GaussianScene
 
 TILE = 16
@@ -220,7 +220,7 @@ class GsplatRasterizer:
             Ks=self._tensor(lenses),
             width=k.width,
             height=k.height,
-            near_plane=DEFAULTS.near,
+            near_plane=info.near_plane,
             eps2d=dilation_for(cameras[0], info),
             sh_degree=self.scene.sh_degree,
             packed=False,  # the median depth indexes the unpacked form

@@ -24,7 +24,7 @@ from service.scene_formats.folder import load_scene
 from service.scene_formats.layouts import files_of
 from service.types import Camera, GaussianScene, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
 
-_VERSION = 2
+_VERSION = 3
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ def _camera(facts: dict[str, Any]) -> NamedCamera:
 
 
 def _info(facts: dict[str, Any]) -> SceneInfo:
-    for name in ("background_rgb", "up_in_world", "warnings"):
+    for name in ("background_rgb", "up_in_world", "warnings", "origin_in_world"):
         facts[name] = facts[name] if facts[name] is None else tuple(facts[name])
     anchor = facts["geo_anchor"]
     if anchor:

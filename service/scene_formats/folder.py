@@ -19,7 +19,9 @@ from service.scene_formats.inria import read_cameras as read_inria_cameras
 from service.scene_formats.layouts import COLMAP_FOLDER, scene_file
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
 from service.scene_formats.nerfstudio import TransformsFile, transforms_path
+from service.scene_formats.recentring import extent_of, near_plane_for, origin_for, recentred
 from service.scene_formats.similarity import moved_gaussians, moved_pose
+from service.scene_origin import shifted_camera
 from service.types import GaussianScene, NamedCamera, SceneInfo
 
 _ELSEWHERE = (".", "sparse", "sparse/*", "colmap/sparse/*", "dense/sparse", "dense/sparse/*", "distorted/sparse/*")
@@ -56,6 +58,10 @@ def load_scene(
     if manifest.world_from_scene is not None:
         raw = moved_gaussians(raw, manifest.world_from_scene)
         used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
+    extent = extent_of(raw)
+    origin = origin_for(extent)
+    raw, back = recentred(raw, origin), -np.array(origin)
+    used = tuple(shifted_camera(camera, back) for camera in used) if any(origin) else used
     info = SceneInfo(
         id=_scene_id(path),
         name=manifest.name or _scene_id(path),
@@ -70,6 +76,8 @@ def load_scene(
         training_long_side_px=max(size) if size else None,
         geo_anchor=manifest.geo_anchor,
         warnings=(*raw.warnings, *found.warnings),
+        origin_in_world=origin,
+        near_plane=near_plane_for(extent),
     )
     log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)

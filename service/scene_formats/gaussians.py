@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 
 from service.errors import CorruptScene
 from service.types import SH_C0
@@ -26,7 +26,8 @@ _ARRAYS = ("means", "scales", "opacities", "sh", "quats")
 class RawGaussians:
     """A file's Gaussians with activated values (scales, not logarithms), in the file's own frame, not checked yet."""
 
-    means: Float32[np.ndarray, "n 3"]
+    means: Float32[np.ndarray, "n 3"] | Float64[np.ndarray, "n 3"]
+    """float64 where the file has more digits than float32 holds."""
     quats: Float32[np.ndarray, "n 4"]
     """wxyz, of any length."""
     scales: Float32[np.ndarray, "n 3"]

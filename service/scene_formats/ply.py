@@ -60,6 +60,8 @@ def _activated(path: Path, header: PlyHeader, count: int, degree: int, per_chann
     names = set(_names(header))
     columns = _COLUMNS | ({"filter": [_FILTER]} if _FILTER in names else {})
     values = {name: np.empty((count, len(listed)), np.float32) for name, listed in columns.items()}
+    if header.has_doubles("vertex", _COLUMNS["means"]):
+        values["means"] = np.empty((count, 3), np.float64)
     sh = np.empty((count, (degree + 1) ** 2, 3), np.float32)
     with np.errstate(over="ignore", invalid="ignore"):  # what overflows is left out by `checked`
         # In blocks, straight to where they belong: a large file is never twice in memory.

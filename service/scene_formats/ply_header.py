@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import BufferedReader
 from itertools import islice
@@ -50,6 +50,11 @@ class PlyHeader:
     def element(self, name: str) -> PlyElement | None:
         """Return the element of this name, if there is one."""
         return next((e for e in self.elements if e.name == name), None)
+
+    def has_doubles(self, element: str, properties: Sequence[str]) -> bool:
+        """Whether one of an element's properties has 8 bytes."""
+        found = self.element(element)
+        return found is not None and found.dtype is not None and any(found.dtype[p].itemsize == 8 for p in properties)
 
 
 def read_header(path: Path) -> PlyHeader:

@@ -21,7 +21,7 @@ def moved_gaussians(raw: RawGaussians, world_from_scene: Float64[np.ndarray, "4 
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return replace(
         raw,
-        means=means.astype(np.float32),
+        means=means,
         quats=(raw.quats @ left.T).astype(np.float32),
         scales=(raw.scales * scale).astype(np.float32),
         sh=_rotated_sh(raw.sh, rotation),

@@ -32,6 +32,7 @@ from service.errors import (
 from service.localize import DEFAULT_MATCHER, LoadedScene
 from service.scene_manager.status import AUTO, SceneContents, SceneReadiness, SceneState, SceneStatus
 from service.scene_manager.warm_up import warm_up
+from service.scene_origin import shifted_camera
 
 _log = logging.getLogger(__name__)
 
@@ -155,8 +156,9 @@ class Scenes:
         if loaded is None:
             return None
         scene = loaded.scene
-        bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) if scene.count else None
-        return SceneContents(scene.cameras, bounds)
+        origin = scene.info.origin_in_world
+        bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) + origin if scene.count else None
+        return SceneContents(tuple(shifted_camera(named, origin) for named in scene.cameras), bounds)
 
     # ------------------------------------------------------------------ use
 

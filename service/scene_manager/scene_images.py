@@ -11,6 +11,7 @@ from service.localize import LoadedScene
 from service.photos.images import encode_image
 from service.scene_manager.status import PictureFormat, PictureSpec
 from service.scene_manager.warm_up import overview
+from service.scene_origin import shifted
 from service.types import Camera, Intrinsics
 
 PICTURE_TYPES: dict[PictureFormat, str] = {"png": "image/png", "jpeg": "image/jpeg", "depth": "application/x-npy"}
@@ -27,7 +28,8 @@ def thumbnail(loaded: LoadedScene) -> bytes:
 
 def picture(loaded: LoadedScene, wanted: PictureSpec) -> bytes:
     """Render to a file. Raises InvalidIntrinsics."""
-    frame = loaded.rasterizer.render([Camera(_intrinsics(loaded, wanted.intrinsics), wanted.pose)])[0]
+    pose = shifted(wanted.pose, -np.array(loaded.scene.info.origin_in_world))
+    frame = loaded.rasterizer.render([Camera(_intrinsics(loaded, wanted.intrinsics), pose)])[0]
     if wanted.format == "depth":
         file = io.BytesIO()
         # Little-endian whatever the machine: the file goes to others.

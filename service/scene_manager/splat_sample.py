@@ -42,7 +42,7 @@ def packed_splats(scene: GaussianScene, limit: int) -> bytes:
         [
             np.uint32(len(header)).astype("<u4").tobytes(),
             header,
-            scene.means[chosen].astype("<f4").tobytes(),
+            (scene.means[chosen] + np.array(info.origin_in_world)).astype("<f4").tobytes(),
             np.stack([covariance[:, i, j] for i, j in _UPPER], 1).astype("<f4").tobytes(),
             np.rint(np.clip(rgba, 0, 1) * 255).astype(np.uint8).tobytes(),
         ]

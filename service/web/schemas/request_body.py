@@ -79,9 +79,9 @@ def _json_body(text: bytes) -> Body:
 
 
 def decoded_base64(text: str, where: str) -> bytes:
-    """Decode base64 in any of its forms: in lines (RFC 2045), URL-safe, unpadded, or as a data URI. Raises InvalidRequest.
+    """Decode base64 in any of its forms: in lines (RFC 2045), URL-safe, unpadded, or as a data URI.
 
-    Browsers, Android and command-line tools each write another one.
+    Browsers, Android and command-line tools each write another one. Raises InvalidRequest.
     """
     if text.startswith("data:"):
         head, comma, text = text.partition(",")
