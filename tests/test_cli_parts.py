@@ -26,6 +26,7 @@ from service.errors import InvalidRequest
 from service.jobs.model import SequenceFrame
 from service.results import Reason, StageTiming, Status
 from service.types import Camera, Intrinsics, NamedCamera
+from service.web.api_keys import KeyRing, add_key
 from service.web.schemas.conversion import frame_out, timing_out
 from service.web.schemas.job_results import RankedScene
 from service.web.settings import Settings
@@ -363,6 +364,47 @@ def test_data_are_kept_by_port_unless_a_folder_is_named(
     with pytest.raises(Ready):
         server.run(given, Console(file=io.StringIO()), Console(file=io.StringIO()))
     assert decided[0].data_dir == (tmp_path / kept if kept else None)
+
+
+@pytest.mark.parametrize(
+    ("lasting", "open_to_all", "host", "made"),
+    [
+        (False, False, "127.0.0.1", False),
+        (False, False, "0.0.0.0", True),  # whoever can reach it could use it
+        (False, True, "0.0.0.0", False),
+        (True, False, "0.0.0.0", False),
+        (True, False, "127.0.0.1", False),
+    ],
+)
+def test_a_key_is_made_where_anybody_could_come_in_without_one(
+    lasting: bool, open_to_all: bool, host: str, made: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given, temporary = [], []
+
+    def create_app(settings: Settings, keys: Any) -> None:
+        given.append(keys)
+        raise Ready
+
+    class Ring(KeyRing):
+        def make_temporary(self, name: str, role: Any) -> str:
+            temporary.append(role)
+            return super().make_temporary(name, role)
+
+    monkeypatch.setattr(server, "KeyRing", Ring)
+
+    monkeypatch.setattr(server, "create_app", create_app)
+    monkeypatch.setattr(server, "_listener", lambda host, port: socket.socket())
+    file = tmp_path / "keys.json"
+    if lasting:
+        add_key(file, "ann", "admin")
+    settings = Settings(
+        scenes=[], port=0, host=host, open=open_to_all, keys_file=file, data_dir=tmp_path / "data", log_json=False
+    )
+    with pytest.raises(Ready):
+        server.run(settings, Console(file=io.StringIO()), Console(file=io.StringIO()))
+    assert bool(given[0]) is (lasting or made)
+    assert bool(KeyRing(file)) is lasting  # of this run only
+    assert bool(temporary) is made
 
 
 def announced(scenes: list[tuple[str, str]], key: str = "", shell_key: str = "", **changes: Any) -> tuple[str, str]:
