@@ -68,6 +68,7 @@ class Intrinsics:
 
     @classmethod
     def parse(cls, raw: Json) -> Intrinsics:
+        """Return the intrinsics of an answer's document."""
         return cls(**{**raw, "distortion": tuple(raw["distortion"])})
 
 
@@ -82,6 +83,7 @@ class Pose:
     def camera_from_world(self) -> np.ndarray:
         """The inverse, 4x4: the extrinsics of OpenCV and COLMAP."""
         inverse = np.eye(4)
+        # The inverse of a rotation is its transpose: exact, and cheaper than inverting the matrix.
         inverse[:3, :3] = self.world_from_camera[:3, :3].T
         inverse[:3, 3] = -inverse[:3, :3] @ self.world_from_camera[:3, 3]
         return inverse
@@ -115,10 +117,12 @@ class Prior:
     """Lower and upper corner for the camera's centre, in the world."""
 
     def fields(self) -> Json:
+        """Return the prior as a request has it, without what is not given."""
         given: Json = {"sigma_deg": self.sigma_deg, "sigma_units": self.sigma_units}
         given["world_from_camera"] = None if self.pose is None else self.pose.world_from_camera.tolist()
         given["covariance"] = None if self.covariance is None else np.asarray(self.covariance).tolist()
         given["box"] = None if self.box is None else np.asarray(self.box, float).tolist()
+        # Which fields are there says what kind of prior it is.
         return {name: value for name, value in given.items() if value is not None}
 
 
@@ -174,6 +178,7 @@ class Result:
 
     @property
     def localized(self) -> bool:
+        """Whether the pose may be used."""
         return self.status == "localized"
 
 
@@ -190,6 +195,7 @@ class Job:
 
     @property
     def ended(self) -> bool:
+        """Whether it is in a state that it can't leave."""
         return self.state in ENDED
 
     def answer(self) -> Result:
@@ -225,6 +231,7 @@ class Event:
     def value(self) -> Record | Job | None:
         """Return what a `record`, or the `result` or `error` of the job's end, says; None of other events."""
         if self.name == "record":
+            # The id is `attempt.index`.
             return parse_record(json.loads(self.data), int(self.id.partition(".")[0] or 1))
         return parse_job(json.loads(self.data)) if self.name in ("result", "error") else None
 
@@ -290,6 +297,7 @@ class EventParser:
     def line(self, line: str) -> Event | None:
         """Take a line without its line break; return the event that it ends, if it does."""
         name, _, value = line.partition(":")
+        # A line that begins with a colon is a comment, which the service sends while nothing happens.
         if line and not name:
             return Event("")
         if name == "event":
@@ -297,6 +305,7 @@ class EventParser:
         elif name == "id":
             self._id = value.strip()
         elif name == "data":
+            # One space after the colon belongs to the notation, further ones to the data.
             self._data.append(value[1:] if value.startswith(" ") else value)
         elif not line:
             event = Event(self._name, self._id, "\n".join(self._data)) if self._data else None
@@ -317,6 +326,7 @@ class _Waiting:
         """Return the seconds until a lost connection or a full queue is tried again. Raises `error` if it isn't."""
         if error.code != "unreachable" and error.retry_after_s is None:
             raise error
+        # A service that is busy says when to come again; a lost connection says nothing.
         seconds = _RECONNECT_S if error.retry_after_s is None else error.retry_after_s
         if time.monotonic() - self.since + seconds > self.timeout_s:
             raise error
@@ -326,6 +336,7 @@ class _Waiting:
         """Return what an event says, and note where the stream is resumed. Raises ServiceError once it is too late."""
         self.last_id = event.id or self.last_id
         value = event.value()
+        # An answer that arrives late is an answer nevertheless.
         if not isinstance(value, Job) and time.monotonic() - self.since > self.timeout_s:
             raise ServiceError("timeout", f"Job {job_id} has not ended after {self.timeout_s:g} s; it goes on.")
         return value
@@ -370,8 +381,10 @@ def _checked(response: httpx.Response) -> httpx.Response:
     detail = problem.get("detail") or f"{response.request.url.path} answered HTTP {response.status_code}."
     # Without a problem document it is a proxy that answers, or another program.
     code = problem.get("code") or ("unreachable" if response.status_code >= 500 else "http_error")
+    # Of a proxy 5xx means that the service is away, which may pass: such calls are tried again.
     error = ServiceError(code, detail, status=response.status_code, problem=problem)
     after = response.headers.get("Retry-After", "")
+    # Retry-After may also be a date, which this service does not send.
     if response.status_code in (429, 503) and after.isdigit():
         error.retry_after_s = float(after)
     raise error
@@ -398,6 +411,7 @@ def _render_body(camera: Intrinsics | None, pose: Pose, kind: str) -> Json:
 
 
 def _depth(data: bytes) -> np.ndarray:
+    # Never a pickle: whoever answers could run code here.
     return np.load(io.BytesIO(data), allow_pickle=False)
 
 
@@ -406,6 +420,7 @@ def _scene_pause(scene: Scene, waiting: _Waiting) -> float:
     problem = scene.raw.get("error")
     if problem:
         raise ServiceError(problem["code"], problem["detail"], status=problem["status"], problem=problem)
+    # It stays so until somebody loads it: waiting would not end.
     if scene.state == "unloaded":
         raise ServiceError("scene_unloaded", f"Scene '{scene.id}' is not in memory: load it first.")
     if time.monotonic() - waiting.since > waiting.timeout_s:
@@ -496,6 +511,7 @@ class Client:
         try:
             with self._http.stream("GET", f"/jobs/{job_id}/events", timeout=_STREAM, headers=headers) as response:
                 if response.is_error:
+                    # The body of a stream is not read by itself, and has the problem document.
                     response.read()
                 _checked(response)
                 yield from filter(None, map(parser.line, response.iter_lines()))

@@ -145,7 +145,9 @@ class ImageMatcher(Protocol):
 
     name: str
 
-    def match_images(self, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs: ...
+    def match_images(self, a: UInt8[np.ndarray, "h w 3"], b: UInt8[np.ndarray, "h2 w2 3"]) -> ImagePairs:
+        """Return pairs of pixels that show the same point, with confidences; each in its image's pixels."""
+        ...
 
 
 @dataclass(slots=True)

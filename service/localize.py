@@ -101,8 +101,10 @@ class LoadedScene:
         rasterizer: str | None = None,
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
+        """Bind tools to a scene in memory. Raises UnknownName, and BackendMissing as `load`."""
         features = images = MATCHERS.load(matcher).create()
         if isinstance(images, ImageMatcher):
+            # Views are retrieved by features of single images, which a matcher of pairs does not have.
             features = MATCHERS.load(DEFAULT_MATCHER).create()
         else:
             # It extracts features, which every method can use.
@@ -122,8 +124,10 @@ class LoadedScene:
             return None
         with self._lock:
             if estimator not in self._prepared:
+                # A seed of its own: what a scene has prepared must not depend on the photo that came first.
                 tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0), None)
                 self._prepared[estimator] = make(tools, self.cache_dir)
+                # It was read through for the index; from now on the renderer's copy is used.
                 release(self.scene)
             return self._prepared[estimator]
 
@@ -139,6 +143,7 @@ class LoadedScene:
             return self
         index = self.prepare(DEFAULT_ESTIMATOR)
         with self._lock:
+            # Whether the background shows at all is asked of the views once: a room hides it everywhere.
             if self._over_white is None:
                 shown = shows_background(self.rasterizer, [view.camera for view in index.views])
                 self._over_white = self._over(WHITE) if shown else self
@@ -242,6 +247,7 @@ def localize_in_scene(
     tuning = {} if request.config is None else {"config": request.config}
     clock = Clock()
     trace = _Trace(clock, on_record)
+    # Closed also after a cancel, so that the estimator's `finally` runs on this thread.
     with closing(plugin.run(query, tools, options, **tuning)) as steps:
         answer = _drive(steps, trace, request, tally)
     if not trace.records:
@@ -414,9 +420,11 @@ def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verd
         return replace(downgraded(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
     if at_bounds(last.correction):
         return downgraded(verdict, Reason.FOCAL_UNCERTAIN)
+    # What other poses have of the probability, this one hasn't, however well it fits.
     share = 1.0 if last.alternatives is None else 1.0 - float(last.alternatives.scores.sum())
     if share < VERIFICATION.min_localized:
         return downgraded(verdict, Reason.AMBIGUOUS, share * verdict.score)
+    # A pose that was found and verified in time counts, however the search would have gone on.
     if exhausted and verdict.status is not Status.LOCALIZED:
         return replace(verdict, reason=Reason.BUDGET_EXHAUSTED)
     return verdict
@@ -430,10 +438,12 @@ class Clock:
 
     @property
     def wall_s(self) -> float:
+        """Seconds since it was made."""
         return time.perf_counter() - self._wall
 
     @property
     def cpu_s(self) -> float:
+        """Seconds of CPU time of this thread since it was made."""
         return time.thread_time() - self._cpu
 
 

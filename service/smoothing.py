@@ -68,6 +68,7 @@ class MotionNoise:
     """The same in units^2/s^3."""
 
     def over(self, dt: float) -> Float64[np.ndarray, "12 12"]:
+        """Return the covariance that it adds to pose and velocity within `dt` seconds."""
         density = np.diag([self.rotation] * 3 + [self.translation] * 3)
         return np.block([[density * dt**3 / 3, density * dt**2 / 2], [density * dt**2 / 2, density * dt]])
 
@@ -118,6 +119,7 @@ def _joined(photos: Sequence[TimedPose], known: Sequence[TimedPose]) -> list[Smo
     assert first.pose is not None
     assert last.pose is not None
     assert first.covariance is not None
+    # Two photos may have the same time.
     speed = _step(first.pose, last.pose) / max(last.time_s - first.time_s, 1e-6)
     joined = []
     for photo in photos:
@@ -149,6 +151,7 @@ def smoothed_states(photos: Sequence[TimedPose], noise: MotionNoise) -> list[Mot
     states, predictions, _, _ = _filtered(photos, noise)
     for i in range(len(states) - 2, -1, -1):
         here, (predicted, transition), later = states[i], predictions[i + 1], states[i + 1]
+        # Rauch, Tung and Striebel's gain; solved instead of inverted, as covariances may be nearly singular.
         gain = np.linalg.solve(predicted.covariance, transition @ here.covariance).T
         difference = np.concatenate(
             [
@@ -188,6 +191,7 @@ def _filtered(
         spread = predicted.covariance[:6, :6] + photo.covariance
         gain = np.linalg.solve(spread, predicted.covariance[:6]).T
         covariance = predicted.covariance - gain @ predicted.covariance[:6]
+        # Rounding makes the difference of two covariances asymmetric, which adds up over a long sequence.
         states.append(_corrected(predicted, gain @ seen, 0.5 * (covariance + covariance.T)))
         # The first step tells the velocity, whose prior is vague: no evidence of the noise.
         if count or len(states) > 2:

@@ -94,6 +94,7 @@ class Intrinsics:
 
     @property
     def long_side(self) -> int:
+        """The larger of width and height, pixels."""
         return max(self.width, self.height)
 
     def resized(self, width: int, height: int) -> Intrinsics:
@@ -173,6 +174,7 @@ class Pose:
 
     @property
     def camera_from_world(self) -> Float64[np.ndarray, "4 4"]:
+        """The inverse: the extrinsics of OpenCV and COLMAP."""
         inverse = np.eye(4)
         inverse[:3, :3] = self.world_from_camera[:3, :3].T
         inverse[:3, 3] = -inverse[:3, :3] @ self.world_from_camera[:3, 3]
@@ -180,6 +182,7 @@ class Pose:
 
     @property
     def position_in_world(self) -> Float64[np.ndarray, "3"]:
+        """The camera's centre; scene units."""
         return self.world_from_camera[:3, 3]
 
     @property
@@ -270,14 +273,17 @@ class GaussianScene:
 
     @property
     def count(self) -> int:
+        """Number of Gaussians."""
         return len(self.means)
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
     @property
     def nbytes(self) -> int:
+        """Memory of the arrays, bytes."""
         return sum(getattr(self, n).nbytes for n in ("means", "quats", "scales", "opacities", "sh"))
 
 

@@ -33,6 +33,7 @@ from viewer.service_values import Job, JobOutcome, ListedJob
 def job_label(job: ListedJob, zone: ZoneInfo | None = None) -> str:
     """Return a job's line in the list of jobs, with the time in a zone; the id's first digits make it unique."""
     created = datetime.fromisoformat(job.created).astimezone(zone)
+    # The list is narrow, and most jobs that are looked at are today's.
     day = "" if created.date() == datetime.now(zone).date() else f"{created:%Y-%m-%d} "
     return f"{day}{created:%H:%M:%S} · {job.scene} · {(job.status or job.state).replace('_', ' ')} · {job.id[:8]}"
 
@@ -46,6 +47,7 @@ def headline_html(job: Job | None, records: int, error: str) -> str:
     title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
     link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>result page</a>"
     if job.outcome is None:
+        # The job was read when its stream began: that it runs meanwhile only its records tell.
         word = "queued" if not records else "running"
         return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title, link=link)
     outcome = job.outcome

@@ -143,6 +143,7 @@ def record_of(record: api.Record) -> IterationRecord:
         correction=IntrinsicsCorrection(**raw["intrinsics_correction"]),
         matches=matches
         and MatchVectors(
+            # An empty list has no second dimension of its own.
             frozen(np.array(matches["photo_px"]).reshape(-1, 2), np.float32),
             frozen(np.array(matches["render_px"]).reshape(-1, 2), np.float32),
             frozen(np.array(matches["inlier"]), np.bool_),

@@ -45,6 +45,7 @@ class FieldQuery:
 
     @property
     def key(self) -> tuple[str, str, int]:
+        """What tells this query from all others of a run."""
         return self.row.name, self.photo.name, self.number
 
 

@@ -77,19 +77,23 @@ class Shared:
 
     @cached_property
     def photos(self) -> list[BenchPhoto]:
+        """The test photos, as many as the run takes."""
         return find_photos(self.folder)[: self.work.photos]
 
     @cached_property
     def scene(self) -> GaussianScene:
+        """The scene without cameras of its test photos."""
         # As in `bench localize`: no index view may rest on a test photo's pose.
         return load_scene(self.folder, without_photos=[name for p in find_photos(self.folder) for name in p.names])
 
     @cached_property
     def reference(self) -> LoadedScene:
+        """The scene with the CPU's renderer."""
         return LoadedScene.of(self.scene, rasterizer=REFERENCE)
 
     @cached_property
     def tested(self) -> LoadedScene:
+        """The scene with the renderer that is measured."""
         return LoadedScene.of(self.scene, rasterizer=self.renderer)
 
     @property
@@ -99,6 +103,7 @@ class Shared:
 
     @cached_property
     def units(self) -> Units:
+        """The scene's normalized units."""
         rasterizer = self.reference.rasterizer
         return units_of([n.camera for n in self.scene.cameras], lambda camera: centre_depth(rasterizer, camera))
 

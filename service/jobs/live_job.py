@@ -38,14 +38,17 @@ class LiveJob:
 
     @property
     def attempt(self) -> int:
+        """Number of the attempt, from 1; 0 before the first."""
         return self.progress[0]
 
     @property
     def records(self) -> list[JobRecord]:
+        """Records of this attempt, in their order."""
         return self.progress[1]
 
     @property
     def stage(self) -> str | None:
+        """Stage of the latest record; None before the first."""
         records = self.records
         return records[-1].step.stage if records else None
 
@@ -56,6 +59,7 @@ class LiveJob:
 
     @property
     def memory_bytes(self) -> int:
+        """Memory of the photo, bytes."""
         return self.shown.rgb.nbytes if self.shown else 0
 
     def mark_alive(self) -> None:
@@ -63,6 +67,7 @@ class LiveJob:
         self._heard = time.monotonic()
 
     def silent_s(self) -> float:
+        """Return the seconds since its thread gave the last sign of life."""
         return time.monotonic() - self._heard
 
     def begin(self, attempt: int) -> None:
@@ -78,6 +83,7 @@ class LiveJob:
         self.announce()
 
     def end(self) -> None:
+        """Announce that the job has ended."""
         self.ended.set()
         self.announce()
 

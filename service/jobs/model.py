@@ -65,6 +65,7 @@ class JobSpec:
 
     @property
     def names_several_scenes(self) -> bool:
+        """Whether the photo is looked for in more than one scene."""
         return self.scene == AUTO or isinstance(self.scene, tuple)
 
 
@@ -179,6 +180,7 @@ class StoredJob(NewJob):
 
     @property
     def ended(self) -> bool:
+        """Whether it is in a state that it can't leave."""
         return self.state in ENDED
 
 

@@ -213,9 +213,11 @@ class Jobs:
         return encode_image(live.shown.rgb)
 
     def waiting(self) -> int:
+        """Return how many jobs wait for a worker."""
         return self._store.count("queued")
 
     def running(self) -> int:
+        """Return how many jobs run."""
         return self._store.count("running")
 
     def require_queue_capacity(self, client: str, key: str | None) -> None:
@@ -224,6 +226,7 @@ class Jobs:
             raise QueueFull(f"{self._queue.waiting()} jobs are waiting.", hint="Try again later.")
 
     def stuck_workers(self) -> int:
+        """Return how many workers were given up."""
         return self._queue.stuck()
 
     def problems(self) -> list[str]:

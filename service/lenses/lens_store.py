@@ -49,7 +49,9 @@ class LensStore(Protocol):
         """Delete a lens, or all, if they are the owner's, or anybody's; return how many."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close files and connections; nothing is called afterwards."""
+        ...
 
 
 class MemoryLensStore:

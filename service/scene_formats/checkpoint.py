@@ -38,6 +38,7 @@ def accepts(head: bytes, suffix: str) -> bool:
 def read(path: Path) -> RawGaussians:
     """Return the activated Gaussians in the trainer's frame. Raises CorruptScene, UnsupportedFormat."""
     with path.open("rb") as file:
+        # Before a process is started for it.
         if file.read(2) != b"PK":
             raise UnsupportedFormat(
                 "not a checkpoint of PyTorch 1.6 or later (a ZIP inside).",
@@ -87,6 +88,7 @@ def _gaussians(arrays: dict[str, np.ndarray], rgb_logits: bool, where: str) -> R
     rest = arrays.get("shN", np.empty((count, 0, 3), np.float32))
     if rest.ndim != 3 or rest.shape[::2] != (count, 3) or rest.shape[1] not in (0, 3, 8, 15, 24):
         raise CorruptScene(f"'shN' has the shape {rest.shape}.", where=where)
+    # Without view dependence splatfacto optimizes logits of colours instead of coefficients.
     if rgb_logits:
         sh0 = ((1 / (1 + np.exp(-sh0)) - 0.5) / SH_C0).astype(np.float32)
     sh, warnings = cut_sh(np.concatenate([sh0, rest], 1))

@@ -69,6 +69,7 @@ def checked(raw: RawGaussians, where: str) -> RawGaussians:
     count = int(np.count_nonzero(bad))
     if not count:
         return replace(raw, quats=(raw.quats / lengths[:, None]).astype(np.float32))
+    # One fault with its place is more help than the names of all.
     what, first = next((what, int(np.argmax(each))) for what, each in faults.items() if each.any())
     text = f"{count} of {len(bad)} Gaussians have {what} or the like, the first is number {first}"
     if count >= MAX_BAD_SHARE * len(bad):
@@ -94,6 +95,7 @@ def joined(parts: list[RawGaussians]) -> RawGaussians:
     """Return the Gaussians of several parts of one file; those of a lower SH degree than others get zeros."""
     if len(parts) == 1:
         return parts[0]
+    # Zeros of a higher degree change no colour.
     most = max(part.sh.shape[1] for part in parts)
     sh = [np.pad(part.sh, ((0, 0), (0, most - part.sh.shape[1]), (0, 0))) for part in parts]
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS if name != "sh"}

@@ -62,10 +62,12 @@ def read(path: Path) -> RawGaussians:
     if sections > _MAX_SECTIONS or _HEADER + _SECTION * sections > len(data):
         raise CorruptScene(f"{sections} sections in {len(data)} bytes.", where=path.name)
     low, high = (float(value) for value in struct.unpack_from("<2f", data[:_HEADER].tobytes(), 36))
+    # 0 stands for the writer's default range.
     bounds = (low or -1.5, high or 1.5)
     at, found = _HEADER + _SECTION * sections, []
     for number in range(sections):
         section = _section(data, _HEADER + _SECTION * number, level, f"{path.name}, section {number}")
+        # Sections lie one after the other with all the room they have, used or not.
         end = at + section.bucket_storage + _record(level, section.degree).itemsize * section.capacity
         if section.count > section.capacity or end > len(data):
             raise CorruptScene(
@@ -100,6 +102,7 @@ def _section(data: np.ndarray, at: int, level: int, where: str) -> _Section:
         raise CorruptScene(f"SH degree {degree}; the limit is 3.", where=where)
     if buckets and (bucket_bytes != 12 or full + partial > buckets or not np.isfinite(block_size)):
         raise CorruptScene(f"{full} full and {partial} other buckets of {buckets}.", where=where)
+    # 0 stands for the default of the level.
     steps = steps or (1 if level == 0 else 32_767)
     return _Section(*(count, capacity, bucket_size, buckets, block_size, bucket_bytes, steps, full, partial, degree))
 

@@ -67,12 +67,14 @@ def parts(path: Path) -> list[Path]:
 
 def _member(bundle: zipfile.ZipFile, name: str, limit: int, where: str) -> bytes:
     """Read a file of the bundle, up to `limit` bytes."""
+    # With or without a folder around its files.
     entry = next((e for e in bundle.infolist() if e.filename.rsplit("/", 1)[-1] == name), None)
     if entry is None:
         raise CorruptScene(f"the bundle has no '{name[:80]}'.", where=where)
     if entry.file_size > limit or entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise CorruptScene(f"'{name[:80]}' is larger than {limit} bytes, or not deflated.", where=where)
     with bundle.open(entry) as file:
+        # The size in the directory may be a lie: no more is unpacked than is allowed.
         return file.read(limit)
 
 
@@ -166,6 +168,7 @@ def _image(data: bytes, where: str) -> UInt8[np.ndarray, "h w 4"]:
 
 def _means(meta: dict[str, Any], planes: list[UInt8[np.ndarray, "n 4"]], where: str) -> Float32[np.ndarray, "n 3"]:
     low, high = _bounds(meta, "means", 3, where)
+    # An image has 8 bits: the low and the high bytes are two of them.
     share = (planes[0][:, :3] + planes[1][:, :3].astype(np.float64) * 256) / 65_535
     logarithm = low + share * (high - low)
     return (np.sign(logarithm) * np.expm1(np.abs(logarithm))).astype(np.float32)

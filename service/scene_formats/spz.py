@@ -50,6 +50,7 @@ def decoded(data: bytes, where: str) -> RawGaussians:
         raise CorruptScene("truncated within the header of 32 bytes.", where=where)
     streams, toc = data[15], struct.unpack_from("<I", data, 16)[0]
     sections = header.sections()
+    # What is empty (SH of degree 0) has no stream.
     present = [(name, size) for name, size in sections.items() if size]
     if streams < len(present) or toc + 16 * streams > len(data):
         raise CorruptScene(f"its table names {streams} streams at byte {toc}.", where=where)

@@ -104,6 +104,7 @@ class Scenes:
         self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
 
     def start(self) -> None:
+        """Start the loading thread, and load the scenes that the service needs."""
         self._thread.start()
         for entry in self.entries():
             if entry.required:
@@ -119,6 +120,7 @@ class Scenes:
     # ------------------------------------------------------------------ the list
 
     def entries(self) -> list[Entry]:
+        """Return all scenes, in memory or not."""
         with self._lock:
             return list(self._entries.values())
 
@@ -208,6 +210,7 @@ class Scenes:
         return next((entry.id for entry in self.entries() if entry.loaded is loaded), None)
 
     def release(self, held: Collection[LoadedScene]) -> None:
+        """Give back scenes that a job held; one that is to be unloaded goes with its last job."""
         with self._lock:
             for entry in self._entries.values():
                 # By identity: the scene of that name may have been replaced meanwhile.
@@ -248,6 +251,7 @@ class Scenes:
         do()
 
     def readiness(self) -> SceneReadiness:
+        """Return whether photos can be localized, what is still loading, and what failed."""
         entries = self.entries()
         pending = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.state in _UNDER_WAY]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]

@@ -124,6 +124,7 @@ class FolderSceneStore:
         self._incoming = folder / ".incoming"
         shutil.rmtree(self._incoming, ignore_errors=True)  # of an ended process
         self._incoming.mkdir(parents=True, exist_ok=True)
+        # The operator's scene wins, and the upload stays: it is there again once the other one has gone.
         for scene_id in self._named.keys() & {path.name for path in self._uploads()}:
             _log.warning("the uploaded scene %s is hidden by another of that name", scene_id)
 
@@ -139,6 +140,7 @@ class FolderSceneStore:
         if scene_id in self._named or (self._folder / scene_id).exists():
             raise _exists(scene_id)
         return FolderDraft(
+            # Two uploads of one name may come at once; the first that is whole gets it.
             self._incoming / f"{scene_id}.{os.urandom(4).hex()}",
             self._folder / scene_id,
             self._max_bytes,
@@ -184,6 +186,7 @@ class FolderDraft:
     def commit(self, file_name: str) -> StoredScene:
         with _storing(self._target):
             self._file.flush()
+            # Before the rename: after a crash there must be no scene whose file is empty.
             os.fsync(self._file.fileno())
             self._file.close()
             self._check(file_name)
@@ -196,6 +199,7 @@ class FolderDraft:
         upload = self._folder / "upload"
         suffix = suffix_of(Path(file_name))
         with upload.open("rb") as file:
+            # A ZIP may be a scene by itself (.sog, .pt); one that is called .ply is none.
             named = suffix != ".ply" and reader_for(file.read(_HEAD_BYTES), suffix) is not None
         if not named and zipfile.is_zipfile(upload):
             unpack(upload, self._folder, self._max_bytes)

@@ -58,6 +58,7 @@ class Relay:
             self.router.add_api_websocket_route(path, self._socket)
 
     async def close(self) -> None:
+        """Close the connections to the viewer."""
         await self._http.aclose()
 
     @route_policy(role="read", key_in_address=True)

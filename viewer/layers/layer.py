@@ -27,8 +27,13 @@ class Canvas(Protocol):
     scene: viser.SceneApi
     camera: Any
 
-    def atomic(self) -> AbstractContextManager[None]: ...
-    def flush(self) -> None: ...
+    def atomic(self) -> AbstractContextManager[None]:
+        """Return a context whose changes the browser draws at once."""
+        ...
+
+    def flush(self) -> None:
+        """Send what was drawn so far."""
+        ...
 
 
 class Layer:

@@ -58,6 +58,7 @@ class Method:
 
     @property
     def options(self) -> Any:
+        """The estimator's options with the changes."""
         return ESTIMATORS.load(self.estimator).Options(**self.changed)
 
     def config(self) -> dict[str, Any]:
@@ -79,6 +80,7 @@ class Cell:
 
     @property
     def name(self) -> str:
+        """Name of the cell in results, unique within a plan."""
         return f"{self.study}/{self.method.name}/{self.protocol}"
 
 

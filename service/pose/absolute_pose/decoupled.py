@@ -61,6 +61,7 @@ class DecoupledSolution:
 
     @property
     def num_inliers(self) -> int:
+        """How many matches are inliers."""
         return int(self.inlier.sum())
 
     @property

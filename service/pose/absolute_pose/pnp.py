@@ -34,6 +34,7 @@ class AbsolutePose:
 
     @property
     def num_inliers(self) -> int:
+        """How many correspondences agree with the pose."""
         return int(self.inlier.sum())
 
 

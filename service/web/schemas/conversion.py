@@ -190,6 +190,7 @@ def covariance_out(matrix: np.ndarray) -> Covariance:
     """Convert the covariance of a pose (see `Verdict.covariance`), and add its two standard deviations."""
     return Covariance(
         matrix=rows(matrix),
+        # The root of the trace is the root mean square of the error's length, whatever its direction.
         sigma_deg=float(np.degrees(np.sqrt(np.trace(matrix[:3, :3])))),
         sigma_units=float(np.sqrt(np.trace(matrix[3:, 3:]))),
     )
@@ -219,6 +220,7 @@ def lens_out(lens: StoredLens) -> LensOut:
         k1_sigma=k1_sigma,
         principal_point=[shift_x, shift_y],
         principal_point_sigma=max(shift_sigmas),
+        # Both counts, since certainty comes from other viewpoints, not from more photos of one.
         photos=estimate.photos,
         viewpoints=estimate.viewpoints,
         tested=estimate.is_tested(),

@@ -89,6 +89,7 @@ def require_pose(job: StoredJob) -> None:
     """Check that a job ended with a pose that may be used. Raises JobNotReady, NoPose."""
     if not job.ended:
         raise JobNotReady(f"the job is {job.state}.", where="job")
+    # An uncertain pose is exported: whoever asks for it has seen its status.
     if job.state != "succeeded" or job.status == Status.NOT_LOCALIZED:
         raise NoPose("the job found no pose that could be used.", where="job", hint="See its reason: GET /jobs/ID.")
 
