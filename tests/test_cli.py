@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import json
 import os
+import pkgutil
 import re
 import shlex
 import shutil
@@ -15,10 +17,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from numba.core.caching import NullCache
+from numba.core.registry import CPUDispatcher
 from PIL import ExifTags, Image
 
 import service
@@ -280,8 +285,21 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
     assert "cores" in complaint  # the machine and its load
 
 
+def kernels() -> dict[str, Any]:
+    """The kernels that have machine code of their own on disk."""
+    names = [each.name for each in pkgutil.walk_packages(service.__path__, "service.")]
+    modules = [importlib.import_module(n) for n in names if n.startswith(("service.render.", "service.pose."))]
+    found = {f"{m.__name__}.{name}": value for m in modules for name, value in vars(m).items()}
+    compiled = {name: value for name, value in found.items() if isinstance(value, CPUDispatcher)}
+    return {name: value for name, value in compiled.items() if not isinstance(value._cache, NullCache)}
+
+
 def test_doctor_finds_the_parts_at_work(splatfix):
+    """And warms all kernels up: each finds its machine code, or compiles it."""
+    for each in kernels().values():
+        each._reset_overloads()
     code, told, _ = splatfix("doctor", "--warm")
+    assert [name for name, each in kernels().items() if not each.signatures] == []
     lines = {line[5:29].strip(): line[:4].strip() for line in told.splitlines()}
     assert code == 0, told
     assert (lines["renderer cpu"], lines["matcher"], lines["estimator view_index"]) == ("ok", "ok", "ok")

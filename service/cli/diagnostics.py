@@ -24,10 +24,13 @@ from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
 from service.operating_system import load_averages, missing_limits
 from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
+from service.pose.absolute_pose.unknown_lens import linearize_reprojection
 from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.uncertainty import pose_uncertainty
+from service.pose.retrieval.free_space import free_space_of
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
-from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
+from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, SceneInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +64,17 @@ def findings() -> Iterator[Finding]:
 
 def compile_kernels() -> None:
     """Run every compiled kernel once, so that later runs find it in the cache: a minute, later seconds."""
-    (camera,) = room_cameras(64)[:1]
-    rasterizer = RASTERIZERS.load("cpu").create(synthetic_room(2000))
+    room, (camera,) = synthetic_room(2000), room_cameras(64)[:1]
+    rasterizer = RASTERIZERS.load("cpu").create(room)
     frame = rasterizer.render([camera])[0]
     rasterizer.pose_gradient(camera, frame.rgb)
     rasterizer.scene_gradients(camera, frame.rgb)
-    refine_photometric((frame.rgb * 255).clip(0, 255).astype(np.uint8), frame, camera, camera, 2)
+    photo = (frame.rgb * 255).clip(0, 255).astype(np.uint8)
+    refine_photometric(photo, frame, camera, camera, 2)
+    pose_uncertainty(photo, frame, camera, camera, None)
+    points = room.means[:8].astype(np.float64)
+    linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
+    free_space_of(room).enclosures(points)
 
 
 def processor() -> str:
