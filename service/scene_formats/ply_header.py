@@ -187,7 +187,11 @@ def _seek(file: BufferedReader, path: Path, header: PlyHeader, name: str) -> Ply
 def _skip(file: BufferedReader, element: PlyElement, text: bool, path: Path) -> None:
     """Pass over an element's records; those with lists (faces) have to be walked through."""
     if element.dtype is not None and not text:
-        file.seek(element.count * element.dtype.itemsize, 1)
+        size = element.count * element.dtype.itemsize
+        # Compared, not tried: a file may be positioned behind its end, though not at any number.
+        if size > path.stat().st_size - file.tell():
+            raise CorruptScene(f"truncated within '{element.name}'.", where=path.name)
+        file.seek(size, 1)
         return
     if element.count and not element.lists and element.dtype is None:
         raise UnsupportedFormat(f"element '{element.name}' has a list of unknown type.", where=path.name)
