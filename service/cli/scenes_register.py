@@ -48,7 +48,7 @@ def register_scene(
     metres_per_unit: Annotated[float | None, typer.Option(min=1e-9, help="Of the scene, where it is certain.")] = None,
     drift: Annotated[float | None, typer.Option(min=0, max=1, help="Of the places, as a share of the path.")] = None,
     geoid_m: Annotated[float | None, typer.Option(help="Height of the geoid, added to EXIF's altitudes.")] = None,
-    count: Annotated[int, typer.Option(min=1, max=500, help="Photos to localize at most, evenly chosen.")] = 20,
+    count: Annotated[int, typer.Option(min=1, max=100, help="Photos to localize at most, evenly chosen.")] = 20,
     matcher: MatcherOption = "",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Don't keep the registration.")] = False,
     undo: Annotated[bool, typer.Option("--undo", help="Drop the latest registration.")] = False,

@@ -61,14 +61,13 @@ def agreeing(
         return fit_similarity(evidence, everyone, core.similarity, noise), everyone
     order = np.argsort(_distances(evidence, core.similarity, noise), kind="stable").tolist()
     core = fit_similarity(evidence, sorted(order[:half]), core.similarity, noise)
-    core_variance = _variance(core)
-    for size in range(count, half - 1, -1):
+    core_variance = max(_variance(core), _floor(evidence))
+    for size in range(count, half, -1):
         used = sorted(order[:size])
         fit = fit_similarity(evidence, used, core.similarity, noise)
-        is_hidden = size > half and _variance(fit) > config.masked * max(core_variance, _floor(evidence))
-        if not is_hidden and not _outliers(fit, evidence, used, config):
+        if _variance(fit) <= config.masked * core_variance and not _outliers(fit, evidence, used, config):
             return fit, used
-    return fit, used
+    return core, sorted(order[:half])
 
 
 def _distances(evidence: Evidence, similarity: Similarity, noise: Noise) -> Float64[np.ndarray, "n"]:
@@ -86,16 +85,18 @@ def _trimmed(evidence: Evidence, similarity: Similarity, noise: Noise, half: int
 
 def _concentrated(evidence: Evidence, start: Similarity, noise: Noise, half: int) -> Fit:
     """Fit to the best half, and again to the half that then is best, until that stays."""
-    chosen: list[int] | None = None
-    similarity = start
-    for _ in range(5):
-        order = np.argsort(_distances(evidence, similarity, noise), kind="stable").tolist()
-        if sorted(order[:half]) == chosen:
+    chosen = _best(evidence, start, noise, half)
+    for _ in range(4):
+        start = fit_similarity(evidence, chosen, start, noise, estimate_noise=False).similarity
+        before, chosen = chosen, _best(evidence, start, noise, half)
+        if chosen == before:
             break
-        chosen = sorted(order[:half])
-        fit = fit_similarity(evidence, chosen, similarity, noise, estimate_noise=False)
-        similarity = fit.similarity
-    return fit
+    return fit_similarity(evidence, chosen, start, noise, estimate_noise=False)
+
+
+def _best(evidence: Evidence, similarity: Similarity, noise: Noise, half: int) -> list[int]:
+    """Return the observations with the smallest residuals, in their own order."""
+    return sorted(np.argsort(_distances(evidence, similarity, noise), kind="stable")[:half].tolist())
 
 
 def _floor(evidence: Evidence) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 _MANY = 1e7
 """Degrees of freedom at which F is chi-square over its degrees of freedom, to six digits."""
@@ -13,6 +14,7 @@ def chi_square_quantile(probability: float, freedom: float) -> float:
     return freedom * f_quantile(probability, freedom, _MANY)
 
 
+@lru_cache(maxsize=1000)
 def f_quantile(probability: float, numerator: float, denominator: float) -> float:
     """Return the value that F with these degrees of freedom stays below with the given probability (by bisection)."""
     low, high = 0.0, 1.0

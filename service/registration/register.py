@@ -14,7 +14,7 @@ from service.registration.determinacy import determined
 from service.registration.observations import Evidence, Observation
 from service.registration.quantiles import chi_square_quantile, f_quantile
 from service.registration.registration import Registration, Residual
-from service.registration.similarity_fit import KINDS, Fit, Noise, Similarity, is_stated, observation_rows
+from service.registration.similarity_fit import KINDS, Fit, Kind, Noise, Similarity, is_stated, observation_rows
 
 _REGION = 0.95
 _TURNED = 0.3
@@ -29,7 +29,10 @@ def register(evidence: Evidence, rng: np.random.Generator) -> Registration:
     Raises RegistrationFailed where it determines nothing, contradicts itself or is in a left-handed frame.
     """
     _check(evidence)
-    evidence, quarter_turns, (fit, used) = _as_turned(evidence, rng)
+    try:
+        evidence, quarter_turns, (fit, used) = _as_turned(evidence, rng)
+    except np.linalg.LinAlgError:
+        raise RegistrationFailed("the numbers are too far apart to be computed with.", where="registration") from None
     _require_right_handed(evidence, fit, used)
     parts, reason, covariance = determined(fit, evidence, used)
     if not parts:
@@ -115,7 +118,9 @@ def _distance(seen: Observation, similarity: Similarity) -> float:
 def _small_sample_factor(fit: Fit, evidence: Evidence, used: Sequence[int]) -> float:
     """Return by how much the covariance grows because noise was estimated: F's 95 % region over the normal's."""
     observations = [evidence.observations[i] for i in used]
-    unsure = [k for k in KINDS if fit.of_kind(k).any() and (not is_stated(k, observations) or fit.noise.factors[k] > 1)]
+    unsure: list[Kind] = [
+        k for k in KINDS if fit.of_kind(k).any() and (not is_stated(k, observations) or fit.noise.factors[k] > 1)
+    ]
     if not unsure:
         return 1.0
     unknowns = free_parameters(evidence)

@@ -138,12 +138,12 @@ def fit_similarity(
     """
     if used:
         start = start.about(np.mean([evidence.observations[i].position_in_world for i in used], axis=0))
-    similarity = start
-    for _ in range(6 if estimate_noise else 1):
-        similarity, fit = _minimize(evidence, used, similarity, noise, steps)
-        noise, change = _with_estimated_noise(fit, evidence, used) if estimate_noise else (noise, 0.0)
+    fit = _minimize(evidence, used, start, noise, steps)
+    for _ in range(5 if estimate_noise else 0):
+        noise, change = _with_estimated_noise(fit, evidence, used)
         if change < 1e-3:
             break
+        fit = _minimize(evidence, used, fit.similarity, noise, steps)
     return fit
 
 
@@ -163,9 +163,7 @@ def is_stated(kind: Kind, observations: Sequence[Observation]) -> bool:
     return True
 
 
-def _minimize(
-    evidence: Evidence, used: Sequence[int], similarity: Similarity, noise: Noise, steps: int
-) -> tuple[Similarity, Fit]:
+def _minimize(evidence: Evidence, used: Sequence[int], similarity: Similarity, noise: Noise, steps: int) -> Fit:
     fit = _evaluated(evidence, used, similarity, noise)
     damping = _DAMPING
     free = _free(evidence)
@@ -175,9 +173,9 @@ def _minimize(
         # A little of the trace, too: a parameter that nothing determines has no diagonal of its own.
         ridge = damping * np.diag(np.diag(normal) + 1e-9 * np.trace(normal) + 1e-300)
         step[free] = -np.linalg.lstsq(normal + ridge, gradient, rcond=1e-14)[0]
-        proposed = _evaluated(evidence, used, similarity.moved(step), noise)
+        proposed = _evaluated(evidence, used, fit.similarity.moved(step), noise)
         if proposed.cost <= fit.cost * (1 + 1e-12):
-            gain, similarity, fit = fit.cost - proposed.cost, proposed.similarity, proposed
+            gain, fit = fit.cost - proposed.cost, proposed
             damping = max(damping / 10, _DAMPING)
             if gain <= 1e-10 * (1 + fit.cost):
                 break
@@ -187,7 +185,7 @@ def _minimize(
                 break
     # Not at each step: it costs more than the step.
     projection = fit.jacobian @ np.linalg.pinv(fit.jacobian, rcond=1e-12) if len(fit.jacobian) else _NO_HAT
-    return similarity, replace(fit, hat=projection)
+    return replace(fit, hat=projection)
 
 
 def _free(evidence: Evidence) -> list[int]:

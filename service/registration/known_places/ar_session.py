@@ -15,11 +15,11 @@ import numpy as np
 from service.errors import BadInput, InvalidRequest
 from service.photos.intrinsics import intrinsics_from
 from service.registration.known_places.known_place import KnownPlace, KnownPlaces
+from service.scene_formats.nerfstudio import OPENCV_FROM_OPENGL
 from service.types import Intrinsics, Pose
 
 ARKIT_DRIFT = 0.01
 """Share of the path: what visual-inertial odometry of phones is measured at."""
-OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LENSES = {"w": "width", "h": "height", "fl_x": "fx", "fl_y": "fy", "cx": "cx", "cy": "cy"}
 
 

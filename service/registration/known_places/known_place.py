@@ -16,6 +16,9 @@ from service.registration.observations import Observation
 from service.registration.registration import Origin
 from service.types import Intrinsics, Pose, frozen
 
+HEADING_SIGMA = 0.26
+"""rad: 15 degrees, of a phone's compass."""
+
 
 @dataclass(frozen=True, slots=True)
 class KnownPlace:
@@ -33,7 +36,7 @@ class KnownPlace:
     """rad."""
     heading: float | None = None
     """Of the optical axis, rad clockwise from north (y)."""
-    heading_sigma: float = 0.26
+    heading_sigma: float = HEADING_SIGMA
     """rad."""
     time_s: float | None = None
     intrinsics: Intrinsics | None = None

@@ -13,14 +13,15 @@ import csv
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
 from service.errors import InvalidRequest
-from service.registration.known_places.known_place import KnownPlace, KnownPlaces, rotation_of
+from service.registration.known_places.known_place import HEADING_SIGMA, KnownPlace, KnownPlaces, rotation_of
 
+MAX_METRES, MIN_SIGMA = 1e8, 1e-6
+"""Of coordinates, and of standard deviations in metres or degrees."""
 _LOCAL, _GEOGRAPHIC, _QUATERNION = ("x", "y", "z"), ("latitude", "longitude", "height"), ("qw", "qx", "qy", "qz")
 _OTHERS = ("name", "sigma_m", "sigma_up_m", "sigma_deg", "heading_deg", "heading_sigma_deg", "time_s")
 _KNOWN = (*_LOCAL, *_GEOGRAPHIC, *_QUATERNION, *_OTHERS)
@@ -100,7 +101,6 @@ def _place(row: Mapping[str, Any], where: str) -> tuple[KnownPlace, bool]:
     sigma, sigma_up = (_sigma(row, key, where) for key in ("sigma_m", "sigma_up_m"))
     turn, heading_sigma = (_sigma(row, key, where) for key in ("sigma_deg", "heading_sigma_deg"))
     covariance = None if sigma is None else np.diag([sigma, sigma, sigma_up or sigma]) ** 2
-    default = next(f.default for f in fields(KnownPlace) if f.name == "heading_sigma")
     time = _numbers(row, ("time_s",), where)
     place = KnownPlace(
         name=row["name"],
@@ -109,7 +109,7 @@ def _place(row: Mapping[str, Any], where: str) -> tuple[KnownPlace, bool]:
         target_from_camera=None if quaternion is None else rotation_of(quaternion.tolist(), where),
         rotation_sigma=None if turn is None else float(np.radians(turn)),
         heading=None if heading is None else float(np.radians(heading[0])),
-        heading_sigma=float(np.radians(heading_sigma)) if heading_sigma else default,
+        heading_sigma=float(np.radians(heading_sigma)) if heading_sigma else HEADING_SIGMA,
         time_s=None if time is None else float(time[0]),
     )
     return place, on_earth
@@ -126,13 +126,13 @@ def _numbers(row: Mapping[str, Any], keys: tuple[str, ...], where: str) -> np.nd
         values = np.array([float(row[key]) for key in keys])
     except (TypeError, ValueError):
         raise InvalidRequest(f"{', '.join(keys)} must be numbers.", where=where) from None
-    if not np.all(np.isfinite(values)):
-        raise InvalidRequest(f"{', '.join(keys)} must be finite numbers.", where=where)
+    if not np.all(np.abs(values) <= MAX_METRES):  # NaN fails, too
+        raise InvalidRequest(f"{', '.join(keys)} must be finite numbers up to {MAX_METRES:g}.", where=where)
     return values
 
 
 def _sigma(row: Mapping[str, Any], key: str, where: str) -> float | None:
     value = _numbers(row, (key,), where)
-    if value is not None and value[0] <= 0:
-        raise InvalidRequest(f"{key} must be positive.", where=where)
+    if value is not None and value[0] < MIN_SIGMA:
+        raise InvalidRequest(f"{key} must be at least {MIN_SIGMA:g}.", where=where)
     return None if value is None else float(value[0])

@@ -13,8 +13,9 @@ import numpy as np
 
 from service.errors import BadInput, InvalidRequest
 from service.photos.intrinsics import intrinsics_from
-from service.registration.known_places.ar_session import ARKIT_DRIFT, OPENCV_FROM_OPENGL
+from service.registration.known_places.ar_session import ARKIT_DRIFT
 from service.registration.known_places.known_place import KnownPlace, KnownPlaces, rotation_of
+from service.scene_formats.nerfstudio import OPENCV_FROM_OPENGL
 from service.types import Intrinsics
 
 
@@ -27,15 +28,15 @@ def read(text: str, name: str) -> KnownPlaces:
     """Parse the poses of all frames. Raises InvalidRequest with the frame."""
     try:
         data = json.loads(text)
-        poses = np.array(data["poses"], np.float64)
+        poses = np.array(data["poses"], np.float64).reshape(-1, 7)
     except (ValueError, KeyError, TypeError):
-        poses = np.zeros(0)
-    if poses.ndim != 2 or poses.shape[1] != 7 or not np.all(np.isfinite(poses)):
-        raise InvalidRequest("'poses' must be a list of qx, qy, qz, qw, x, y, z.", where=name)
+        raise InvalidRequest("'poses' must be a list of qx, qy, qz, qw, x, y, z.", where=name) from None
+    if not len(poses) or not np.all(np.isfinite(poses)):
+        raise InvalidRequest("'poses' must be finite numbers, at least of one pose.", where=name)
     intrinsics = _intrinsics(data, name)
     rate = data.get("fps")
     places = []
-    for number, (x, y, z, w, *position) in enumerate(poses):
+    for number, (x, y, z, w, *position) in enumerate(poses.tolist()):
         rotation = rotation_of([w, x, y, z], f"{name}, pose {number}") @ OPENCV_FROM_OPENGL[:3, :3]
         time = number / float(rate) if isinstance(rate, int | float) and rate > 0 else None
         places.append(

@@ -21,6 +21,7 @@ from service.registration.known_places import place_table
 from service.registration.known_places.known_place import KnownPlaces
 from service.registration.observations import Direction, Height, Length
 
+MAX_POINTS = 100
 LENGTH_SIGMA = 0.01
 """Of a length, as a share of it: both ends are picked by hand."""
 _FLOOR_SIGMA = np.radians(1.0)
@@ -72,8 +73,8 @@ def floor_evidence(
 
 def _list(data: Mapping[str, Any], key: str, where: str) -> list[Any]:
     value = data.get(key, [])
-    if not isinstance(value, list) or len(value) > 1000:
-        raise InvalidRequest("must be a list of at most 1000.", where=f"{where}: {key}")
+    if not isinstance(value, list) or len(value) > MAX_POINTS:
+        raise InvalidRequest(f"must be a list of at most {MAX_POINTS}.", where=f"{where}: {key}")
     return value
 
 
@@ -82,8 +83,8 @@ def _vector(value: Any, where: str) -> Float64[np.ndarray, "3"]:
         vector = np.array(value, np.float64)
     except (TypeError, ValueError):
         vector = np.zeros(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InvalidRequest("must be three finite numbers.", where=where)
+    if vector.shape != (3,) or not np.all(np.abs(vector) <= place_table.MAX_METRES):  # NaN fails, too
+        raise InvalidRequest(f"must be three finite numbers up to {place_table.MAX_METRES:g}.", where=where)
     return vector
 
 
@@ -97,6 +98,6 @@ def _length(value: Any, where: str) -> Length:
         sigma = float(value.get("sigma_m", LENGTH_SIGMA * metres))
     except (TypeError, ValueError):
         metres = sigma = 0.0
-    if not (0 < metres < 1e7 and 0 < sigma < 1e7) or np.allclose(start, end, rtol=0, atol=1e-12):
+    if not (1e-6 < metres < 1e7 and 1e-7 < sigma < 1e7) or np.allclose(start, end, rtol=0, atol=1e-12):
         raise InvalidRequest("must be a positive length between two different points.", where=where)
     return Length(start, end, metres, sigma)

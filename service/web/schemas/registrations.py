@@ -78,10 +78,10 @@ class LengthIn(Model):
 class RegistrationIn(Model):
     """What is known of the scene's place; at least one of the lists."""
 
-    photos: list[PhotoPlaceIn] = Field(default_factory=list, max_length=500)
-    points: list[PointPlaceIn] = Field(default_factory=list, max_length=1000)
-    lengths: list[LengthIn] = Field(default_factory=list, max_length=1000)
-    floor: list[Point] = Field(default_factory=list, max_length=1000)
+    photos: list[PhotoPlaceIn] = Field(default_factory=list, max_length=100)
+    points: list[PointPlaceIn] = Field(default_factory=list, max_length=100)
+    lengths: list[LengthIn] = Field(default_factory=list, max_length=100)
+    floor: list[Point] = Field(default_factory=list, max_length=100)
     """Three points or more of a level floor, which don't lie on a line."""
     up: Point | None = None
     """What is up in the frame of x, y, z."""
