@@ -440,3 +440,49 @@ def test_an_ablation_needs_two_scenes(splatfix):
     code, _, complaint = splatfix("bench", "ablation", "S")
     assert code == 2
     assert "needs two scenes" in complaint
+
+
+def test_a_scene_is_registered_by_photos_and_results_are_in_metres(splatfix, room, tmp_path):
+    """Of five photos one has a wrong position; the frame is turned about z by a quarter, 3 m a unit."""
+    scene = tmp_path / "room"
+    shutil.copytree(room, scene)
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    lines = ["name,x,y,z"]
+    for number, (angle, height) in enumerate([(1.0, 0.1), (0.6, 0.2), (0.0, 0.0), (2.6, 0.1), (4.0, 0.3)]):
+        pose = moved(pose_at(angle, height), np.array([0.05, 0.0, 0.04, 0.0, 0.0, 0.0]))
+        told = json.dumps({"world_from_camera": pose.world_from_camera.tolist()})
+        render(room, told, tmp_path / f"{number}.png")
+        x, y, z = 3 * turn @ pose.position_in_world + [10, 20, 30] + ([0, 5, 0] if number == 3 else [0, 0, 0])
+        lines.append(f"{number}.png,{x},{y},{z}")
+    (tmp_path / "places.csv").write_text("\n".join(lines))
+    code, told, errors = splatfix("scenes", "register", scene, "--places", tmp_path / "places.csv", "--json")
+    assert code == 0, errors
+    found = json.loads(told)
+    assert [(r["name"], r["used"]) for r in found["residuals"]] == [(f"{n}.png", n != 3) for n in range(5)]
+    assert found["metres_per_unit"] == pytest.approx(3, rel=0.02)  # seen: 0.002
+    assert np.array(found["target_from_world"])[:3, :3] / 3 == pytest.approx(turn, abs=0.03)
+    code, told, _ = splatfix("localize", tmp_path / "1.png", "--scene", scene, "--json")
+    placed = json.loads(told)[0]["registered"]
+    expected = [float(v) for v in lines[2].split(",")[1:]]
+    assert placed["target_from_camera"]["translation"] == pytest.approx(expected, abs=0.1)
+    assert placed["revision"] == 1
+    assert 0 < placed["sigma_m"] < 1
+    code, told, _ = splatfix("scenes", "register", scene, "--undo")
+    assert "not registered any more" in told
+
+
+def test_a_scene_is_registered_by_a_length_and_a_floor(splatfix, room, tmp_path):
+    scene = tmp_path / "room"
+    shutil.copytree(room, scene)
+    points = {
+        "lengths": [{"from_in_world": [0, 0, 0], "to_in_world": [0, 2, 0], "metres": 5}],
+        "floor": [[0, 0, -1], [1, 0, -1], [0, 1, -1]],
+    }
+    code, told, errors = splatfix("scenes", "register", scene, "--points", json.dumps(points))
+    assert code == 0, errors
+    assert "determined: scale, up" in told
+    assert "metres per unit: 2.5" in told
+    assert (scene / "registration.json").is_file()
+    code, _, errors = splatfix("scenes", "register", scene)
+    assert code == 2
+    assert "nothing to register by" in errors

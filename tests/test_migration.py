@@ -92,7 +92,8 @@ def test_an_ended_job_is_described_as_before(taken_over, name):
     assert [new.pop(added) for added in ("camera_id", "lens")] == [None, None]
     if new["result"]:
         # The release knew neither.
-        assert [new["result"].pop(added) for added in ("fitting_intrinsics", "covariance_given_lens")] == [None, None]
+        added = ("fitting_intrinsics", "covariance_given_lens", "registered")
+        assert [new["result"].pop(name) for name in added] == [None] * 3
     if new["error"]:
         # It gave no hint; today every error has one.
         assert old["error"].pop("hint") == ""
