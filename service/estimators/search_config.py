@@ -36,11 +36,8 @@ class SearchConfig:
     """Size of the photo in the stage `retrieve_more_views`, relative to `retrieve_full_size`."""
     further_views_divisor: int = 16
     """One view in so many is matched before the search is given up: in a building the likeliest five may be wrong."""
-    min_inliers: int = 12
-    min_inlier_share: float = 0.055
-    """Inliers, and their share of the matches, from which on a render at the pose is made: of 168 searches with fewer,
-    119 of them for photos of other scenes, none led to an answer; with 12 to 30 those have a median share of 0.04 to
-    0.05."""
+    free_views: int = 8
+    """Views beside the index that a photo is matched with which no view of the index led to; 0: none."""
     rematch_below_inliers: int = 30
     """With fewer inliers a pose is matched with a render before it is refined..."""
     rematch_if_refused_below_inliers: int = 80

@@ -268,7 +268,7 @@ def _search_mirrored(
     views = (retrieval.index.views[i] for i in top_indices(retrieval.scores(variant), config.small_photo_views))
     features = retrieval.features(variant)
     found = yield from match_candidates(features, views, state.images, variant.max_error_px, config.matching)
-    if found is None or found.num_inliers < config.min_inliers:
+    if found is None or found.num_inliers < config.matching.min_inliers:
         return None
     outcome = yield from refine_stage(found, state.images, state.renderer, config.refinement, max_loss)
     return outcome.refined

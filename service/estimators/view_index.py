@@ -15,7 +15,7 @@ thresholds come from.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -40,6 +40,7 @@ from service.interfaces import Answer, Tools
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
 from service.pose.features.image_sizes import PHOTO_PX, sized
+from service.pose.features.rendered_views import View, view_from
 from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.matching.match_stages import match_candidates, record_of, render_and_rematch, solve_matches
 from service.pose.matching.render_and_match import render_and_match
@@ -124,13 +125,16 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     views = top_indices(retrieval.scores(variant), options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
     yield Stage(_search_views(name, variant, deque(views), state), variant)
-    variant = variant.scaled(config.large_photo_factor)
+    full_size, variant = variant, variant.scaled(config.large_photo_factor)
     ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
     # A stage ends early where matches or refinement fail; the next goes on with the other views.
     while untried:
         yield Stage(_search_views("retrieve_more_views", variant, untried, state), variant)
-    if options.effort == "fast" or (options.effort == "normal" and not state.recognised):
+    if options.effort == "fast":
+        return
+    yield from _free_view_stages(full_size, state)
+    if options.effort == "normal" and not state.recognised:
         return
     for _ in range(config.sample_rounds if options.effort == "normal" else config.max_sample_rounds):
         yield Stage(_sample_poses(variant, state), variant)
@@ -157,7 +161,7 @@ def _search_views(
     Views that were matched are taken from `untried`. `try_prior_view`: match with a render at the prior pose, if there
     is one, before the views.
     """
-    images, config = state.images, state.config
+    images = state.images
     index, prior = state.tools.prepared, images.query.prior
     poses = [index.views[i].camera.pose for i in untried]
     scores = state.retrieval.scores(variant)[list(untried)]
@@ -166,10 +170,46 @@ def _search_views(
     views = (index.views[untried.popleft()] for _ in range(len(untried)))
     if prior and try_prior_view:
         views = chain([state.renderer.at(images.query, prior).view(images.matcher)], views)
+    return (yield from _match_and_refine(views, variant, state))
+
+
+def _free_view_stages(variant: ImageVariant, state: SearchState) -> Iterator[Stage]:
+    """Yield stages that match with views beside those of the index, which are rendered when first needed."""
+    tools, index = state.tools, state.tools.prepared
+    if not state.config.free_views:
+        return
+    views = index.free_views.of(tools.scene, tools.rasterizer, tools.matcher, index.views)
+    if not views:
+        return
+    scores = replace(state.retrieval, index=replace(index, views=views), _scores={}).scores(variant)
+    untried = deque(top_indices(scores, state.config.free_views))
+    while untried:
+        cameras = [views[i].camera for i in untried]
+        yield Stage(_search_free_views(cameras, scores[list(untried)], untried, variant, state), variant)
+
+
+def _search_free_views(
+    cameras: Sequence[Camera], scores: np.ndarray, untried: deque[int], variant: ImageVariant, state: SearchState
+) -> StageResult:
+    """Render views beside those of the index anew, and go from them to a refined pose."""
+    tools = state.tools
+    candidates = Candidates(np.stack([camera.pose.world_from_camera for camera in cameras]), scores)
+    yield IterationRecord("retrieve_free_views", cameras[0].pose, candidates=candidates)
+
+    def views() -> Iterator[View]:
+        for camera in cameras:
+            untried.popleft()
+            yield view_from(camera, tools.rasterizer, tools.matcher)
+
+    return (yield from _match_and_refine(views(), variant, state))
+
+
+def _match_and_refine(views: Iterable[View], variant: ImageVariant, state: SearchState) -> StageResult:
+    """Match with views, and refine the pose that most matches agree with, after a rematch if these are few."""
+    images, config = state.images, state.config
     features = state.retrieval.features(variant)
     found = yield from match_candidates(features, views, images, variant.max_error_px, config.matching)
-    # Chance matches grow with their number, so a share is required, too.
-    if found is None or found.num_inliers < max(config.min_inliers, config.min_inlier_share * len(found.inlier)):
+    if found is None or config.matching.may_be_chance(found):
         return StageOutcome(None)
     rounds = 0
     # With many inliers refinement converges from the pose as it is.

@@ -13,7 +13,7 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_cor
 from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
 from service.pose.retrieval.free_space import SPACE
+from service.pose.retrieval.free_views import FreeViews
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
 from service.pose.retrieval.scene_symmetries import SYMMETRY, like_its_mirror_image, repeats_itself
 from service.pose.retrieval.scores import SCORES
@@ -45,6 +46,8 @@ class ViewIndex:
     """Whether a mirrored photo of the scene may pass for one of the scene."""
     repeats_itself: bool = True
     """Whether a photo that fits one pose may fit another one."""
+    free_views: FreeViews = field(default_factory=FreeViews, compare=False)
+    """Views beside these, for photos that are like none of them."""
 
 
 def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:

@@ -176,11 +176,11 @@ def floaters(scene: GaussianScene) -> float:
     space = free_space_of(scene)
     size = PLACEMENT.floater_reach * space.distance
     cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
-    ids = _ids(cells)
+    ids = cell_ids(cells)
     order = np.argsort(ids)
     around = np.zeros(len(cells), int)
     for step in np.ndindex(3, 3, 3):
-        wanted = _ids(cells + np.array(step) - 1)
+        wanted = cell_ids(cells + np.array(step) - 1)
         at = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
         around += np.where(ids[at] == wanted, counts[at], 0)
     # The space has a sample of the points; neighbours become fewer in proportion.
@@ -220,7 +220,7 @@ class _Views:
         """Of the voxels that each sees."""
         self._space, self._rasterizer, self._config = space, rasterizer, config
         self._voxel = config.voxel_share * space.distance
-        points = _ids(np.floor(space.points / self._voxel).astype(np.int64))
+        points = cell_ids(np.floor(space.points / self._voxel).astype(np.int64))
         self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
 
     def add_candidates(self, poses: Sequence[Pose]) -> None:
@@ -250,7 +250,7 @@ class _Views:
             self.scores.append(float(solid.mean()))
             self._surfaces.append(transformed(camera.pose.world_from_camera, points))
             voxels = np.floor(self._surfaces[-1] / self._voxel).astype(np.int64)
-            self._surface_ids.append(np.unique(_ids(voxels)))
+            self._surface_ids.append(np.unique(cell_ids(voxels)))
 
     def good(self) -> Int64[np.ndarray, "k"]:
         """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior."""
@@ -279,10 +279,10 @@ class _Views:
         directions = np.rint(1.4 * rays / np.maximum(distances, 1e-12))
         octaves = np.floor(np.log2(np.maximum(distances, 1e-12)))
         voxels = np.floor(points / self._voxel)
-        return np.unique(_ids(np.concatenate([voxels, directions, octaves], 1).astype(np.int64)))
+        return np.unique(cell_ids(np.concatenate([voxels, directions, octaves], 1).astype(np.int64)))
 
 
-def _ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
+def cell_ids(rows: Int64[np.ndarray, "n d"]) -> Int64[np.ndarray, "n"]:
     """Return a hash of each row of small numbers; rare collisions do no harm."""
     result = np.zeros(len(rows), np.uint64)
     for column in rows.T:
