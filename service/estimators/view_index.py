@@ -45,7 +45,7 @@ from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.matching.match_stages import match_candidates, record_of, render_and_rematch, solve_matches
 from service.pose.matching.render_and_match import render_and_match
 from service.pose.refinement.refine_stage import refine_stage, rematch_and_refine
-from service.pose.retrieval.image_variant import ImageVariant
+from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.index import ViewIndex, prepared_index
 from service.pose.retrieval.scores import top_indices
 from service.results import Candidates, IterationRecord
@@ -111,8 +111,8 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     config, retrieval = state.config, state.retrieval
     has_cameras = bool(state.tools.scene.cameras)
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
-    variant = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
-    small = variant.scaled(config.small_photo_factor)
+    upright = retrieval.upright_variant() if has_cameras else ImageVariant(PHOTO_PX)
+    small = upright.scaled(config.small_photo_factor)
     if not retrieval.is_upright(small):
         small = retrieval.rotated_variant(small, likeliest_only=True)
     views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
@@ -121,11 +121,11 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
     yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small)
     # Anew: of a small copy the wrong rotation may have looked better.
-    variant = retrieval.rotated_variant(variant)
+    variant = retrieval.rotated_variant(upright)
     views = top_indices(retrieval.scores(variant), options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
     yield Stage(_search_views(name, variant, deque(views), state), variant)
-    full_size, variant = variant, variant.scaled(config.large_photo_factor)
+    variant = variant.scaled(config.large_photo_factor)
     ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
     untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
     # A stage ends early where matches or refinement fail; the next goes on with the other views.
@@ -133,7 +133,7 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
         yield Stage(_search_views("retrieve_more_views", variant, untried, state), variant)
     if options.effort == "fast":
         return
-    yield from _free_view_stages(full_size, state)
+    yield from _free_view_stages(upright, state)
     if options.effort == "normal" and not state.recognised:
         return
     for _ in range(config.sample_rounds if options.effort == "normal" else config.max_sample_rounds):
@@ -173,7 +173,7 @@ def _search_views(
     return (yield from _match_and_refine(views, variant, state))
 
 
-def _free_view_stages(variant: ImageVariant, state: SearchState) -> Iterator[Stage]:
+def _free_view_stages(upright: ImageVariant, state: SearchState) -> Iterator[Stage]:
     """Yield stages that match with views beside those of the index, which are rendered when first needed."""
     tools, index = state.tools, state.tools.prepared
     if not state.config.free_views:
@@ -181,7 +181,9 @@ def _free_view_stages(variant: ImageVariant, state: SearchState) -> Iterator[Sta
     views = index.free_views.of(tools.scene, tools.rasterizer, tools.matcher, index.views)
     if not views:
         return
-    scores = replace(state.retrieval, index=replace(index, views=views), _scores={}).scores(variant)
+    retrieval = Retrieval(state.images, replace(index, views=views), state.config.retrieval)
+    variant = retrieval.rotated_variant(upright)
+    scores = retrieval.scores(variant)
     untried = deque(top_indices(scores, state.config.free_views))
     while untried:
         cameras = [views[i].camera for i in untried]
@@ -201,15 +203,22 @@ def _search_free_views(
             untried.popleft()
             yield view_from(camera, tools.rasterizer, tools.matcher)
 
-    return (yield from _match_and_refine(views(), variant, state))
+    # The last views there are: of few matches, too, a render at the pose tells whether they are chance.
+    return (yield from _match_and_refine(views(), variant, state, min_share=0.0))
 
 
-def _match_and_refine(views: Iterable[View], variant: ImageVariant, state: SearchState) -> StageResult:
-    """Match with views, and refine the pose that most matches agree with, after a rematch if these are few."""
+def _match_and_refine(
+    views: Iterable[View], variant: ImageVariant, state: SearchState, min_share: float | None = None
+) -> StageResult:
+    """Match with views, and refine the pose that most matches agree with, after a rematch if these are few.
+
+    `min_share`: of the matches, if it isn't the usual one.
+    """
     images, config = state.images, state.config
+    matching = config.matching if min_share is None else replace(config.matching, min_inlier_share=min_share)
     features = state.retrieval.features(variant)
-    found = yield from match_candidates(features, views, images, variant.max_error_px, config.matching)
-    if found is None or config.matching.may_be_chance(found):
+    found = yield from match_candidates(features, views, images, variant.max_error_px, matching)
+    if found is None or matching.may_be_chance(found):
         return StageOutcome(None)
     rounds = 0
     # With many inliers refinement converges from the pose as it is.
