@@ -6,8 +6,8 @@
     -> verification gate -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
 At first a small copy of the photo is compared, rotated as its corners suggest if no view is much like it. Only if the
-gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; then poses
-sampled near views. From a prior pose refinement is tried first; where that fails, a render at the prior pose is the
+gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; views
+beside the index (`free_views`); then poses sampled near views. From a prior pose refinement is tried first; where that fails, a render at the prior pose is the
 first candidate view of the first search, if that is of the upright photo. `SearchConfig` says where sizes and
 thresholds come from.
 """
@@ -59,8 +59,8 @@ class Options:
     sixteenth of all, whichever is more. The small copy before is matched with two, at most."""
     effort: Literal["fast", "normal", "exhaustive"] = "normal"
     """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, and
-    with the photo turned. `normal`: then among sampled poses, if something in the photo was recognised.
-    `exhaustive`: among sampled poses until the budget ends."""
+    with the photo turned. `normal`: then among views beside the index, and among sampled poses if something in the
+    photo was recognised. `exhaustive`: among sampled poses until the budget ends."""
 
     __pydantic_config__: ClassVar = {"extra": "forbid", "use_attribute_docstrings": True}
 
