@@ -176,7 +176,8 @@ def _search_views(
 def _free_view_stages(upright: ImageVariant, state: SearchState) -> Iterator[Stage]:
     """Yield stages that match with views beside those of the index, which are rendered when first needed."""
     tools, index = state.tools, state.tools.prepared
-    if not state.config.free_views:
+    few_features = len(state.images.features().scores) < state.config.verification.min_features
+    if not state.config.free_views or few_features:
         return
     views = index.free_views.of(tools.scene, tools.rasterizer, tools.matcher, index.views)
     if not views:
