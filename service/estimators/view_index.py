@@ -7,9 +7,9 @@
 
 At first a small copy of the photo is compared, rotated as its corners suggest if no view is much like it. Only if the
 gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; views
-beside the index (`free_views`); then poses sampled near views. From a prior pose refinement is tried first; where that fails, a render at the prior pose is the
-first candidate view of the first search, if that is of the upright photo. `SearchConfig` says where sizes and
-thresholds come from.
+beside the index (`free_views`); then poses sampled near views. From a prior pose refinement is tried first; where that
+fails, a render at the prior pose is the first candidate view of the first search, if that is of the upright photo.
+`SearchConfig` says where sizes and thresholds come from.
 """
 
 from __future__ import annotations
