@@ -174,6 +174,27 @@ def test_the_covariance_of_a_placed_pose_is_that_of_its_parts():
     assert placed.pose.position_in_world == pytest.approx((truth.matrix @ [1, 2, 0.5, 1])[:3])
 
 
+def test_a_registration_by_another_scene_has_the_uncertainty_of_both():
+    """Against samples: a point of the scene goes to the other scene's world, and from there to its target."""
+    rng = np.random.default_rng(12)
+    first, second = planted(rng), planted(rng)
+    spread = np.diag([0.01, 0.02, 0.015, 0.1, 0.05, 0.08, 0.02])
+    inner = Registration(first.matrix, np.array([0.3, -0.2, 0.1]), spread**2, PARTS, "")
+    other = Registration(second.matrix, np.array([1.0, 0.5, -1.0]), 0.25 * spread**2, PARTS, "", origin=Origin(1, 2, 3))
+    both = inner.onto(other)
+    assert both.target_from_world == pytest.approx(second.matrix @ first.matrix)
+    assert both.origin == other.origin
+    point = np.array([1.0, 2.0, 0.5])
+    samples = []
+    for _ in range(4000):
+        moved = first.about(inner.centre_in_world).moved(spread @ rng.normal(size=7)).matrix
+        onto = second.about(other.centre_in_world).moved(0.5 * spread @ rng.normal(size=7)).matrix
+        samples.append((onto @ moved @ [*point, 1.0])[:3])
+    placed = both.placed(look_at(point, np.zeros(3), UP), None)
+    expected = np.cov(np.array(samples).T)
+    assert placed.position_covariance == pytest.approx(expected, rel=0.2, abs=0.03 * np.trace(expected))
+
+
 def test_the_worked_example_prints_what_the_page_says(capsys):
     text = (Path(__file__).parents[1] / "docs" / "registration.md").read_text("utf-8")
     exec("\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL)), {})

@@ -20,12 +20,13 @@ from service.cli.terminal import (
     registrations_folder,
     say,
 )
-from service.errors import InvalidRequest
+from service.errors import InvalidRequest, RegistrationFailed
 
 if TYPE_CHECKING:
     from service.localize import LoadedScene
-    from service.registration.gathering import LocalizedPhoto
+    from service.registration.gathering import GatherOptions, LocalizedPhoto
     from service.registration.known_places.known_place import KnownPlace, KnownPlaces
+    from service.registration.known_places.scene_points import ScenePoints
     from service.registration.registration import Registration
     from service.registration.registration_file import RegistrationFile
 
@@ -41,6 +42,9 @@ def register_scene(
             help="Where they were taken: CSV or JSON table, transforms.json of an AR recorder, Record3D's metadata, "
             "TUM trajectory, folder of a COLMAP model. Default: GPS in the photos' EXIF."
         ),
+    ] = None,
+    onto: Annotated[
+        Path | None, typer.Option(help="Another scene of the same place, registered or with a known unit.")
     ] = None,
     points: Annotated[str, typer.Option(help="Points, lengths and floor points of the scene: JSON or a file.")] = "",
     times: Annotated[str, typer.Option(help="For a trajectory: JSON list of the photos' times, or a file.")] = "",
@@ -72,20 +76,49 @@ def register_scene(
     axis = unit_vector(parsed_option(up, "--up"), "--up") if up else None
     options = GatherOptions(axis, metres_per_unit, drift)
     picked = scene_points.read(parsed_option(points, "--points"), "--points") if points else None
-    known, chosen = _known_photos(photos or [], places, parsed_option(times, "--times"), geoid_m)
-    if not chosen and picked is None:
-        raise InvalidRequest(
-            "nothing to register by.", where="photos", hint="Name photos, --places with photos, or --points."
-        )
-    step = max(1, -(-len(chosen) // count))
-    # Last: faults of the files are reported without waiting for it.
-    loaded = loaded_scene(scene, "view_index" if chosen else None, matcher)
-    localized, missed = _localized(chosen[::step], loaded)
-    found = _registered(loaded, known, localized, picked, options)
-    found = replace(found, warnings=(*known.warnings, *missed, *found.warnings))
+    if onto is not None:
+        if photos or places or picked:
+            raise InvalidRequest("needs no photos, places or points.", where="--onto")
+        found = _by_scene(scene, onto, matcher, count, options)
+    else:
+        known, chosen = _known_photos(photos or [], places, parsed_option(times, "--times"), geoid_m)
+        if not chosen and picked is None:
+            raise InvalidRequest(
+                "nothing to register by.", where="photos", hint="Name photos, --places with photos, or --points."
+            )
+        found = _by_photos(scene, known, chosen[:: max(1, -(-len(chosen) // count))], picked, matcher, options)
     if not dry_run:
         found = file.add(found)
     _show(found, None if dry_run else file.path, as_json=as_json)
+
+
+def _by_photos(
+    scene: Path,
+    known: KnownPlaces,
+    chosen: Sequence[tuple[KnownPlace, Path]],
+    picked: ScenePoints | None,
+    matcher: str,
+    options: GatherOptions,
+) -> Registration:
+    loaded = loaded_scene(scene, "view_index" if chosen else None, matcher)
+    localized, missed = _localized(chosen, loaded)
+    found = _registered(loaded, known, localized, picked, options)
+    return replace(found, warnings=(*known.warnings, *missed, *found.warnings))
+
+
+def _by_scene(scene: Path, onto: Path, matcher: str, count: int, options: GatherOptions) -> Registration:
+    """Register the scene in another one's world, and from there in its target frame."""
+    from service.cli.scenes_onto import renders_in, target_of
+
+    other, target = target_of(onto, matcher)
+    loaded = loaded_scene(scene)
+    known, localized, missed = renders_in(other, loaded, count)
+    found = _registered(loaded, known, localized, None, options)
+    found = replace(found, warnings=(*missed, *found.warnings))
+    # A part of it would be in units of the other scene's world, which are no metres.
+    if not found.is_complete:
+        raise RegistrationFailed(found.reason, where="--onto", hint="Render more of it: --count.")
+    return found.onto(target)
 
 
 def _undo(file: RegistrationFile) -> None:
@@ -173,7 +206,13 @@ def _localized(
     return found, missed
 
 
-def _registered(loaded: LoadedScene, known: KnownPlaces, localized: Sequence, picked, options) -> Registration:
+def _registered(
+    loaded: LoadedScene,
+    known: KnownPlaces,
+    localized: Sequence[LocalizedPhoto],
+    picked: ScenePoints | None,
+    options: GatherOptions,
+) -> Registration:
     import time
 
     import numpy as np
@@ -184,6 +223,7 @@ def _registered(loaded: LoadedScene, known: KnownPlaces, localized: Sequence, pi
     scene = loaded.scene
     cameras = [c.camera.pose.position_in_world for c in scene.cameras]
     above = np.mean(cameras, axis=0) if cameras else np.median(scene.means, axis=0).astype(np.float64)
+    above = above + scene.info.origin_in_world
     evidence, origin = gathered(known, localized, picked, scene.info, above, options)
     found = register(evidence, np.random.default_rng(0))
     return replace(found, origin=origin, source=known.kind, scene_sha256=scene.info.sha256, created=time.time())

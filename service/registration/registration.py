@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -120,6 +120,29 @@ class Registration:
         place = self.origin
         return GeoAnchor(place.latitude_deg, place.longitude_deg, place.height_m, self.target_from_world)
 
+    def onto(self, other: Registration) -> Registration:
+        """Return the registration in the target frame of another scene, if this one's target is that scene's world.
+
+        Both must be complete. Residuals are then in metres.
+        """
+        scale, rotation = other.scale, other.target_from_world[:3, :3] / other.scale
+        centre = (self.target_from_world @ [*self.centre_in_world, 1.0])[:3]
+        arm = other.target_from_world[:3, :3] @ (centre - other.centre_in_world)
+        inner, outer = np.eye(7), np.eye(7)
+        inner[:3, :3], inner[3:6, 3:6] = rotation, scale * rotation
+        # The other's small rotations and scales move this one's centre.
+        outer[3:6, :3], outer[3:6, 6] = -hat(arm), arm
+        covariance = inner @ self.covariance @ inner.T + outer @ other.covariance @ outer.T
+        residuals = tuple(replace(r, metres=None if r.metres is None else r.metres * scale) for r in self.residuals)
+        return replace(
+            self,
+            target_from_world=other.target_from_world @ self.target_from_world,
+            covariance=covariance,
+            residuals=residuals,
+            up_in_target=other.up_in_target,
+            origin=other.origin,
+        )
+
     def placed(self, pose: Pose, covariance: Float64[np.ndarray, "6 6"] | None) -> PlacedPose | None:
         """Return a pose of the scene's world in the target frame, None if the registration is incomplete.
 
@@ -139,3 +162,9 @@ class Registration:
         own = np.zeros((6, 6)) if covariance is None else covariance
         units = np.diag([1.0, 1.0, 1.0, scale, scale, scale])
         return PlacedPose(Pose(matrix), change @ self.covariance @ change.T + units @ own @ units)
+
+
+def by_unit(metres_per_unit: float, up_in_world: tuple[float, float, float] | None) -> Registration:
+    """Return the registration of a scene in its own world's axes, by a unit that is certain."""
+    matrix = np.diag([metres_per_unit, metres_per_unit, metres_per_unit, 1.0])
+    return Registration(matrix, np.zeros(3), np.zeros((7, 7)), PARTS, "", up_in_target=up_in_world)
