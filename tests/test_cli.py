@@ -486,3 +486,21 @@ def test_a_scene_is_registered_by_a_length_and_a_floor(splatfix, room, tmp_path)
     code, _, errors = splatfix("scenes", "register", scene)
     assert code == 2
     assert "nothing to register by" in errors
+
+
+def test_a_scene_is_registered_by_another_one(splatfix, room, tmp_path):
+    """By renders of the room turned about z and twice as large, in the room itself, whose unit is 3 m."""
+    scene, other = tmp_path / "turned", tmp_path / "room"
+    shutil.copytree(room, scene)
+    shutil.copytree(room, other)
+    similarity = np.array([[0.0, -2.0, 0.0, 1.0], [2.0, 0.0, 0.0, 5.0], [0.0, 0.0, 2.0, -3.0], [0.0, 0.0, 0.0, 1.0]])
+    (scene / "scene.json").write_text(json.dumps({"world_from_scene": similarity.tolist()}))
+    code, _, errors = splatfix("scenes", "register", scene, "--onto", other, "--count", 3)
+    assert code == 2
+    assert "neither registered, nor is its unit known" in errors
+    length = {"from_in_world": [0, 0, 0], "to_in_world": [1, 0, 0], "metres": 3}
+    assert splatfix("scenes", "register", other, "--points", json.dumps({"lengths": [length]}))[0] == 0
+    code, told, errors = splatfix("scenes", "register", scene, "--onto", other, "--count", 3, "--json")
+    assert code == 0, errors
+    found = np.array(json.loads(told)["target_from_world"])
+    assert found @ similarity == pytest.approx(np.diag([3.0, 3.0, 3.0, 1.0]), abs=0.05)

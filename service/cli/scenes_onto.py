@@ -17,6 +17,7 @@ from service.registration.known_places.known_place import KnownPlace, KnownPlace
 from service.registration.registration import Registration, by_unit
 from service.results import PoseEstimate, Status
 from service.scene_manager.scene_images import picture
+from service.scene_manager.scene_registrations import registered_info
 from service.scene_manager.status import PictureSpec
 from service.scene_origin import shifted
 from service.types import Camera
@@ -32,6 +33,7 @@ def target_of(other: Path, matcher: str) -> tuple[LoadedScene, Registration]:
     known = scene_registrations([other], [loaded])[0]
     if known is not None and known.is_complete:
         return loaded, known
+    info = registered_info(info, known)
     if info.metres_per_unit is None:
         raise RegistrationFailed(
             "the scene is neither registered, nor is its unit known.",
