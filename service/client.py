@@ -127,6 +127,20 @@ class Prior:
 
 
 @dataclass(frozen=True)
+class Accuracy:
+    """How accurate a pose must be to be localized: bounds of its rotation, and of its position in one measure."""
+
+    deg: float = 5.0
+    units: float | None = None
+    metres: float | None = None
+    share: float | None = None
+    """Of the distance to what is seen; 0.02 if the others are None, too."""
+
+    def fields(self) -> Json:
+        return {name: value for name, value in self.__dict__.items() if value is not None}
+
+
+@dataclass(frozen=True)
 class Frame:
     """The answer for one photo of a sequence, or one frame of a video."""
 
@@ -164,8 +178,12 @@ class Result:
     """`localized`: use the pose. `uncertain`: check it. `not_localized`: don't use it."""
     reason: str
     hint: str
+    advice: tuple[str, ...]
+    """What would help this photo, by what was seen."""
     score: float
-    """Calibrated probability that the pose is right."""
+    """Probability that the pose is as accurate as was asked for: `right_place` times `precise`."""
+    right_place: float | None
+    precise: float | None
     pose: Pose
     intrinsics: Intrinsics
     covariance: np.ndarray | None
@@ -253,6 +271,9 @@ def _result(raw: Json) -> Result:
     names = ("status", "reason", "hint", "score")
     return Result(
         **{name: raw[name] for name in names},
+        advice=tuple(raw.get("advice", ())),
+        right_place=raw.get("right_place"),
+        precise=raw.get("precise"),
         pose=_pose(raw["pose"]["world_from_camera"]["matrix"]),
         intrinsics=Intrinsics.parse(raw["intrinsics"]),
         covariance=_covariance(raw),
@@ -347,7 +368,7 @@ def _form(photos: Photo | Sequence[Photo], fields: Mapping[str, Any]) -> Json:
     data: Json = {}
     for name, value in fields.items():
         value = {"world_from_camera": value.world_from_camera.tolist()} if isinstance(value, Pose) else value
-        value = value.fields() if isinstance(value, Prior) else value
+        value = value.fields() if isinstance(value, (Prior, Accuracy)) else value
         value = dict(value.__dict__) if isinstance(value, Intrinsics) else value
         value = value.tolist() if isinstance(value, np.ndarray) else value
         if value is not None:
@@ -464,7 +485,8 @@ class Client:
     ) -> Result:
         """Localize a photo, a video, or several photos of one camera in their order; wait for the result.
 
-        `fields` are those of docs/api.md: `scene`, `intrinsics` (Intrinsics), `prior` (Prior), `times_s`, ...
+        `fields` are those of docs/api.md: `scene`, `intrinsics` (Intrinsics), `prior` (Prior), `accuracy` (Accuracy),
+        `times_s`, ...
         `on_record` is called with each step. Raises ServiceError; a photo that is not localized is a result.
         """
         job = self.submit(photos, timeout_s=timeout_s, **fields)

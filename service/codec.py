@@ -86,12 +86,20 @@ def _member(members: tuple[Any, ...], value: Any) -> Any:
         return type(None)
     for member in members:
         is_object = dataclasses.is_dataclass(member)
-        if is_object and isinstance(value, dict) and set(value) == set(_field_names(member)):  # type: ignore[arg-type]
+        if is_object and isinstance(value, dict) and _has_fields(member, value):  # type: ignore[arg-type]
             return member
         # Unions of the stored classes differ in their fields or in the JSON type.
         if not is_object and member is not type(None) and _fits(member, value):
             return member
     raise ValueError(f"no member of {members} fits {type(value).__name__}")
+
+
+def _has_fields(kind: type, value: dict[str, Any]) -> bool:
+    """Whether an object is of this dataclass: of its fields those with a default may be missing."""
+    fields = dataclasses.fields(kind)
+    missing = (dataclasses.MISSING, dataclasses.MISSING)
+    needed = {field.name for field in fields if (field.default, field.default_factory) == missing}
+    return needed <= value.keys() <= {field.name for field in fields}
 
 
 def _fits(member: Any, value: Any) -> bool:

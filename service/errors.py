@@ -2,7 +2,7 @@
 
     SplatfixError
       |-- BadInput           the caller's mistake
-      |     |-- InvalidImage, InvalidIntrinsics, InvalidPrior, InvalidOptions, InvalidRequest
+      |     |-- InvalidImage, InvalidIntrinsics, InvalidPrior, InvalidAccuracy, InvalidOptions, InvalidRequest
       |     |-- RegistrationFailed  (what is known of a scene's place determines nothing)
       |     `-- UnknownName  (a plug-in, scene or modification that does not exist; lists what does)
       |-- SceneError
@@ -69,6 +69,10 @@ class InvalidIntrinsics(BadInput):
 
 class InvalidPrior(BadInput):
     code = "invalid_prior"
+
+
+class InvalidAccuracy(BadInput):
+    code = "invalid_accuracy"
 
 
 class InvalidOptions(BadInput):

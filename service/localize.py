@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.errors import BackendMissing, EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.interfaces import Answer, ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
@@ -32,6 +33,7 @@ from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.features.untold_background import WHITE, has_white_border, shows_background
+from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.gate import VERIFICATION, downgraded, verify
 from service.render import RASTERIZERS
 from service.render.render_counter import Counted
@@ -199,6 +201,8 @@ class Request:
     cancel: threading.Event | None = None
     config: Any = None
     """The estimator's tuning, for benches; None: its default."""
+    accuracy: Accuracy = DEFAULT_ACCURACY
+    """How accurate a pose must be to be `localized`."""
 
 
 def localize(
@@ -207,9 +211,10 @@ def localize(
     request: Request | None = None,
     on_record: Callable[[IterationRecord], None] | None = None,
 ) -> PoseEstimate:
-    """Run one estimator on one photo and verify its answer. Raises Cancelled, UnknownName, BackendMissing.
+    """Run one estimator on one photo and verify its answer.
 
-    Poses are in the world, those of the query and of what is returned and reported.
+    Poses are in the world, those of the query and of what is returned and reported. Raises Cancelled, UnknownName,
+    BackendMissing; InvalidAccuracy for metres in a scene without a scale.
     """
     origin = loaded.scene.info.origin_in_world
     if not any(origin):
@@ -230,6 +235,7 @@ def localize_in_scene(
 ) -> PoseEstimate:
     """Localize as `localize` does, with all positions relative to the scene's origin (`service/scene_origin.py`)."""
     request = request or Request()
+    query = asked_of(query, loaded, request)
     loaded = loaded.as_seen_by(query)
     plugin = ESTIMATORS.load(request.estimator)
     _require_matching(request.estimator, loaded)
@@ -260,10 +266,29 @@ def localize_in_scene(
         answer.verdict if answer else render_and_verify(QueryImages(query, loaded.matcher), last.pose, tools.rasterizer)
     )
     verdict = _qualified(verdict, last, trace.exhausted)
+    advice = _advice(query, loaded, verdict, last, tools.rasterizer)
     timings = _timings(trace.records, clock)
-    return estimate_of(
+    found = estimate_of(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
     )
+    return replace(found, advice=advice)
+
+
+def _advice(
+    query: Query, loaded: LoadedScene, verdict: Verdict, last: IterationRecord, rasterizer: Rasterizer
+) -> tuple[str, ...]:
+    """Return what would help a photo that isn't localized; for one that is, nothing is measured."""
+    if verdict.status is Status.LOCALIZED:
+        return ()
+    others = () if last.alternatives is None else tuple(map(Pose, last.alternatives.world_from_camera))
+    extent = content_extent(loaded.scene.means)
+    return advice_for(QueryImages(query, loaded.matcher), last.pose, rasterizer, verdict, others, extent)
+
+
+def asked_of(query: Query, loaded: LoadedScene, request: Request) -> Query:
+    """Return the query with the accuracy that the request asks for. Raises InvalidAccuracy."""
+    info = loaded.scene.info
+    return replace(query, accuracy=request.accuracy.in_units(info.name, info.metres_per_unit))
 
 
 @dataclass(slots=True)
@@ -423,7 +448,7 @@ def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verd
     # What other poses have of the probability, this one hasn't, however well it fits.
     share = 1.0 if last.alternatives is None else 1.0 - float(last.alternatives.scores.sum())
     if share < VERIFICATION.min_localized:
-        return downgraded(verdict, Reason.AMBIGUOUS, share * verdict.score)
+        return downgraded(verdict, Reason.AMBIGUOUS, share * verdict.place_probability)
     # A pose that was found and verified in time counts, however the search would have gone on.
     if exhausted and verdict.status is not Status.LOCALIZED:
         return replace(verdict, reason=Reason.BUDGET_EXHAUSTED)

@@ -163,9 +163,7 @@ class Verdict:
     status: Status
     reason: Reason
     score: float
-    """Probability, 0..1, that the pose is right, if right and wrong poses were equally frequent: within 5 degrees and
-    1/80 of the training cameras' median distance from the scene's focus. The same model for every estimator; at most
-    0.5 where the intrinsics or the position are in doubt. At least 0.8 is `localized`."""
+    """Probability, 0..1, that the pose is as accurate as was asked for: the product of `right_place` and `precise`."""
     inliers: int
     """Matches between the photo and the render at the pose that agree with it; 0 where none were made, as for a
     photo of a sequence that its alignment alone makes clear."""
@@ -191,6 +189,26 @@ class Verdict:
     """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)
     """All signals that the gate measured, by name; `service/pose/verification/gate.py` describes them."""
+    right_place: float | None = None
+    """Probability, 0..1, that the pose is right as far as its place is concerned, if right and wrong poses were equally
+    frequent: within 5 degrees and 1/80 of the training cameras' median distance from the scene's focus. The same model
+    for every estimator. None: version 0.1.0 had but the score."""
+    precise: float | None = None
+    """Probability, 0..1, that a pose in the right place is within the bounds asked for, by its covariance without what
+    another step of refinement would change, which counts in `right_place`; at most 0.5 where the intrinsics are in
+    doubt. None as `right_place`."""
+    asked: tuple[float, float] | None = None
+    """The bounds asked for at this pose: degrees, and scene units. None as `right_place`."""
+
+    @property
+    def place_probability(self) -> float:
+        """`right_place`; of results of version 0.1.0 their score."""
+        return self.score if self.right_place is None else self.right_place
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """What the better of two answers to a photo has more of: acceptance, then a surer place."""
+        return self.status is Status.LOCALIZED, self.place_probability
 
     @property
     def focal_sigma(self) -> float:
@@ -228,6 +246,8 @@ class PoseEstimate:
     records: tuple[IterationRecord, ...]
     scene_ranking: tuple[tuple[str, int], ...] = ()
     """Where several scenes were searched: each one's id, and how many matches agreed, best first."""
+    advice: tuple[str, ...] = ()
+    """What would help, by what was seen, the most helpful first; nothing for a pose that is localized."""
 
     @property
     def alternatives(self) -> tuple[tuple[Pose, float], ...]:

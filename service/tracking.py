@@ -27,6 +27,7 @@ from service.localize import (
     Clock,
     LoadedScene,
     Request,
+    asked_of,
     estimate_of,
     localize_in_scene,
     rasterizer_for,
@@ -41,7 +42,8 @@ from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import appearance
 from service.pose.verification.gate import VERIFICATION, VerificationConfig, photometric_suffices, verdict_of
-from service.pose.verification.signals import geometry_signals
+from service.pose.verification.precision import AskedBounds
+from service.pose.verification.signals import geometry_signals, typical_depth
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene
@@ -137,6 +139,7 @@ class Tracker:
         if self._request.cancel is not None and self._request.cancel.is_set():
             raise Cancelled
         self._loaded = self._loaded.as_seen_by(query)
+        query = asked_of(query, self._loaded, self._request)
         # Equal intervals of 1: only their ratios matter.
         if time_s is None:
             time_s = self._past[-1][0] + 1.0 if self._past else 0.0
@@ -202,7 +205,7 @@ class Tracker:
         if followed is not None:
             spent = {"timings": followed.timings + found.timings, "renders": followed.renders + found.renders}
             # Both were verified by the same gate, so their scores compare.
-            if followed.verdict.score >= found.verdict.score:
+            if followed.verdict.rank >= found.verdict.rank:
                 return replace(followed, budget_exhausted=found.budget_exhausted, **spent)
             found = replace(found, **spent)
         self._past.clear()  # the camera didn't come here at a known velocity
@@ -290,7 +293,8 @@ def verify_tracked(
     # A shared focal length is not for one photo to doubt.
     focal_step = 0.0 if lens_prior else found.uncertainty.focal_step
     uncertainty = replace(found.uncertainty, last_step=np.zeros(6), focal_step=focal_step)
-    return verdict_of(signals, uncertainty, config=config)
+    asked = AskedBounds.of(images.query.accuracy, typical_depth(frame))
+    return verdict_of(signals, uncertainty, asked, config=config)
 
 
 @dataclass(slots=True)

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.distortion import composed
 from service.errors import InvalidIntrinsics, InvalidPrior
 
@@ -383,6 +384,8 @@ class Query:
     """Of approximate intrinsics, by default that of their source; None of exact ones: nothing of them is estimated."""
     region: PriorRegion | None = None
     """Poses outside are refused."""
+    accuracy: Accuracy = DEFAULT_ACCURACY
+    """What a pose must be certain within; without metres."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))

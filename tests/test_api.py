@@ -545,6 +545,11 @@ BAD_FIELDS = [
     ({"truth": {"box": [[0, 0, 0], [1, 1, 1]]}}, 422, "invalid_prior", "truth.box"),
     ({"truth": {"world_from_camera": SHEARED}}, 422, "invalid_prior", "truth.world_from_camera"),
     ({"prior": {"convention": "blender"}}, 422, "invalid_prior", "prior.convention"),
+    ({"accuracy": {"metres": 0.1}}, 422, "invalid_accuracy", "accuracy.metres"),
+    ({"accuracy": {"metres": 0.1, "share": 0.1}}, 422, "invalid_accuracy", "accuracy.share"),
+    ({"accuracy": {"deg": 0}}, 422, "invalid_accuracy", "accuracy.deg"),
+    ({"accuracy": {"cm": 3}}, 422, "invalid_accuracy", "accuracy.cm"),
+    ({"accuracy": "{"}, 422, "invalid_accuracy", "accuracy"),
     ({"seed": "x"}, 400, "invalid_request", "seed"),
     ({"seed": "-1"}, 400, "invalid_request", "seed"),
     ({"seed": str(2**63)}, 400, "invalid_request", "seed"),
@@ -560,6 +565,7 @@ def test_a_refusal_names_what_is_allowed_with_an_example_that_is_right(shared):
     wrong = {
         **{"seed": "x", "budget_s": "0", "deadline_s": "0", "camera_id": "/", "every": "0", "keep_photo": "maybe"},
         **{"options": "{", "prior": {"pose": 1}, "truth": {"pose": 1}, "intrinsics": {"fov": 60}, "times_s": "[1]"},
+        "accuracy": {"cm": 3},
     }
     assert wrong.keys() <= hints.EXAMPLES.keys()
     for field, value in wrong.items():

@@ -21,7 +21,7 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 FLOORS = {
     "service": [
         {
-            *("types", "results", "errors", "plugins", "logs", "versions", "distortion", "client", "codec"),
+            *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "client", "codec"),
             "operating_system",
         },
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
@@ -55,6 +55,8 @@ FLOORS = {
 SAME_FLOOR = {
     "service": {
         ("types", "errors"),
+        ("types", "accuracy"),
+        ("accuracy", "errors"),
         ("types", "distortion"),
         ("results", "types"),
         ("plugins", "errors"),

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from service.accuracy import Accuracy
 from service.bench import localize as bench
 from service.bench import modifications
 from service.bench import render as render_bench
@@ -194,7 +195,8 @@ class TestRun:
         near = moved(poses()[5], np.array([np.radians(2), 0, 0, 0, 0, 0]))
         runs["answer"] = lambda query, index: [poses()[0], poses()[0], near][index - 1]  # the first warms up
         steps = []
-        outcome = bench.run(folder, progress=lambda done, total: steps.append((done, total)))
+        asked = Accuracy(deg=1.0, share=0.05)
+        outcome = bench.run(folder, accuracy=asked, progress=lambda done, total: steps.append((done, total)))
         demanded = {
             "scene", "estimator", "start", "queries", "success_5deg_0p05", "success_1deg_0p01",
             "median_rotation_deg", "median_translation_units", "localized", "false_localized",
@@ -204,6 +206,11 @@ class TestRun:
         assert json.loads(json.dumps(outcome)) == outcome
         assert (outcome["queries"], outcome["localized"], outcome["false_localized"]) == (2, 2, 0)
         assert (outcome["success_5deg_0p05"], outcome["success_1deg_0p01"]) == (1.0, 0.5)
+        assert (outcome["success_asked"], outcome["false_asked"]) == (0.5, 1)
+        # Everything that the fake rasterizer shows is 2 scene units away.
+        bounds = [line["asked_units"] / outcome["units_per_scene_unit"] for line in outcome["per_query"]]
+        assert bounds == pytest.approx([0.1, 0.1])
+        assert all(request.accuracy == asked for _, request in runs["queries"])
         assert outcome["median_rotation_deg"] == pytest.approx(1)
         assert [line["photo"] for line in outcome["per_query"]] == ["images/0.png", "images/5.png"]
         assert steps == [(1, 2), (2, 2)]

@@ -29,6 +29,7 @@ from PIL import ExifTags, Image
 import service
 import service.__main__
 from service import jit
+from service.accuracy import Accuracy
 from service.cli.render import render
 from service.geometry import moved, pose_distance
 from service.types import Pose
@@ -263,6 +264,8 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         "dark=0.5",
         "--options",
         '{"candidates": 3}',
+        "--accuracy",
+        '{"units": 0.5}',
         "--misses",
         tmp_path / "misses",
         "--json",
@@ -273,6 +276,7 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
     assert asked.pop("on_miss")
     assert (tmp_path / "misses").is_dir()
     assert asked.pop("options").candidates == 3
+    assert asked.pop("accuracy") == Accuracy(units=0.5)
     assert asked.pop("budget") == service.bench.localize.Budget(None, 9)
     assert asked.pop("cache_dir") == Path(os.environ["SPLATFIX_CACHE_DIR"])
     assert asked == {

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from service.accuracy import Accuracy
 from service.codec import VERSION, decode, encode
 from service.errors import Failure
 from service.jobs.model import JobRecord, JobSpec, SequenceFrame
@@ -53,6 +54,7 @@ STORED_RECORD = {
         "frame": {
             **{"index": 0, "name": "a.jpg", "time_s": 1.5, "status": "localized", "reason": "verified", "score": 0.75},
             **{"tracked": True, "pose": {"world_from_camera": IDENTITY}, "covariance": None},
+            **{"right_place": 0.875, "precise": 0.5},
         },
     },
 }
@@ -79,6 +81,7 @@ STORED_SPEC = {
         },
         **{"truth": None, "every": 2, "times_s": [0.5, 1.0], "seed": 7, "budget_s": 0.1, "deadline_s": None},
         "keep_photo": True,
+        "accuracy": {"deg": 2.0, "units": 0.5, "metres": None, "share": None},
     },
 }
 
@@ -113,6 +116,18 @@ def test_a_spec_of_before_lenses_were_remembered_is_read():
     value = {name: item for name, item in STORED_SPEC["value"].items() if name not in ("camera_id", "lens")}
     spec = decode(JobSpec, json.dumps({"version": 1, "value": value}))
     assert (spec.camera_id, spec.lens, spec.seed) == (None, None, 7)
+
+
+def test_what_was_stored_before_an_accuracy_could_be_asked_for_is_read():
+    frame = {k: v for k, v in STORED_RECORD["value"]["frame"].items() if k not in ("right_place", "precise")}
+    value = STORED_RECORD["value"] | {"frame": frame}
+    record = decode(JobRecord, json.dumps({"version": 1, "value": value}))
+    assert record.frame
+    assert (record.frame.score, record.frame.right_place) == (0.75, None)
+    value = {name: item for name, item in STORED_SPEC["value"].items() if name != "accuracy"}
+    assert decode(JobSpec, json.dumps({"version": 1, "value": value})).accuracy == Accuracy(deg=5.0, share=0.02)
+    with pytest.raises(ValueError, match="no member"):
+        decode(JobRecord, json.dumps({"version": 1, "value": STORED_RECORD["value"] | {"frame": frame | {"x": 1}}}))
 
 
 def test_numbers_survive_exactly():

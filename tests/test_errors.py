@@ -259,6 +259,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("localize_photo", "invalid_image"): lambda s: send_photo(s, b"x"),
     ("localize_photo", "invalid_intrinsics"): lambda s: send_photo(s, intrinsics=NO_FOCAL),
     ("localize_photo", "invalid_prior"): lambda s: send_photo(s, prior={"world_from_camera": [*EYE[:3], [1, 0, 0, 1]]}),
+    ("localize_photo", "invalid_accuracy"): lambda s: send_photo(s, accuracy={"metres": 0.1}),
     ("localize_photo", "invalid_options"): lambda s: send_photo(s, options={"topk": 1}),
     ("localize_photo", "unknown_name"): lambda s: send_photo(s, estimator="magic"),
     ("localize_photo", "backend_missing"): lambda s: send_photo(s, estimator="absent"),

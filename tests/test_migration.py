@@ -91,9 +91,12 @@ def test_an_ended_job_is_described_as_before(taken_over, name):
     del old["records"], old["stage"]
     assert [new.pop(added) for added in ("camera_id", "lens")] == [None, None]
     if new["result"]:
-        # The release knew neither.
-        added = ("fitting_intrinsics", "covariance_given_lens", "registered")
-        assert [new["result"].pop(name) for name in added] == [None] * 3
+        # The release knew none of these.
+        added = ("fitting_intrinsics", "covariance_given_lens", "registered", "right_place", "precise", "asked")
+        assert [new["result"].pop(name) for name in added] == [None] * len(added)
+        assert new["result"].pop("advice") == []
+        for frame in new["result"]["frames"] or ():
+            assert (frame.pop("right_place"), frame.pop("precise")) == (None, None)
     if new["error"]:
         # It gave no hint; today every error has one.
         assert old["error"].pop("hint") == ""

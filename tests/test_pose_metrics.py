@@ -81,7 +81,7 @@ class TestErrors:
 
 
 def outcome(status=Status.LOCALIZED, rotation=0.5, translation=0.005, latency=100.0, cpu=90.0) -> Outcome:
-    return Outcome(status, rotation, translation, latency, cpu)
+    return Outcome(status, rotation, translation, latency, cpu, asked=(2.0, 0.0045))
 
 
 class TestSuccess:
@@ -116,10 +116,12 @@ class TestSuccess:
             "queries": 4,
             "success_5deg_0p05": 0.5,
             "success_1deg_0p01": 0.25,
+            "success_asked": 0.25,
             "median_rotation_deg": pytest.approx(1.6),
             "median_translation_units": pytest.approx(0.003),
             "localized": 3,
             "false_localized": 1,
+            "false_asked": 2,
             "latency_ms_p50": pytest.approx(250),
             "latency_ms_p95": pytest.approx(470),  # linear between 300 and 500
             "cpu_ms_p50": pytest.approx(25),

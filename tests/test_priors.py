@@ -9,8 +9,8 @@ import pytest
 from small_room import HALF_TURN, write_room
 from test_estimators import assert_near, photo_at, unseen_pose
 
+from service.accuracy import Accuracy
 from service.errors import InvalidPrior
-from service.estimators.search_config import SEARCH
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
 from service.localize import LoadedScene, Request, localize
@@ -92,8 +92,7 @@ def test_a_wrong_guess_costs_nothing_but_time(repeated: LoadedScene) -> None:
 
 
 def test_where_only_the_place_is_in_doubt_no_further_view_is_tried(repeated: LoadedScene) -> None:
-    strict = replace(SEARCH, verification=replace(SEARCH.verification, max_sigma_share=0.0))
-    found = localize(photo_at(repeated, TRUTH), repeated, replace(FAST, config=strict))
+    found = localize(photo_at(repeated, TRUTH), repeated, replace(FAST, accuracy=Accuracy(units=1e-6)))
     assert found.verdict.reason is Reason.POSITION_UNCERTAIN
     assert not stages(found) & {"retrieve_more_views", "retrieve_rotated", "sample_poses"}
 

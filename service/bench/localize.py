@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.bench.bench_photos import BenchPhoto, prepare_photo
 from service.bench.datasets import PHOTO_SUFFIXES, DataSet, read_data_set
 from service.bench.modifications import require_modifications
@@ -25,9 +26,12 @@ from service.bench.scene_modifications import modified_scene, require_scene_modi
 from service.bench.start_poses import require_kind, start_pose
 from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
+from service.interfaces import Rasterizer
 from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.photos.images import read_query
+from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.scene_focus import centre_depth
+from service.pose.verification.signals import typical_depth
 from service.results import PoseEstimate
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
@@ -87,6 +91,7 @@ def run(
     occluders: Path | None = None,
     options: Any = None,
     budget: Budget | None = None,
+    accuracy: Accuracy = DEFAULT_ACCURACY,
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
     on_miss: Callable[[BenchScene, Trial, PoseEstimate], dict[str, Any]] | None = None,
@@ -97,7 +102,7 @@ def run(
     another scene; `modify_scene` changes the scene's Gaussians. `options` are the estimator's `Options`; None: its
     defaults. With `cameras="ignored"` the scene is used without its training cameras, which still define the units.
     `on_miss` is called for each photo that isn't a success at 1 deg and 0.01 units; what it returns is added to the
-    photo's line.
+    photo's line. `accuracy` is asked for with each photo; its bound of the position is one at the true pose.
     """
     require_kind(start)
     require_modifications(modify)
@@ -113,7 +118,13 @@ def run(
     prepare_s = time.perf_counter() - began
     todo = list(make_trials(bench_scene, start, trials * len(bench_scene.photos), seed, tuple(modify), occluders))
     limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
-    request = Request(estimator=estimator, options=chosen_options, seed=seed, **limits)
+    info = bench_scene.loaded.scene.info
+    accuracy = accuracy.in_units(info.name, info.metres_per_unit)
+    request = Request(estimator=estimator, options=chosen_options, seed=seed, accuracy=accuracy, **limits)
+    rasterizer = bench_scene.loaded.rasterizer
+
+    def asked_at(trial: Trial) -> tuple[float, float]:
+        return asked_bounds(accuracy, trial.truth, rasterizer, bench_scene.units)
 
     def localize_one(trial: Trial) -> PoseEstimate:
         return localize_trial(bench_scene, trial, request, intrinsics)
@@ -121,14 +132,22 @@ def run(
     def describe_miss(trial: Trial, estimate: PoseEstimate) -> dict[str, Any]:
         return on_miss(bench_scene, trial, estimate) if on_miss else {}
 
-    outcomes, per_query = measure(todo, localize_one, bench_scene.units, progress, describe_miss)
+    outcomes, per_query = measure(todo, localize_one, bench_scene.units, progress, describe_miss, asked_at)
     settings = {"estimator": estimator, "matcher": matcher, "start": start, "trials": trials, "seed": seed}
     settings |= {"layout": bench_scene.layout, "background_rgb": list(bench_scene.background_rgb)}
     settings |= {"intrinsics": intrinsics, "cameras": cameras, "modify": list(modify)}
     settings |= {"modify_scene": list(modify_scene)}
     settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
+    settings |= {"accuracy": dataclasses.asdict(accuracy)}
     facts = {"scene": bench_scene.loaded.scene.info.name, **settings, **_facts(bench_scene), "prepare_s": prepare_s}
     return {**facts, **summary(outcomes), "per_query": per_query}
+
+
+def asked_bounds(accuracy: Accuracy, truth: Camera, rasterizer: Rasterizer, units: Units) -> tuple[float, float]:
+    """Return the accuracy asked for at the true pose, as bounds: degrees and normalized units."""
+    camera = Camera(sized(truth.intrinsics, RENDER_PX), truth.pose)
+    distance = typical_depth(rasterizer.render([camera])[0])
+    return accuracy.deg, accuracy.bound_units(distance) * units.units_per_scene_unit
 
 
 def _facts(bench_scene: BenchScene) -> dict[str, Any]:
@@ -155,10 +174,12 @@ def measure(
     units: Units,
     progress: Callable[[int, int], None] | None = None,
     on_miss: Callable[[Trial, PoseEstimate], dict[str, Any]] | None = None,
+    asked_at: Callable[[Trial], tuple[float, float]] = lambda _: COARSE,
 ) -> tuple[list[Outcome], list[dict[str, Any]]]:
     """Localize every trial; return errors and times, and the lines of the result file.
 
     The first trial is localized twice, of which the first time, with compilation and allocation, isn't counted.
+    `asked_at` returns the bounds asked for at a trial's true pose: degrees and normalized units.
     """
     outcomes, lines = [], []
     # Not kept: its time would include compilation.
@@ -167,7 +188,8 @@ def measure(
         wall, cpu = time.perf_counter(), time.process_time()
         estimate = localize_one(trial)
         latency_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
-        outcome = Outcome(estimate.verdict.status, *errors(estimate.pose, trial.truth.pose, units), latency_ms, cpu_ms)
+        found = errors(estimate.pose, trial.truth.pose, units)
+        outcome = Outcome(estimate.verdict.status, *found, latency_ms, cpu_ms, asked_at(trial))
         outcomes.append(outcome)
         lines.append(trial_result(trial, estimate, outcome, units))
         # After the times were taken.
@@ -282,9 +304,13 @@ def trial_result(trial: Trial, estimate: PoseEstimate, outcome: Outcome, units: 
         "status": str(verdict.status),
         "reason": str(verdict.reason),
         "score": verdict.score,
+        "right_place": verdict.right_place,
+        "precise": verdict.precise,
         "inliers": verdict.inliers,
         "success_5deg_0p05": outcome.success(COARSE),
         "success_1deg_0p01": outcome.success(FINE),
+        "success_asked": outcome.success(outcome.asked),
+        "asked_units": outcome.asked[1],
         "rotation_deg": outcome.rotation_deg,
         "translation_units": outcome.translation_units,
         "start_world_from_camera": trial.start.world_from_camera.tolist() if trial.start else None,

@@ -52,6 +52,8 @@ class Outcome:
     """Normalized."""
     latency_ms: float
     cpu_ms: float
+    asked: tuple[float, float] = COARSE
+    """The accuracy asked for at the true pose, as bounds: degrees and normalized units."""
 
     def success(self, bound: tuple[float, float]) -> bool:
         """Whether the status is localized and both errors are within bounds; a correct but uncertain pose is a miss."""
@@ -94,10 +96,12 @@ def summary(outcomes: Sequence[Outcome]) -> dict[str, float | int]:
         "queries": len(outcomes),
         "success_5deg_0p05": float(np.mean([o.success(COARSE) for o in outcomes])),
         "success_1deg_0p01": float(np.mean([o.success(FINE) for o in outcomes])),
+        "success_asked": float(np.mean([o.success(o.asked) for o in outcomes])),
         "median_rotation_deg": float(np.median([o.rotation_deg for o in outcomes])),
         "median_translation_units": float(np.median([o.translation_units for o in outcomes])),
         "localized": sum(o.status is Status.LOCALIZED for o in outcomes),
         "false_localized": sum(o.false for o in outcomes),
+        "false_asked": sum(o.status is Status.LOCALIZED and not o.within(o.asked) for o in outcomes),
         "latency_ms_p50": float(np.percentile(latencies, 50)),
         "latency_ms_p95": float(np.percentile(latencies, 95)),
         "cpu_ms_p50": float(np.percentile([o.cpu_ms for o in outcomes], 50)),

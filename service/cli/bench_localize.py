@@ -39,6 +39,7 @@ def bench_localize(
     modify_scene: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, for `--modify occlusion`.")] = None,
     options: Annotated[str, typer.Option(help="The estimator's, as JSON or a file of it.")] = "",
+    accuracy: Annotated[str, typer.Option(help="Asked for with each photo, as `localize` takes it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Seconds a query.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Renders a query.", min=1)] = None,
     misses: Annotated[Path | None, typer.Option(help="A folder for an image of each miss at 1 deg, 0.01.")] = None,
@@ -48,7 +49,7 @@ def bench_localize(
     from service.bench import miss_images
     from service.bench.localize import Budget, run
     from service.localize import DEFAULT_MATCHER
-    from service.web.schemas.job_spec import options_from
+    from service.web.schemas.job_spec import accuracy_from, options_from
 
     print_machine()
     with progress_bar() as progress:
@@ -69,6 +70,7 @@ def bench_localize(
             occluders=occluders,
             options=options_from(estimator, parsed_option(options, "options") or {}),
             budget=Budget(budget_s, budget_renders),
+            accuracy=accuracy_from(parsed_option(accuracy, "accuracy")),
             progress=counter(progress, "photos"),
             cache_dir=settings_of({}).cache_dir,
             on_miss=miss_images.save_miss_images(misses) if misses else None,

@@ -54,6 +54,9 @@ def localize(
     ] = False,
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="What is known of the pose, as the API takes it: JSON or a file.")] = "",
+    accuracy: Annotated[
+        str, typer.Option(help='How accurate a pose must be, as the API takes it: {"deg": 2, "share": 0.01}.')
+    ] = "",
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
     matcher: MatcherOption = "",
     seed: int = 0,
@@ -85,7 +88,7 @@ def localize(
 
     fields = _fields(
         {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every},
-        {"intrinsics": intrinsics, "prior": prior, "times_s": times},
+        {"intrinsics": intrinsics, "prior": prior, "accuracy": accuracy, "times_s": times},
     )
     files = [(str(photo), read_file(photo)) for photo in photos]
     # A video is a sequence by itself; photos are one only on request.

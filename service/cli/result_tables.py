@@ -17,7 +17,7 @@ def photo_line(name: str, result: Result) -> str:
     """Return one photo's result as a line."""
     status = f"{result.status} in {result.scene.id}" if result.scene_ranking else result.status
     line = _line(name, status, result.score, result.pose.world_from_camera)
-    return f"{line}. {result.hint}" if result.hint else line
+    return " ".join([f"{line}.", result.hint, *result.advice]) if result.hint else line
 
 
 def frame_line(frame: FrameOut) -> str:

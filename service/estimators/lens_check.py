@@ -17,6 +17,7 @@ from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.refine_stage import rematch_and_refine
+from service.pose.verification.gate import doubted
 from service.results import IterationRecord, Reason, Status
 from service.types import Intrinsics, Query
 
@@ -42,7 +43,7 @@ def check_lens(state: SearchState) -> Generator[IterationRecord, None, SearchSta
 
 def _is_suspicious(state: SearchState, best: VerifiedPose) -> bool:
     query, config = state.images.query, state.config
-    if has_distortion(query.photo_intrinsics) or best.verdict.score < config.verification.min_uncertain:
+    if has_distortion(query.photo_intrinsics) or best.verdict.status is Status.NOT_LOCALIZED:
         return False
     if best.verdict.status is not Status.LOCALIZED:
         return True
@@ -113,8 +114,7 @@ def photo_lens(query: Query, lens: Intrinsics) -> Intrinsics:
 
 def _refused_as_unmodelled(state: SearchState, best: VerifiedPose) -> IterationRecord:
     """Refuse the answer because no model explains its lens; return its record."""
-    score = min(best.verdict.score, state.config.verification.doubtful_score)
-    verdict = replace(best.verdict, status=Status.UNCERTAIN, reason=Reason.LENS_UNMODELLED, score=score)
+    verdict = doubted(best.verdict, Reason.LENS_UNMODELLED)
     # What fits best of the models doesn't fit.
     state.best = replace(best, verdict=replace(verdict, fitting_correction=None))
     return state.best.record("check_lens")

@@ -174,10 +174,10 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     verdict = state.verify(found, pixels_may_decide)
     if _may_be_in_other_light(state, verdict):
         again = yield from _refined_in_other_light(state, found)
-        if again is not None and again[1].score > verdict.score:
+        if again is not None and again[1].rank > verdict.rank:
             found, verdict = again
     # A later, costlier stage doesn't always lead to a better pose.
-    if state.best is None or verdict.score > state.best.verdict.score:
+    if state.best is None or verdict.rank > state.best.verdict.rank:
         state.best = VerifiedPose(found, verdict, stage.variant)
     # Poses are verified in one size, whatever led to them; refinement from few matches may not have arrived.
     conclusive = verdict.reason in CONCLUSIVE_DOUBTS and outcome.unmatched is None
@@ -233,7 +233,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     For an answer that the gate refused the mirror image must be accepted.
     """
     best, config = state.best, state.config
-    if best is None or best.verdict.score < config.verification.min_uncertain:
+    if best is None or best.verdict.status is Status.NOT_LOCALIZED:
         return False
     if not state.tools.prepared.like_its_mirror_image or not may_be_mirrored(best.verdict.signals, config.mirror):
         return False

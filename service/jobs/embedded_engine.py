@@ -176,7 +176,9 @@ def run_task(
     A sequence is localized in the first scene. `registrations` are the scenes', which the result's pose is placed by.
     """
     options = ESTIMATORS.load(task.estimator).Options(**task.options)
-    request = Request(task.estimator, options, seed=task.seed, budget_s=task.budget_s, cancel=cancel)
+    request = Request(
+        task.estimator, options, seed=task.seed, budget_s=task.budget_s, cancel=cancel, accuracy=task.accuracy
+    )
     if isinstance(task.source, SequenceSource):
         sequence = _run_sequence(task.source, request, scenes[0], on_record)
         return _registered(sequence, scenes, scenes[0], registrations), scenes[0]

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.jobs.model import JobRecord, JobResult
 from service.photos.sequence import SequenceOptions
 from service.results import StageTiming
@@ -57,6 +58,7 @@ class LocalizeTask:
     source: Query | SequenceSource
     decode: StageTiming
     """What reading the photo took: a part of the result."""
+    accuracy: Accuracy = DEFAULT_ACCURACY
 
 
 @dataclass(frozen=True, slots=True)

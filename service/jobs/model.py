@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.errors import Failure
 from service.lenses.lens_memory import RecalledLens
 from service.registration.registration import Registration
@@ -62,6 +63,8 @@ class JobSpec:
     """Seconds after acceptance by which the job must have started."""
     keep_photo: bool = False
     """Keep the upright photo as long as the job."""
+    accuracy: Accuracy = DEFAULT_ACCURACY
+    """How accurate a pose must be to be localized."""
 
     @property
     def names_several_scenes(self) -> bool:
@@ -97,6 +100,9 @@ class SequenceFrame:
     pose: Pose
     covariance: Float64[np.ndarray, "6 6"] | None
     """As a verdict's."""
+    right_place: float | None = None
+    precise: float | None = None
+    """Both as a verdict's."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -47,6 +47,7 @@ class DecodedPhoto:
             budget_s=spec.budget_s if budget_s is None else budget_s,
             source=self.source,
             decode=self.decode,
+            accuracy=spec.accuracy,
         )
 
 

@@ -125,6 +125,8 @@ class Jobs:
             return known
         held = self._engine.hold(order.spec.scene)
         try:
+            for scene_id in held.ids:
+                order.spec.accuracy.in_units(scene_id, self._engine.require(scene_id).metres_per_unit)
             recall = self._recall(order)
             photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames, recall)
             if recall:

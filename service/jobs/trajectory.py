@@ -99,4 +99,6 @@ def _frame(index: int, found: SequencePose) -> SequenceFrame:
         tracked=estimate.records[-1].stage == "track",
         pose=estimate.pose,
         covariance=verdict.covariance,
+        right_place=verdict.right_place,
+        precise=verdict.precise,
     )

@@ -86,7 +86,7 @@ def measured(
     lest what is recalled confirms itself.
     """
     verdict, intrinsics = answer.verdict, answer.intrinsics
-    sure = verdict.status is Status.LOCALIZED and verdict.score >= LENS_MEMORY.min_score
+    sure = verdict.status is Status.LOCALIZED and verdict.place_probability >= LENS_MEMORY.min_score
     if not sure or not verdict.focal_sigma or intrinsics.model not in _MODELS:
         return None
     value = _stored_values(intrinsics, camera)

@@ -5,8 +5,9 @@ whatever the exposure) and its colours, each over most of the photo and over its
 and whether the colours agree where the gradients do (repeated things seen one further, and mirror images, have the
 right edges and the wrong colours; see `appearance.py`); how many fresh matches between photo and render agree with
 the pose, without any fit, what share that is, and how they are spread; and by how much refinement would still move the
-pose. `gate_model.py` computes from them how probably the pose is right (within 5 degrees and 1/80 of
-the training cameras' median distance from the scene's focus), and which signals are below their floors.
+pose. `gate_model.py` computes from them how probably the pose is in the right place (within 5 degrees and 1/80 of
+the training cameras' median distance from the scene's focus), and which signals are below their floors. `precision.py`
+computes from the covariance how probably a pose in the right place is as accurate as was asked for.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float64
 
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.absolute_pose.prior_region import inside_prior
@@ -28,7 +30,8 @@ from service.pose.refinement.refinement_config import REFINEMENT, RefinementConf
 from service.pose.refinement.uncertainty import PoseUncertainty, pose_uncertainty
 from service.pose.verification.appearance import GLOBAL_SIGNALS, appearance, visible_alpha
 from service.pose.verification.gate_model import SHIPPED_MODEL, GateModel
-from service.pose.verification.signals import NO_MATCHES, SIGNALS, geometry_signals, match_signals
+from service.pose.verification.precision import AskedBounds, probability_within
+from service.pose.verification.signals import NO_MATCHES, SIGNALS, geometry_signals, match_signals, typical_depth
 from service.results import Reason, Status, Verdict
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -42,9 +45,15 @@ class VerificationConfig:
     """How the step is made that measures the uncertainty."""
     min_localized: float = 0.8
     min_uncertain: float = 0.1
-    """Least probabilities of the statuses `localized` and `uncertain`."""
+    """Least probabilities of the right place of the statuses `localized` and `uncertain`."""
+    min_precise: float = 0.91
+    """Least probability of `localized` that the errors are within the bounds asked for. By the default ones, a standard
+    deviation of the position of 0.9 to 0.94 % of the distance to what is seen, as its directions have it: six in seven
+    such positions are within 1.25 % of it. Photos of the test scenes have 0.02 to 0.2 %, cropped to an eighth 1 %.
+    Wrong answers with estimated intrinsics have 0.95 % and more: crops and turntables through long lenses."""
     doubtful_score: float = 0.5
-    """Score, at most, where a signal is below its floor, or the intrinsics or the position are in doubt."""
+    """Probability of the right place, at most, where a signal is below its floor, and of being precise, where the
+    intrinsics are in doubt."""
     unrecognised: float = 0.35
     """Mean of the scaled signals of a kind below which nothing was recognised: foreign photos have 0.0 to 0.3."""
     unlike: float = 0.3
@@ -54,14 +63,10 @@ class VerificationConfig:
     """Features of a photo; with fewer, that is the reason of a refusal."""
     min_coverage: float = 0.04
     """Share of the photo in which the scene is opaque."""
-    max_sigma_share: float = 0.009
-    """Standard deviation of the position, relative to the distance to what is seen: six in seven such positions are
-    within the bound of what is right (0.0125). Photos of the test scenes have 0.0002 to 0.002, cropped to an eighth
-    0.01. Wrong answers with estimated intrinsics have 0.0095 and more: crops and turntables through long lenses."""
     max_sigma_share_if_cropped: float = 0.0125
-    """That of the position if the photo may have been cropped off centre, with approximate intrinsics: beyond it a
-    plane may be seen from elsewhere with another principal point. Right answers have up to 0.0105, wrong ones of this
-    kind 0.027 and more."""
+    """Standard deviation of the position, relative to the distance to what is seen, if the photo may have been cropped
+    off centre, with approximate intrinsics: beyond it a plane may be seen from elsewhere with another principal point.
+    Right answers have up to 0.0105, wrong ones of this kind 0.027 and more."""
     max_sigma_deg_if_cropped: float = 2.0
     """Likewise of the rotation."""
     max_significance_if_cropped: float = 6.6
@@ -69,7 +74,8 @@ class VerificationConfig:
     not move the pose. Right answers have 4.6 at most, wrong ones of this kind 9.3 and more."""
     max_focal_step: float = 0.008
     """By which another step would change the logarithm of an approximate focal length: a method may not have estimated
-    it at all, and one that is 1 % off moves the camera by 1 % of the distance."""
+    it at all, and one that is 1 % off moves the camera by 1 % of the distance. Where a looser accuracy than the default
+    is asked for, this and the limits `if_cropped` are as much looser."""
     max_drift_px_free_lens: float = 0.3
     """By which another step would move the image, with approximate intrinsics: refinement settles at 0.3 px, and what
     it has not settled may still be a tenth of the distance off, for distance and focal length move along together."""
@@ -80,6 +86,8 @@ class VerificationConfig:
 
 
 VERIFICATION = VerificationConfig()
+LENS_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED, Reason.LENS_UNMODELLED)
+"""Doubts about the intrinsics, on which the accuracy depends, not about the place."""
 
 
 def verify(
@@ -101,17 +109,18 @@ def verify(
     that repeats itself, where colours tell similar things apart.
     """
     query, frame, size = images.query, rendered.frame, rendered.camera.intrinsics
+    asked = AskedBounds.of(query.accuracy, typical_depth(frame))
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification, but where the scene's model is poor only they show wrong intrinsics.
     large_loss = uncertainty is None or uncertainty.loss > config.refinement.lens_test.suspicious_loss
     if pixels_may_decide and not large_loss and photometric_suffices(signals, config):
-        verdict = verdict_of(signals, uncertainty, config=config)
+        verdict = verdict_of(signals, uncertainty, asked, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
     few = len(features.scores) < config.min_features
     # Neither matches nor a refinement make a picture of something else right.
     if _is_unlike(signals, config):
-        return verdict_of(signals | NO_MATCHES, uncertainty, few, config=config)
+        return verdict_of(signals | NO_MATCHES, uncertainty, asked, few, config=config)
     found = correspondences(features, rendered.view(images.matcher), images.matcher)
     signals |= match_signals(found, visible_alpha(frame, valid), query, size, pose)
     if uncertainty and query.lens_prior is None:
@@ -119,7 +128,7 @@ def verify(
     # A masked photo has fewer matches than a whole one, without being less certain.
     if valid is not None:
         signals["inliers"] /= max(float(valid.mean()), 1 / config.max_inlier_scale)
-    return _within_prior(verdict_of(signals, uncertainty, few, light_may_differ, config), images, pose)
+    return _within_prior(verdict_of(signals, uncertainty, asked, few, light_may_differ, config), images, pose)
 
 
 def _photometric_signals(
@@ -179,45 +188,69 @@ def _within_prior(verdict: Verdict, images: QueryImages, pose: Pose) -> Verdict:
     return verdict if inside_prior(images.query.region, pose) else downgraded(verdict, Reason.OUTSIDE_PRIOR)
 
 
-def downgraded(verdict: Verdict, reason: Reason, score: float = VERIFICATION.doubtful_score) -> Verdict:
-    """Return a `localized` verdict as `uncertain` with this reason and at most this score; others as they are."""
-    if verdict.status is not Status.LOCALIZED:
-        return verdict
-    return replace(verdict, status=Status.UNCERTAIN, reason=reason, score=min(verdict.score, score))
+def downgraded(verdict: Verdict, reason: Reason, most: float = VERIFICATION.doubtful_score) -> Verdict:
+    """Return a `localized` verdict as `doubted`; others as they are."""
+    return doubted(verdict, reason, most) if verdict.status is Status.LOCALIZED else verdict
+
+
+def doubted(verdict: Verdict, reason: Reason, most: float = VERIFICATION.doubtful_score) -> Verdict:
+    """Return a verdict as `uncertain`, with `precise` at most this if the reason is the lens, else `right_place`."""
+    place, precise = verdict.place_probability, 1.0 if verdict.precise is None else verdict.precise
+    if reason in LENS_DOUBTS:
+        precise = min(precise, most)
+    else:
+        place = min(place, most)
+    return replace(
+        verdict, status=Status.UNCERTAIN, reason=reason, score=place * precise, right_place=place, precise=precise
+    )
 
 
 def verdict_of(
     signals: Mapping[str, float],
     uncertainty: PoseUncertainty | None,
+    asked: AskedBounds,
     few_features: bool = False,
     light_may_differ: bool = False,
     config: VerificationConfig = VERIFICATION,
 ) -> Verdict:
-    """Return the verdict on a pose with these signals."""
+    """Return the verdict on a pose with these signals, by the accuracy asked for there.
+
+    A pose that the pixels don't determine is never `uncertain`: whoever is to check a pose needs its covariance.
+    """
     # The sum of the model could compensate for one bad signal; floors don't.
     doubtful = config.model.below_floor(signals, light_may_differ)
-    score = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
+    place = min(config.model.probability(signals), config.doubtful_score if doubtful else 1.0)
+    precise = _precise(uncertainty and uncertainty.covariance, asked)
     little = signals["coverage"] < config.min_coverage
-    doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals, uncertainty, config)
-    if score < config.min_localized:
+    doubt = Reason.LOW_COVERAGE if little else _doubt_about_position(signals, uncertainty, precise, asked, config)
+    if place < config.min_localized:
         reason = Reason.FEW_FEATURES if few_features else _reason_of_refusal(signals, doubtful, config)
         if little and reason in (Reason.FEW_INLIERS, Reason.RENDER_MISMATCH):
             reason = Reason.LOW_COVERAGE  # of which the others are consequences
-    elif doubt:
-        score, reason = config.doubtful_score, doubt
     else:
-        reason = Reason.VERIFIED
+        reason = doubt or Reason.VERIFIED
+    if little:
+        place = min(place, config.doubtful_score)
+    if doubt in LENS_DOUBTS:
+        precise = min(precise, config.doubtful_score)
+    status = _status(place, reason, uncertainty, config)
     inliers, correlation = int(signals.get("inliers", 0)), signals["gradients"]
     verdict = Verdict(
-        _status(score, config), reason, score, inliers, correlation, signals["coverage"], None, signals=signals
+        *(status, reason, place * precise, inliers, correlation, signals["coverage"], None),
+        **{"signals": signals, "right_place": place, "precise": precise, "asked": (asked.deg, asked.units)},
     )
     return verdict if uncertainty is None else _with_uncertainty(verdict, uncertainty)
 
 
-def _status(score: float, config: VerificationConfig) -> Status:
-    if score >= config.min_localized:
+def _precise(covariance: Float64[np.ndarray, "k k"] | None, asked: AskedBounds) -> float:
+    """Return the probability that the pose is as accurate as asked if this is its covariance; 0 without one."""
+    return 0.0 if covariance is None else probability_within(covariance[:6, :6], asked.deg, asked.units)
+
+
+def _status(place: float, reason: Reason, uncertainty: PoseUncertainty | None, config: VerificationConfig) -> Status:
+    if reason is Reason.VERIFIED:
         return Status.LOCALIZED
-    return Status.UNCERTAIN if score >= config.min_uncertain else Status.NOT_LOCALIZED
+    return Status.UNCERTAIN if place >= config.min_uncertain and uncertainty else Status.NOT_LOCALIZED
 
 
 def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config: VerificationConfig) -> Reason:
@@ -234,43 +267,43 @@ def _reason_of_refusal(signals: Mapping[str, float], doubtful: list[str], config
 
 
 def _doubt_about_position(
-    signals: Mapping[str, float], uncertainty: PoseUncertainty | None, config: VerificationConfig
+    signals: Mapping[str, float],
+    uncertainty: PoseUncertainty | None,
+    precise: float,
+    asked: AskedBounds,
+    config: VerificationConfig,
 ) -> Reason | None:
-    """Return why the position may be wrong at a pose where photo and render agree; None if there is no reason."""
-    sigma_share = signals["sigma_share"]
+    """Return why a pose where photo and render agree may be less accurate than asked; None if there is no reason."""
+    is_precise = precise >= config.min_precise
     if uncertainty is None:
-        return Reason.POSITION_UNCERTAIN if sigma_share > config.max_sigma_share else None
+        return Reason.POSITION_UNCERTAIN
     if uncertainty.lens_fit and uncertainty.lens_fit.contradicts:
         return Reason.INTRINSICS_CONTRADICTED
-    if abs(uncertainty.focal_step) > config.max_focal_step:
+    if abs(uncertainty.focal_step) > config.max_focal_step * asked.looser_position:
         return Reason.FOCAL_UNCERTAIN
     given_lens = uncertainty.given_lens
     settled = given_lens is None or signals["drift_px"] <= config.max_drift_px_free_lens
-    if sigma_share <= config.max_sigma_share and settled and _is_certain_if_cropped(uncertainty, signals, config):
+    if is_precise and settled and _is_certain_if_cropped(uncertainty, asked, config):
         return None
     if given_lens is None:
         return Reason.POSITION_UNCERTAIN
-    if sigma_share <= config.max_sigma_share:
-        return Reason.FOCAL_UNCERTAIN
     # With known intrinsics the position would be certain: then they are what is missing.
-    known, unknown = (np.trace(matrix[3:6, 3:6]) for matrix in (given_lens, uncertainty.covariance))
-    is_known = sigma_share * np.sqrt(known / unknown) <= config.max_sigma_share
+    is_known = is_precise or _precise(given_lens, asked) >= config.min_precise
     return Reason.FOCAL_UNCERTAIN if is_known else Reason.POSITION_UNCERTAIN
 
 
-def _is_certain_if_cropped(
-    uncertainty: PoseUncertainty, signals: Mapping[str, float], config: VerificationConfig
-) -> bool:
+def _is_certain_if_cropped(uncertainty: PoseUncertainty, asked: AskedBounds, config: VerificationConfig) -> bool:
     """Return whether the pose would be certain, and the same, if the principal point might be anywhere."""
     cropped, test = uncertainty.if_cropped, config.refinement.lens_test
     if cropped is None:
         return True
     sigma_deg = np.degrees(np.sqrt(np.trace(cropped.covariance[:3, :3])))
-    sigma, sigma_told = (np.sqrt(np.trace(one[3:6, 3:6])) for one in (cropped.covariance, uncertainty.covariance))
-    depth = sigma_told / max(signals["sigma_share"], 1e-9)
-    if sigma_deg > config.max_sigma_deg_if_cropped or sigma > config.max_sigma_share_if_cropped * depth:
+    sigma, units = np.sqrt(np.trace(cropped.covariance[3:6, 3:6])), asked.looser_position * asked.distance
+    if sigma_deg > config.max_sigma_deg_if_cropped * asked.looser_rotation:
         return False
-    moves = moves_pose(cropped.step, depth, test.contradicting_deg, test.contradicting_share)
+    if sigma > config.max_sigma_share_if_cropped * units:
+        return False
+    moves = moves_pose(cropped.step, units, test.contradicting_deg * asked.looser_rotation, test.contradicting_share)
     return not (moves and cropped.significance > config.max_significance_if_cropped)
 
 

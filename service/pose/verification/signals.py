@@ -38,22 +38,27 @@ NO_MATCHES = {"inliers": 0.0, "inlier_share": 0.0, "inlier_spread": 0.0}
 """The signals of matches where none were made."""
 
 
+def typical_depth(frame: Frame) -> float:
+    """Return the distance to what is seen, in scene units: the median depth; 1 where nothing is."""
+    # A sample is enough for a median.
+    depth = frame.median_depth[::4, ::4]
+    return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+
+
 def geometry_signals(frame: Frame, size: Intrinsics, uncertainty: PoseUncertainty | None) -> dict[str, float]:
     """Return the signals of what is seen and how well it determines the pose.
 
     `coverage`: share of the image that is opaque; `drift_px`: by how much another step of refinement on this frame
     would move the image; `sigma_share`: standard deviation of the position over the median depth.
     """
-    # A sample is enough for a median.
-    depth = frame.median_depth[::4, ::4]
-    typical_depth = float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
+    depth = typical_depth(frame)
     drift = spread = np.inf
     if uncertainty is not None:
-        spread = float(np.sqrt(np.trace(uncertainty.covariance[3:6, 3:6]))) / typical_depth
+        spread = float(np.sqrt(np.trace(uncertainty.covariance[3:6, 3:6]))) / depth
         if spread < SIGNALS.undetermined:
             # Both as pixels: an angle times the focal length, a translation over the depth times it.
             rotation, translation = np.linalg.norm(uncertainty.last_step.reshape(2, 3), axis=1)
-            drift = size.fx * float(rotation + translation / typical_depth)
+            drift = size.fx * float(rotation + translation / depth)
     return {
         "coverage": float((frame.alpha > SIGNALS.min_alpha).mean()),
         "drift_px": min(drift, SIGNALS.max_signal),

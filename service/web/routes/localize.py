@@ -28,8 +28,8 @@ def _form_schema() -> dict[str, Any]:
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
     # The definitions are among the document's components already.
     schema.pop("$defs", None)
-    schema["description"] = "`options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text."
-    for name in ("options", "intrinsics", "prior", "truth", "times_s"):
+    schema["description"] = "`options`, `intrinsics`, `prior`, `accuracy`, `truth` and `times_s` are JSON text."
+    for name in ("options", "intrinsics", "prior", "accuracy", "truth", "times_s"):
         described = LocalizeFields.model_fields[name].description or "See the JSON body."
         schema["properties"][name] = {
             "type": "string",
@@ -73,7 +73,14 @@ _ACCEPTED = {
     responses=_ACCEPTED
     | errors(
         *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE_ERRORS),
-        *("invalid_image", "invalid_intrinsics", "invalid_prior", "invalid_options", "unknown_name"),
+        *(
+            "invalid_image",
+            "invalid_intrinsics",
+            "invalid_prior",
+            "invalid_accuracy",
+            "invalid_options",
+            "unknown_name",
+        ),
         *("backend_missing", "idempotency_conflict", "storage_failed"),
         body=True,
     ),
@@ -127,9 +134,9 @@ async def create_job(
 
     def accept() -> StoredJob:
         sha256 = hashlib.sha256(body.photo).hexdigest()
-        # Of the validated fields: the same request as form and as JSON is the same job. Requests of before there was a
-        # `camera_id` keep their digest.
-        absent = None if fields.camera_id else {"camera_id"}
+        # Of the validated fields: the same request as form and as JSON is the same job. Requests of before there were
+        # these fields keep their digest.
+        absent = {name for name in ("camera_id", "accuracy") if getattr(fields, name) is None}
         digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
         owner = lens_owner(request, app_state)

@@ -17,6 +17,7 @@ from service.results import HINTS, IterationRecord, StageTiming
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
 from service.web.schemas.job_results import (
     Alternative,
+    AskedOut,
     CandidatesOut,
     FrameOut,
     MatchesOut,
@@ -172,6 +173,8 @@ def frame_out(frame: SequenceFrame) -> FrameOut:
         status=frame.status,
         reason=frame.reason,
         score=frame.score,
+        right_place=frame.right_place,
+        precise=frame.precise,
         tracked=frame.tracked,
         world_from_camera=transform_out(frame.pose.world_from_camera),
         covariance=None if frame.covariance is None else covariance_out(frame.covariance),
@@ -253,7 +256,11 @@ def result_out(result: JobResult) -> Result:
         status=verdict.status,
         reason=verdict.reason,
         hint=HINTS[verdict.reason],
+        advice=list(estimate.advice),
         score=verdict.score,
+        right_place=verdict.right_place,
+        precise=verdict.precise,
+        asked=verdict.asked and AskedOut(deg=verdict.asked[0], units=verdict.asked[1]),
         pose=pose_out(estimate.pose),
         alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),

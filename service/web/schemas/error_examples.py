@@ -25,6 +25,14 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.InvalidIntrinsics("must be a positive focal length in pixels, is 0.0.", where="intrinsics.fx"), "/localize"),
     (e.InvalidPrior("the last row must be 0 0 0 1.", where="prior.world_from_camera"), "/localize"),
     (
+        e.InvalidAccuracy(
+            "scene 'studio' has no scale, so metres mean nothing in it.",
+            where="accuracy.metres",
+            hint='Ask for units or share, or say "metres_per_unit" in its scene.json.',
+        ),
+        "/localize",
+    ),
+    (
         e.InvalidOptions("'view_index' has no such option; it has: candidates, effort.", where="options.topk"),
         "/localize",
     ),

@@ -52,7 +52,9 @@ class FrameOut(Model):
     status: Status
     reason: Reason
     score: float
-    """Probability that the pose is right, as the result's."""
+    """Probability that the pose is as accurate as was asked for, as the result's."""
+    right_place: float | None = None
+    precise: float | None = None
     tracked: bool
     """Whether the pose was found by tracking from the previous frame; else the whole scene was searched."""
     world_from_camera: Transform
@@ -123,6 +125,14 @@ class Alternative(Model):
     pose: PoseOut
 
 
+class AskedOut(Model):
+    """The accuracy that was asked for, at this pose."""
+
+    deg: float
+    units: float
+    """In scene units; of a share of the distance to what is seen, at this pose."""
+
+
 class Result(Model):
     """The pose with its verification and provenance. `not_localized` is a result, not an error."""
 
@@ -132,9 +142,19 @@ class Result(Model):
     """What decided the status."""
     hint: str
     """What to do about the reason; empty for a pose that is localized."""
+    advice: list[str] = Field(default_factory=list)
+    """What would help this photo, by what was seen in it and at the pose, the most helpful first: where to turn,
+    whether to step back, what is wrong with the picture. At most three sentences; empty for a pose that is
+    localized."""
     score: float
-    """Probability, 0..1, that the pose is right (within 5 degrees and 1/80 of the distance to the scene); from 0.8 on
-    the status is `localized`."""
+    """Probability, 0..1, that the pose is as accurate as was asked for: `right_place` times `precise`."""
+    right_place: float | None = None
+    """Probability, 0..1, that the pose is in the right place (within 5 degrees and 1/80 of the distance to the scene),
+    by how photo and scene agree there. `localized` needs 0.8. Null in results of version 0.1.0, as the next two."""
+    precise: float | None = None
+    """Probability, 0..1, that a pose in the right place is within the bounds asked for, by its covariance. `localized`
+    needs 0.91."""
+    asked: AskedOut | None = None
     pose: PoseOut
     """Best pose found. Use it only if `status` is `localized`."""
     alternatives: list[Alternative] = Field(default_factory=list)
@@ -163,7 +183,7 @@ class Result(Model):
     signals: dict[str, float]
     """Inputs of the verification's probability model, by name."""
     covariance: Covariance | None
-    """Uncertainty of the pose; null if the photo does not determine it."""
+    """Uncertainty of the pose; null if the photo does not determine it, which an `uncertain` one always does."""
     covariance_given_lens: Covariance | None = None
     """Uncertainty of the pose if the estimated intrinsics were the true ones; null if they were given as exact."""
     timings: list[Timing]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.errors import (
     InvalidIntrinsics,
     InvalidOptions,
@@ -63,7 +64,13 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
         budget_s=fields.budget_s,
         deadline_s=fields.deadline_s,
         keep_photo=fields.keep_photo,
+        accuracy=DEFAULT_ACCURACY if fields.accuracy is None else Accuracy(**fields.accuracy.model_dump()),
     )
+
+
+def accuracy_from(value: Any) -> Accuracy:
+    """Validate an accuracy by itself, as JSON has it; None is the default. Raises InvalidAccuracy."""
+    return job_spec(read_fields({"accuracy": value})).accuracy
 
 
 def options_from(estimator: str, values: Mapping[str, Any]) -> Any:

@@ -7,7 +7,14 @@ from typing import Annotated, Any, Literal
 from annotated_types import Len
 from pydantic import Field
 
-from service.errors import BadInput, InvalidIntrinsics, InvalidOptions, InvalidPrior, InvalidRequest
+from service.errors import (
+    BadInput,
+    InvalidAccuracy,
+    InvalidIntrinsics,
+    InvalidOptions,
+    InvalidPrior,
+    InvalidRequest,
+)
 from service.photos.video import MAX_EVERY
 from service.web.api_model import Model
 
@@ -49,6 +56,20 @@ class PriorIn(PoseIn):
     """Lower and upper corner of an axis-aligned box in the world that contains the camera centre."""
 
 
+class AccuracyIn(Model):
+    """How accurate a pose must be to be `localized`: `deg`, and at most one of `units`, `metres` and `share`."""
+
+    deg: float = Field(default=5.0, gt=0, le=180, allow_inf_nan=False)
+    """Bound of the rotation's error, in degrees."""
+    units: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    """Bound of the position's error in scene units."""
+    metres: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+    """The same in metres, for scenes whose manifest has `metres_per_unit`."""
+    share: float | None = Field(default=None, gt=0, le=1, allow_inf_nan=False)
+    """The same relative to the distance to what is seen, the median depth of the scene rendered at the answer. Default,
+    if `units` and `metres` are left out, too: 0.02."""
+
+
 class RenderIn(Model):
     """An image to render of a scene."""
 
@@ -81,6 +102,8 @@ class LocalizeFields(Model):
     """A name of yours for the camera: what its earlier photos told of the lens is the prior of this one's, even without
     EXIF data. Of a phone name the phone: its lenses are told apart by EXIF data; without these name the lens."""
     prior: PriorIn | None = None
+    accuracy: AccuracyIn | None = None
+    """Default: within 5 degrees and 2 % of the distance to what is seen."""
     truth: PoseIn | None = None
     """Ground truth of the pose, if known. Stored with the job, to measure errors by; estimators don't get it."""
     every: int = Field(default=1, ge=1, le=MAX_EVERY)
@@ -101,6 +124,7 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
     "options": InvalidOptions,
     "intrinsics": InvalidIntrinsics,
     "prior": InvalidPrior,
+    "accuracy": InvalidAccuracy,
     "truth": InvalidPrior,
     "times_s": InvalidRequest,
 }
@@ -110,8 +134,8 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
 class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same fields.
 
-    In a form, `options`, `intrinsics`, `prior`, `truth` and `times_s` are JSON text, and `photo` is a file, or several
-    of one camera, in the order in which they were taken.
+    In a form, `options`, `intrinsics`, `prior`, `accuracy`, `truth` and `times_s` are JSON text, and `photo` is a file,
+    or several of one camera, in the order in which they were taken.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})

@@ -16,7 +16,8 @@
  * @typedef {{matrix: number[][], sigma_deg: number, sigma_units: number}} Covariance
  * @typedef {{index: number, name: string, time_s: number, status: string, reason: string, score: number,
  *   world_from_camera: Transform, covariance: Covariance | null}} Frame
- * @typedef {{status: "localized" | "uncertain" | "not_localized", reason: string, hint: string, score: number,
+ * @typedef {{status: "localized" | "uncertain" | "not_localized", reason: string, hint: string, advice: string[],
+ *   score: number, right_place: number | null, precise: number | null,
  *   pose: Pose, intrinsics: Intrinsics, covariance: Covariance | null, scene: {id: string}, frames: Frame[] | null,
  *   warnings: string[]}} Result
  * @typedef {{code: string, detail: string, where: string, hint: string, status: number}} Problem

@@ -26,6 +26,7 @@ function verdict({ result, error, state }) {
   const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
   return [
     h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, `${sentence(result.reason)}.`), " ", lead)),
+    ...(result.advice?.length ? [h("ul", { class: "advice" }, result.advice.map(sentence => h("li", {}, sentence)))] : []),
     ...(result.frames ? [h("p", { class: "lead" }, walk(result.frames))] : []),
     ...(result.alternatives.length ? [alternatives(result)] : []),
     ...result.warnings.map(warning => h("p", { class: "warning" }, warning)),
@@ -80,7 +81,7 @@ function numbers(job, scene) {
   const { covariance, intrinsics } = result;
   const [angle, distance] = job.truth ? poseDistance(result.pose, job.truth) : [null, null];
   return h("section", {}, h("h2", {}, "Evidence"), facts([
-    ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
+    ["Score", result.score.toFixed(2)], ["Right place / precise", parts(result, scale)], ["Inliers", String(result.inliers)],
     ["Gradient correlation", result.gradient_correlation.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
     ["σ of rotation", covariance && degrees(covariance.sigma_deg)],
     ["σ of position", covariance && length(covariance.sigma_units, scale)],
@@ -90,6 +91,13 @@ function numbers(job, scene) {
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(
     result.timings.map(t => [words(t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
+}
+
+/** The parts of the score, and what `precise` is about; null in results of version 0.1.0. */
+function parts({ right_place: place, precise, asked }, scale) {
+  if (place == null || precise == null || !asked) return null;
+  const bounds = `${degrees(asked.deg)} and ${length(asked.units, scale)}`;
+  return `${place.toFixed(2)} / ${precise.toFixed(2)} (within ${bounds})`;
 }
 
 function lens({ intrinsics, intrinsics_source: source }) {
