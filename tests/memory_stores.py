@@ -269,13 +269,13 @@ class MemorySceneStore:
     def draft(self, scene_id: str) -> MemoryDraft:
         check_scene_id(scene_id)
         if scene_id in self._scenes:
-            raise SceneExists(f"there is a scene '{scene_id}'.", where="scene")
+            raise SceneExists(f"scene '{scene_id}' already exists.", where="scene")
         return MemoryDraft(self._scenes, scene_id, self._folder)
 
     def delete(self, scene_id: str) -> None:
         scene = self._scenes.get(scene_id)
         if scene is None or not scene.uploaded:
-            raise SceneNotFound(f"there is no uploaded scene '{scene_id}'.", where="scene")
+            raise SceneNotFound(f"uploaded scene '{scene_id}' not found.", where="scene")
         scene.path.unlink()
         del self._scenes[scene_id]
 
@@ -305,6 +305,6 @@ class MemoryDraft:
             raise
         if self._id in self._scenes:
             path.unlink()
-            raise SceneExists(f"there is a scene '{self._id}'.", where="scene")
+            raise SceneExists(f"scene '{self._id}' already exists.", where="scene")
         self._scenes[self._id] = StoredScene(self._id, path, uploaded=True)
         return self._scenes[self._id]

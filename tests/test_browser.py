@@ -178,6 +178,31 @@ def test_the_3d_view_has_most_of_the_window(
     page.close()
 
 
+def test_on_a_phone_the_panel_is_a_sheet_that_folds(browser: Browser, fake: FakeService, url: str) -> None:
+    fake.job("one", 3, finished=True)
+    page = opened(browser, f"{url}/jobs/one/", 390, 844)
+    page.get_by_text("localized", exact=True).wait_for()
+    page.locator(".mantine-Notification-closeButton").click()  # that there is no GPU
+    expect(page.locator(".mantine-Notification-closeButton")).to_have_count(0)
+    assert share_of_3d(page) > 0.5
+    assert page.locator("[style*='width: 20em']").first.bounding_box()["width"] == 390  # pyright: ignore[reportOptionalSubscript]
+    page.get_by_text("splatfix", exact=True).click()
+    expect(page.get_by_text("localized", exact=True)).not_to_be_visible()
+    assert share_of_3d(page) > 0.85
+    page.close()
+
+
+def share_of_3d(page: Page) -> float:
+    """The share of the window in which the 3D view can be touched."""
+    return page.evaluate(
+        """() => {
+            const parts = [...Array(20).keys()].map(i => (i + 0.5) / 20);
+            const at = (x, y) => document.elementFromPoint(x * innerWidth, y * innerHeight)?.tagName === "CANVAS";
+            return parts.flatMap(y => parts.map(x => at(x, y))).filter(Boolean).length / 400;
+        }"""
+    )
+
+
 def test_a_new_job_is_followed_while_it_runs(browser: Browser, fake: FakeService, url: str) -> None:
     page = opened(browser, f"{url}/")
     page.get_by_text("no job", exact=True).wait_for()

@@ -347,7 +347,7 @@ def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monk
         code, _, complaint = splatfix("bench", "paper", scenes[0], "--out", tmp_path / "out", flag, "magic")
         assert (code, "magic" in complaint, known in complaint) == (2, True, True)
     code, _, complaint = splatfix("bench", "paper", tmp_path / "a", f"{tmp_path / 'b' / 'a'}", "--out", tmp_path)
-    assert (code, "two scenes 'a'" in complaint) == (2, True)
+    assert (code, "two scenes have the name 'a'" in complaint) == (2, True)
 
 
 def test_bench_field_runs_what_its_flags_say_and_prints_the_table(splatfix, monkeypatch, tmp_path):

@@ -401,7 +401,7 @@ class TestPlyVariants:
 
 @pytest.mark.parametrize("name", [f"scene{s}" if s[0] == "." else s for s in unread.UNREAD_SUFFIXES])
 def test_unread_formats_are_named_with_a_hint(tmp_path, name):
-    with pytest.raises(UnsupportedFormat, match="which is not read") as caught:
+    with pytest.raises(UnsupportedFormat, match="is not supported") as caught:
         load_scene(written(tmp_path, b"\x1f\x8b", name))
     assert caught.value.hint
 

@@ -157,7 +157,7 @@ def test_a_pasted_photo_that_shows_nothing_is_refused_with_reason_and_hint(page:
     lead = page.locator(".lead")
     expect(lead).to_contain_text(result["reason"].replace("_", " "), ignore_case=True)
     expect(lead).to_contain_text(result["hint"])
-    expect(page.get_by_text("The best guess")).to_be_visible()
+    expect(page.get_by_text("Best guess only")).to_be_visible()
     expect(page.get_by_role("link", name="COLMAP")).to_have_count(0)
     _audit(page)
 
@@ -168,7 +168,7 @@ def test_an_ambiguous_photo_tells_the_other_places(page: Page, url: str) -> None
     job["result"] |= {"status": "uncertain", "reason": "ambiguous", "hint": "Show more.", "alternatives": [other]}
     page.route(f"{url}/jobs/{job['id']}", lambda route: route.fulfill(json=job))
     page.goto(f"{url}/#/jobs/{job['id']}")
-    expect(page.get_by_text("It may as well have been taken at")).to_contain_text("1.000, -2.500, 0.125 (42 %)")
+    expect(page.get_by_text("Other possible positions")).to_contain_text("1.000, -2.500, 0.125 (42 %)")
     _audit(page)
 
 
@@ -196,7 +196,7 @@ def test_who_has_no_photo_can_try_a_view_of_the_scene(page: Page) -> None:
     page.get_by_role("button", name="Try a view of the scene").click()
     page.locator(".badge.localized").wait_for()
     # The picture's pose was sent as the truth; 0.002 seen.
-    assert float(fact(page, "Error of rotation").rstrip("°")) < 0.1
+    assert float(fact(page, "Rotation error").rstrip("°")) < 0.1
 
 
 def test_a_running_job_can_be_watched_and_cancelled(page: Page) -> None:
@@ -275,7 +275,7 @@ def test_the_curl_line_sends_the_very_same_request(page: Page, url: str) -> None
     there = np.array(job["result"]["pose"]["position"])
     error = np.linalg.norm(there - truth_of(PHOTO)[:3, 3])
     # Three digits are written.
-    assert float(fact(page, "Error of position").split()[0]) == pytest.approx(error, rel=6e-3)
+    assert float(fact(page, "Position error").split()[0]) == pytest.approx(error, rel=6e-3)
     assert (job["seed"], job["options"]) == (7, {"candidates": 3})
     assert job["result"]["intrinsics"]["fx"] == 500
     sent = page.locator("pre.curl").inner_text()
@@ -303,7 +303,7 @@ def test_jobs_are_listed_filtered_and_compared(page: Page, url: str) -> None:
     rows = page.locator("tbody tr")
     rows.nth(1).wait_for()
     page.get_by_label("Outcome").select_option("interrupted")
-    page.get_by_text("No job fits").wait_for()
+    page.get_by_text("No jobs match").wait_for()
     page.get_by_label("Outcome").select_option("localized")
     for i in range(2):
         rows.nth(i).get_by_role("checkbox").check()
@@ -393,10 +393,10 @@ def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> N
         _audit(page)
         page.get_by_label("API key").fill(key)
         page.get_by_label("API key").press("Enter")
-        page.get_by_text("No job fits").wait_for()  # what was asked for
+        page.get_by_text("No jobs match").wait_for()  # what was asked for
         assert key not in page.url
         page.get_by_role("link", name="Localize").click()
-        page.get_by_text("There is no scene").wait_for()
+        page.get_by_text("No scenes yet").wait_for()
         page.goto(f"{url}/?key=sfx_wrong")
         expect(page.get_by_role("alert")).to_contain_text("not valid")
         assert "sfx_wrong" not in page.url

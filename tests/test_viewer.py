@@ -338,8 +338,8 @@ def test_texts_escape_what_others_wrote() -> None:
 
 def test_lengths_are_in_metres_where_the_scene_has_a_scale() -> None:
     record = replace(records(1)[0], step_units=0.5)
-    assert "moved by, units</div><div style='white-space:nowrap'>0.5<" in record_html(record)
-    assert "moved by, m</div><div style='white-space:nowrap'>1.25<" in record_html(record, None, 2.5)
+    assert "position step, units</div><div style='white-space:nowrap'>0.5<" in record_html(record)
+    assert "position step, m</div><div style='white-space:nowrap'>1.25<" in record_html(record, None, 2.5)
     assert "position error, m" in charts.curves_html(records(3), records(3)[2].pose, 1, 2.5)
 
 

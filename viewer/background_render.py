@@ -121,7 +121,7 @@ class BackgroundRender:
         try:
             image = decode(self._service.render(scene_id, *api_camera(self._camera(long_side_px))))
         except (ServiceError, ValueError) as error:
-            log.warning("no exact render: %s", error)
+            log.warning("no full-quality render: %s", error)
             return
         with self._changed:
             if self._closed or self._scene_id != scene_id:

@@ -69,14 +69,14 @@ def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_u
     error_deg, error_units = pose_error(record.pose, truth) if truth else (None, None)
     rows = [
         ("stage", escape(record.stage)),
-        ("after", f"{record.elapsed_s * 1000:.0f} ms"),
+        ("elapsed", f"{record.elapsed_s * 1000:.0f} ms"),
         # Wall and CPU time differ where a job waits or uses several threads.
         ("CPU time", f"{record.cpu_s * 1000:.0f} ms"),
         ("matches", _or_dash(record.num_matches, "d")),
         ("inliers", _or_dash(record.num_inliers, "d")),
         ("loss", _or_dash(record.loss, ".4g")),
-        ("rotated by", _or_dash(record.step_deg, ".3g", "°")),
-        (f"moved by, {unit}", _or_dash(scaled(record.step_units, scale), ".3g")),
+        ("rotation step", _or_dash(record.step_deg, ".3g", "°")),
+        (f"position step, {unit}", _or_dash(scaled(record.step_units, scale), ".3g")),
     ]
     if truth:
         rows += [
@@ -104,7 +104,7 @@ _CAPTIONS: dict[Mode, str] = {
     "side by side": "photo, and render at this step's pose",
     "blend": "photo and render at this step's pose blended",
     "checker": "photo and render at this step's pose, in alternating tiles: edges should continue across them",
-    "difference": "of photo and render at this step's pose, doubled: black is agreement",
+    "difference": "of photo and render at this step's pose, doubled: black means equal",
     "flicker": "photo and render at this step's pose, alternating: what jumps is misaligned",
 }
 
@@ -144,7 +144,7 @@ def legend_html(outcome: JobOutcome | None, *, truth: bool) -> str:
     """Return the legend of the cameras' colours in 3D."""
     cameras = [("start", INITIAL_COLOUR), ("this step", CURRENT_COLOUR)]
     if outcome:
-        cameras.append(("answer", outcome_colour(outcome)))
+        cameras.append(("result", outcome_colour(outcome)))
     if truth:
         cameras.append(("true", TRUTH_COLOUR))
     cameras.append(("training", TRAINING_COLOUR))

@@ -126,7 +126,7 @@ def run(
     known = removals()
     for part in parts:
         if part not in known:
-            raise UnknownName(f"there is no part '{part}'; known: {', '.join(known)}.", where="part")
+            raise UnknownName(f"unknown part '{part}'; known: {', '.join(known)}.", where="part")
     chosen = {part: known[part] for part in parts or known}
     outcomes: dict[tuple[str, str], list[Outcome]] = {(p, c): [] for p in chosen for c in CONDITIONS}
     for number, folder in enumerate(folders):

@@ -55,7 +55,7 @@ def find_photos(folder: Path) -> list[BenchPhoto]:
     `test_filenames` of transforms.json (nerfstudio); every eighth photo of transforms.json or sparse/0.
     """
     if not folder.is_dir():
-        raise SceneNotFound("there is no such folder.", where=str(folder))
+        raise SceneNotFound("no such folder.", where=str(folder))
     if (folder / "truth.json").is_file():
         photos = _from_truth(folder)
     elif (folder / "transforms_test.json").is_file():

@@ -69,11 +69,11 @@ def read_data_set(folder: Path, layout: str = "auto", scene: Path | None = None)
     Raises UnknownName, SceneError.
     """
     if layout not in ("auto", *LAYOUTS):
-        raise UnknownName(f"there is no layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
+        raise UnknownName(f"unknown layout '{layout}'; known: auto, {', '.join(LAYOUTS)}.", where="layout")
     if folder.is_file():
         raise SceneNotFound("a scene file has no photos.", where=str(folder), hint="Name the data set: --data FOLDER.")
     if not folder.is_dir():
-        raise SceneNotFound("there is no such folder.", where=str(folder))
+        raise SceneNotFound("no such folder.", where=str(folder))
     if layout == "auto":
         layout = detect_layout(folder)
     if layout == "scene":
@@ -189,7 +189,7 @@ def _photo_files(folder: Path, count: int | None) -> list[Path]:
             sizes[max(_size_of(files[0]))] = files
     if not sizes:
         number = "" if count is None else f"{count} "
-        raise SceneNotFound(f"there is no images folder with {number}photos.", where=str(folder))
+        raise SceneNotFound(f"no images folder with {number}photos found.", where=str(folder))
     enough = [size for size in sizes if size >= MIN_LONG_SIDE_PX]
     return sizes[min(enough) if enough else max(sizes)]
 

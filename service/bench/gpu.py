@@ -50,7 +50,7 @@ def run(
     known = [part.name for part in PARTS]
     for name in names:
         if name not in known:
-            raise UnknownName(f"there is no part '{name}'; known: {', '.join(known)}.", where="part")
+            raise UnknownName(f"unknown part '{name}'; known: {', '.join(known)}.", where="part")
     # The first one is always run: without it the figures belong to no machine.
     chosen = [part for part in PARTS if not names or part.name in names or part is PARTS[0]]
     setup = "service.bench.gpu_shared:Shared", (folder, renderer, small)

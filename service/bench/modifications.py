@@ -53,9 +53,7 @@ def require_modifications(specs: Sequence[str]) -> None:
 def _parse(spec: str) -> tuple[Change, float]:
     name, _, text = spec.partition("=")
     if name not in MODIFICATIONS:
-        raise UnknownName(
-            f"there is no modification '{name}'; known: {', '.join(sorted(MODIFICATIONS))}.", where="modify"
-        )
+        raise UnknownName(f"unknown modification '{name}'; known: {', '.join(sorted(MODIFICATIONS))}.", where="modify")
     try:
         value = float(text)
     except ValueError:

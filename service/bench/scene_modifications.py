@@ -54,7 +54,7 @@ def _parse(spec: str) -> tuple[_Change, float]:
     name, _, text = spec.partition("=")
     if name not in SCENE_MODIFICATIONS:
         known = ", ".join(sorted(SCENE_MODIFICATIONS))
-        raise UnknownName(f"there is no modification of scenes '{name}'; known: {known}.", where="modify_scene")
+        raise UnknownName(f"unknown modification of scenes '{name}'; known: {known}.", where="modify_scene")
     low, high, change = SCENE_MODIFICATIONS[name]
     try:
         value = float(text)

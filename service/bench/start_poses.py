@@ -35,7 +35,7 @@ KINDS = ("none", *_WORLD_PERTURBATIONS, "pnerf", "inplace", "random")
 def require_kind(kind: str) -> None:
     """Raise UnknownName unless `kind` is one of `KINDS`."""
     if kind not in KINDS:
-        raise UnknownName(f"there is no start '{kind}'; known: {', '.join(KINDS)}.", where="start")
+        raise UnknownName(f"unknown start '{kind}'; known: {', '.join(KINDS)}.", where="start")
 
 
 def start_pose(

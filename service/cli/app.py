@@ -22,7 +22,11 @@ from service.cli.serve import serve
 from service.cli.terminal import err
 from service.errors import SplatfixError
 
-app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, help="Photo in, pose out.")
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="Localize photos in 3D Gaussian scenes.",
+)
 for command in (serve, demo, localize, render, doctor):
     app.command()(command)
 app.command(hidden=True)(openapi)

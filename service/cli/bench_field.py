@@ -14,16 +14,16 @@ def bench_field(
     scenes: Annotated[
         list[str] | None, typer.Argument(help="Scene folders; SCENE=PHOTOS where photos and truth are elsewhere.")
     ] = None,
-    folder: Annotated[Path, typer.Option("--out", help="Where results are kept; a run there is gone on with.")] = Path(
+    folder: Annotated[Path, typer.Option("--out", help="Folder of results; an interrupted run is continued.")] = Path(
         "field"
     ),
     rows: Annotated[list[str] | None, typer.Option("--row", help="Only rows like this, e.g. 'lens/k1=*'.")] = None,
-    random: Annotated[int, typer.Option(min=0, help="Random combinations a scene; rows only if named, too.")] = 0,
-    photos: Annotated[int | None, typer.Option(min=1, help="Test photos a scene, at most.")] = None,
+    random: Annotated[int, typer.Option(min=0, help="Random combinations per scene; rows only if named, too.")] = 0,
+    photos: Annotated[int | None, typer.Option(min=1, help="Limit of test photos per scene.")] = None,
     seed: int = 0,
     occluders: Annotated[Path | None, typer.Option(help="Photos of another scene, to hide parts with.")] = None,
     by_scene: Annotated[bool, typer.Option("--by-scene", help="A line of the table for each scene and row.")] = False,
-    table_only: Annotated[bool, typer.Option("--table-only", help="Run nothing; print what there is.")] = False,
+    table_only: Annotated[bool, typer.Option("--table-only", help="Print the table of existing results.")] = False,
     show_rows: Annotated[bool, typer.Option("--list", help="Print the rows, and end.")] = False,
 ) -> None:
     """Localize photos with the lenses, defects and scenes that people have; print a Markdown table."""

@@ -15,11 +15,11 @@ from service.errors import BackendMissing, InvalidRequest
 
 def bench_gpu(
     folder: Annotated[Path, typer.Argument(help="A scene folder with test photos.")] = Path("scenes/studio"),
-    renderer: Annotated[str, typer.Option(help="Compared with the CPU's.")] = "gsplat_cuda",
-    small: Annotated[bool, typer.Option("--small", help="Few and small images, for a stand-in without a GPU.")] = False,
+    renderer: Annotated[str, typer.Option(help="Renderer to compare with the CPU's.")] = "gsplat_cuda",
+    small: Annotated[bool, typer.Option("--small", help="Few and small images, to try it without a GPU.")] = False,
     part: Annotated[list[str] | None, typer.Option(help="Only this part; may be repeated.")] = None,
-    limit_s: Annotated[float, typer.Option(min=1, help="Seconds for all parts.")] = 470.0,
-    table_of: Annotated[Path | None, typer.Option(help="Run nothing: the table of this result file.")] = None,
+    limit_s: Annotated[float, typer.Option(min=1, help="Time limit of all parts together, seconds.")] = 470.0,
+    table_of: Annotated[Path | None, typer.Option(help="Run nothing; print the table of this result file.")] = None,
     json_file: JsonFileOption = None,
 ) -> None:
     """Compare a GPU's renderer with the CPU's: images, gradients, poses, times, memory. Prints a Markdown table.

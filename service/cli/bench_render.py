@@ -10,7 +10,7 @@ from service.cli.terminal import JsonFileOption, counter, out, print_machine, pr
 
 
 def bench_render(
-    repeats: Annotated[int, typer.Option(min=1, help="Of each image; the least time counts.")] = 30,
+    repeats: Annotated[int, typer.Option(min=1, help="Repetitions per image; the shortest time counts.")] = 30,
     json_file: JsonFileOption = None,
 ) -> None:
     """Time the renderer on the synthetic room."""

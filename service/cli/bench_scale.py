@@ -12,11 +12,13 @@ from service.cli.terminal import JsonFileOption, counter, out, print_machine, pr
 
 def bench_scale(
     folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
-    around: Annotated[list[Path] | None, typer.Option(help="Scenes to put around it; else varied copies.")] = None,
-    sizes: Annotated[list[int] | None, typer.Option("--size", min=1000, help="Gaussians; may be repeated.")] = None,
+    around: Annotated[list[Path] | None, typer.Option(help="Scenes to place around it, not varied copies.")] = None,
+    sizes: Annotated[
+        list[int] | None, typer.Option("--size", min=1000, help="How many Gaussians; may be repeated.")
+    ] = None,
     cameras: Annotated[Literal["given", "ignored"], typer.Option()] = "ignored",
     compressed: Annotated[bool, typer.Option("--compressed", help="Write compressed scene files.")] = False,
-    work: Annotated[Path | None, typer.Option(help="Where to write the large scenes meanwhile.")] = None,
+    work: Annotated[Path | None, typer.Option(help="Folder for the large scenes while it runs.")] = None,
     plot_file: Annotated[Path | None, typer.Option("--plot", help="Draw the curves, a .png.")] = None,
     json_file: JsonFileOption = None,
 ) -> None:

@@ -21,7 +21,7 @@ from service.cli.terminal import (
 
 def bench_track(
     folder: Annotated[Path, typer.Argument(help="A scene folder with training cameras.")],
-    frames: Annotated[int, typer.Option(min=2, help="Of the path.")] = 300,
+    frames: Annotated[int, typer.Option(min=2, help="Number of frames.")] = 300,
     seed: int = 0,
     intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
     json_file: JsonFileOption = None,

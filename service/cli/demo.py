@@ -15,7 +15,7 @@ _PLACES = (Path("splatfix", "demo", "studio"), Path("scenes", "studio"))
 
 
 def demo(
-    port: Annotated[int, typer.Option("--port", help="0: any free one.")] = 8000,
+    port: Annotated[int, typer.Option("--port", help="Port to listen on; 0: any free one.")] = 8000,
 ) -> None:
     """Serve the demo scene on this machine."""
     from service.cli.server import run
@@ -28,5 +28,7 @@ def demo_scene() -> Path:
     root = Path(__file__).resolve().parents[2]
     found = next((root / place for place in _PLACES if (root / place / "scene.json").is_file()), None)
     if found is None:
-        raise SceneNotFound("the demo scene is not here.", where=str(root), hint="Install splatfix from its wheel.")
+        raise SceneNotFound(
+            "the demo scene is not installed.", where=str(root), hint="Install splatfix from its wheel."
+        )
     return found

@@ -11,7 +11,7 @@ from service.cli.terminal import err, say, settings_of
 
 
 def doctor(
-    warm: Annotated[bool, typer.Option("--warm", help="Compile every kernel first: a minute, once.")] = False,
+    warm: Annotated[bool, typer.Option("--warm", help="First compile all kernels; takes a minute, once.")] = False,
 ) -> None:
     """Print what runs on this machine, and why the rest doesn't. Exit code 1 if localizing can't work."""
     from service.cli.diagnostics import compile_kernels, findings

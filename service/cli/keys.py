@@ -10,12 +10,12 @@ import typer
 from service.cli.terminal import say, settings_of
 from service.errors import InvalidRequest
 
-keys_app = typer.Typer(no_args_is_help=True, help="Who may use the service.")
+keys_app = typer.Typer(no_args_is_help=True, help="Manage API keys.")
 
 
 @keys_app.command("add")
 def add_key(
-    name: Annotated[str, typer.Argument(help="Whose it is; for you.")],
+    name: Annotated[str, typer.Argument(help="Name of the key, for your own overview.")],
     role: Annotated[Literal["read", "localize", "admin"], typer.Option()] = "localize",
 ) -> None:
     """Make an API key and print it; only its hash is kept."""
@@ -45,5 +45,5 @@ def remove_key(name: str) -> None:
 def _keys_file() -> Path:
     path = settings_of({}).keys_file
     if path is None:
-        raise InvalidRequest("there is no file for keys.", where="SPLATFIX_KEYS_FILE")
+        raise InvalidRequest("no keys file is set.", where="SPLATFIX_KEYS_FILE")
     return path

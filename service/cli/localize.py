@@ -60,16 +60,16 @@ def localize(
     estimator: Annotated[str, typer.Option(help="`splatfix doctor` lists them.")] = "",
     matcher: MatcherOption = "",
     seed: int = 0,
-    budget_s: Annotated[float | None, typer.Option(help="Seconds after which the best so far counts.")] = None,
-    every: Annotated[int, typer.Option(min=1, help="Of a sequence: use each Nth.")] = 1,
-    times: Annotated[str, typer.Option(help="Of a sequence's photos: JSON list of seconds, or a file of it.")] = "",
+    budget_s: Annotated[float | None, typer.Option(help="Time limit, seconds; returns the best pose so far.")] = None,
+    every: Annotated[int, typer.Option(min=1, help="Sequences: use every Nth frame.")] = 1,
+    times: Annotated[str, typer.Option(help="Sequences: times of the photos in seconds, a JSON list or a file.")] = "",
     csv_file: Annotated[Path | None, typer.Option("--csv", help="Write a table.")] = None,
-    tum_file: Annotated[Path | None, typer.Option("--tum", help="Of a sequence: write a trajectory.")] = None,
+    tum_file: Annotated[Path | None, typer.Option("--tum", help="Sequences: write the trajectory.")] = None,
     smooth: Annotated[
-        bool, typer.Option("--smooth", help="Of a sequence: filter jitter and join short gaps in --csv and --tum.")
+        bool, typer.Option("--smooth", help="Sequences: filter jitter and join short gaps in --csv and --tum.")
     ] = False,
     learn_lenses: Annotated[
-        bool, typer.Option("--learn-lenses", help="Photos tell the lens of the same camera's next ones, by EXIF.")
+        bool, typer.Option("--learn-lenses", help="Use the lens of earlier photos of the same camera, by EXIF.")
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print results as the API has them.")] = False,
     fail: Annotated[

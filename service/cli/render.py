@@ -13,7 +13,7 @@ from service.errors import InvalidRequest
 
 def render(
     scene: Annotated[Path, typer.Option("--scene", help="Scene folder or scene file.")],
-    pose: Annotated[str, typer.Option(help="As the API takes a prior: JSON or a file.")],
+    pose: Annotated[str, typer.Option(help="Pose in the API's format of a prior: JSON, or a file.")],
     out_file: Annotated[Path, typer.Option("--out", help="A .png or .jpg to write.")],
     intrinsics: IntrinsicsOption = "",
 ) -> None:

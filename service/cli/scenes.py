@@ -10,7 +10,7 @@ import typer
 from service.cli.scenes_register import register_scene
 from service.cli.terminal import err, print_json, say
 
-scenes_app = typer.Typer(no_args_is_help=True, help="Look at scenes, and register them.")
+scenes_app = typer.Typer(no_args_is_help=True, help="Inspect and register scenes.")
 scenes_app.command("register")(register_scene)
 
 

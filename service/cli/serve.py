@@ -15,7 +15,7 @@ def serve(
         list[Path] | None, typer.Argument(help="Scene folders, scene files, or folders of scene folders.")
     ] = None,
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
-    port: Annotated[int | None, typer.Option(help="0: any free one.", min=0, max=65535)] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)] = None,
     viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
     open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
 ) -> None:

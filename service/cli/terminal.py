@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 out, err = Console(), Console(stderr=True)
 
-MatcherOption = Annotated[str, typer.Option("--matcher", help="Of local features; `splatfix doctor` lists them.")]
+MatcherOption = Annotated[str, typer.Option("--matcher", help="Kind of local features; see `splatfix doctor`.")]
 IntrinsicsOption = Annotated[
     str,
     typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
@@ -111,7 +111,7 @@ def scene_arguments(given: list[str], named_by_photos: bool = False) -> dict[str
         if data and named_by_photos:
             name += f"-{Path(data).resolve().stem}"
         if name in found:
-            raise InvalidRequest(f"there are two scenes '{name}'.", where="scenes")
+            raise InvalidRequest(f"two scenes have the name '{name}'.", where="scenes")
         found[name] = Path(scene), Path(data) if data else None
     return found
 

@@ -112,7 +112,7 @@ class Options:
         require_within(self, limits)
         for what, value, known in (("solver", self.solver, SOLVERS), ("around", self.around, AROUND)):
             if value not in known:
-                raise InvalidOptions(f"there is no {what} '{value}'; known: {', '.join(known)}.", where=what)
+                raise InvalidOptions(f"unknown {what} '{value}'; known: {', '.join(known)}.", where=what)
         require_loss(self.loss)
 
 

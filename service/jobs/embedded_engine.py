@@ -135,7 +135,7 @@ class EmbeddedEngine:
     def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
         held = self._held.get(task.held)
         if held is None:
-            raise SceneNotReady("the job's scenes are not in memory any more.", where="scene")
+            raise SceneNotReady("the job's scenes were unloaded.", where="scene")
         cancel = self._cancels[task.id] = threading.Event()
         try:
             result, loaded = run_task(task, held.scenes, on_record, cancel, held.registrations)

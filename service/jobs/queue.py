@@ -61,7 +61,7 @@ class JobQueue:
         """Take a place in the queue for a job that is about to come. Raises QueueFull."""
         with self._changed:
             if self._full():
-                raise QueueFull(f"{len(self._queue)} jobs are waiting.", hint="Try again later.")
+                raise QueueFull(f"the queue is full: {len(self._queue)} jobs.", hint="Try again later.")
             self._reserved += 1
 
     def release(self) -> None:

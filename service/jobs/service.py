@@ -225,7 +225,7 @@ class Jobs:
     def require_queue_capacity(self, client: str, key: str | None) -> None:
         """Raises QueueFull if a new job would be refused; a repeated one never is."""
         if self._queue.full() and not (key and self._store.has_key(client, key)):
-            raise QueueFull(f"{self._queue.waiting()} jobs are waiting.", hint="Try again later.")
+            raise QueueFull(f"the queue is full: {self._queue.waiting()} jobs.", hint="Try again later.")
 
     def stuck_workers(self) -> int:
         """Return how many workers were given up."""

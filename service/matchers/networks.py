@@ -45,7 +45,7 @@ def missing_weights(*files: str) -> str | None:
     if not folder:
         return f"set {WEIGHTS_DIR} to a folder with {' and '.join(files)}; nothing is downloaded."
     absent = [file for file in files if not Path(folder, file).is_file()]
-    return f"there is no {' and no '.join(absent)} in {WEIGHTS_DIR}." if absent else None
+    return f"{' and '.join(absent)} not found in {WEIGHTS_DIR}." if absent else None
 
 
 def lighterglue() -> LightGlue:

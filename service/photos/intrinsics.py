@@ -48,7 +48,7 @@ def intrinsics_from(mapping: Mapping[str, Any]) -> Intrinsics:
     model = mapping.get("model", "PINHOLE")
     if not isinstance(model, str) or model not in DISTORTION_COUNTS:
         raise InvalidIntrinsics(
-            f"there is no camera model {str(model)[:40]!r}; known: {', '.join(DISTORTION_COUNTS)}.",
+            f"unknown camera model {str(model)[:40]!r}; known: {', '.join(DISTORTION_COUNTS)}.",
             where="model",
         )
     distortion = mapping.get("distortion", ())

@@ -18,5 +18,5 @@ def find_scenes(path: Path) -> list[Path]:
     # One level only: a scene folder may hold photos and other files in folders of its own.
     found = sorted(p for p in path.iterdir() if p.is_dir() and is_scene_folder(p)) if path.is_dir() else []
     if not found:
-        raise SceneNotFound("there is no scene.", where=str(path))
+        raise SceneNotFound("no scene found.", where=str(path))
     return found

@@ -44,7 +44,7 @@ def load_scene(
     cameras in the scene file's frame that replace those of the folder.
     """
     if not path.exists():
-        raise SceneNotFound("there is no such file or folder.", where=str(path))
+        raise SceneNotFound("no such file or folder.", where=str(path))
     manifest = read_manifest(path) if path.is_dir() else Manifest()
     file, reader = scene_file(path, manifest)
     raw = checked(reader.read(file), file.name)

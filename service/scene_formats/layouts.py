@@ -39,7 +39,7 @@ def scene_file(path: Path, manifest: Manifest) -> tuple[Path, ModuleType]:
     elif manifest.file:
         candidates = [path / manifest.file]
         if not candidates[0].is_file():
-            raise SceneNotFound(f"there is no '{manifest.file}'.", where=f"{MANIFEST}: file")
+            raise SceneNotFound(f"'{manifest.file}' not found.", where=f"{MANIFEST}: file")
     else:
         candidates = _likely(path)
     if not candidates:

@@ -82,7 +82,7 @@ def _beside(meta: Path, name: str) -> bytes:
     """Read an image in the folder of `meta.json`; not one elsewhere, wherever a link leads."""
     file = meta.parent / name
     if Path(name).name != name or not file.is_file():
-        raise CorruptScene(f"there is no image '{name[:80]}' beside it.", where=meta.name)
+        raise CorruptScene(f"image '{name[:80]}' not found beside it.", where=meta.name)
     if not file.resolve().is_relative_to(meta.parent.resolve()) or file.stat().st_size > _MAX_PLANE_BYTES:
         raise CorruptScene(f"'{name[:80]}' is a link out of the folder, or too large.", where=meta.name)
     return file.read_bytes()

@@ -41,11 +41,11 @@ def refuse_suffix(suffix: str, where: str) -> None:
     """Raise UnsupportedFormat if files of this suffix are known and not read."""
     if suffix in UNREAD_SUFFIXES:
         what, hint = UNREAD_SUFFIXES[suffix]
-        raise UnsupportedFormat(f"{what}, which is not read.", where=where, hint=hint)
+        raise UnsupportedFormat(f"{what} is not supported.", where=where, hint=hint)
 
 
 def refuse_properties(names: tuple[str, ...], where: str) -> None:
     """Raise UnsupportedFormat if a .ply has the properties of a known kind of scene that is not 3DGS."""
     for what, present, absent, hint in _LAYERS:
         if present <= set(names) and not absent & set(names):
-            raise UnsupportedFormat(f"not a 3DGS scene but {what}.", where=where, hint=hint)
+            raise UnsupportedFormat(f"not a 3DGS scene: {what}.", where=where, hint=hint)

@@ -131,9 +131,9 @@ class Scenes:
             if scene_id is None and len(self._entries) == 1:
                 return next(iter(self._entries.values()))
             if scene_id is None:
-                raise SceneNotFound(f"say which scene; known: {known}.", where="scene")
+                raise SceneNotFound(f"name a scene; known: {known}.", where="scene")
             if scene_id not in self._entries:
-                raise SceneNotFound(f"there is no scene '{scene_id}'; known: {known}.", where="scene")
+                raise SceneNotFound(f"unknown scene '{scene_id}'; known: {known}.", where="scene")
             return self._entries[scene_id]
 
     def add(self, entry: Entry) -> None:
@@ -231,7 +231,7 @@ class Scenes:
     def unload(self, entry: Entry) -> None:
         """Drop a scene from memory as soon as no job uses it; none may start to. Raises BadInput."""
         if entry.path is None:
-            raise BadInput("it has no file to be loaded from again.", where="scene")
+            raise BadInput("the scene has no file to reload it from.", where="scene")
         with self._lock:
             entry.wanted = False
             if entry.state == "ready":

@@ -127,5 +127,5 @@ def _copied(source: IO[bytes], path: Path, left: int) -> int:
             # The size in the archive is not trusted: small files can unpack to any size.
             left -= len(chunk)
             if left < 0:
-                raise CorruptScene("the archive holds more than the service takes.", where="archive")
+                raise CorruptScene("the unpacked archive is too large.", where="archive")
             target.write(chunk)

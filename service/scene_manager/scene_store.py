@@ -95,13 +95,13 @@ def named_scenes(paths: Iterable[Path]) -> list[StoredScene]:
         place = path.resolve()
         scene_id = place.stem if path.is_file() else place.name
         if scene_id == AUTO:
-            raise BadInput(f"no scene can be called '{AUTO}': it stands for all.", where=str(path))
+            raise BadInput(f"'{AUTO}' is a reserved name: it means all scenes.", where=str(path))
         if place in named:
             continue
         named.add(place)
         if scene_id in found:
             free = _free_id(f"{place.parent.name}-{scene_id}", found)
-            _log.warning("there is a scene %s already: that at %s gets the id %s", scene_id, path, free)
+            _log.warning("scene %s already exists: the one at %s gets the id %s", scene_id, path, free)
             scene_id = free
         found[scene_id] = StoredScene(scene_id, path)
     return list(found.values())
@@ -150,7 +150,7 @@ class FolderSceneStore:
     def delete(self, scene_id: str) -> None:
         scene = self.find(scene_id)
         if scene is None or not scene.uploaded:
-            raise SceneNotFound(f"there is no uploaded scene '{scene_id}'.", where="scene")
+            raise SceneNotFound(f"uploaded scene '{scene_id}' not found.", where="scene")
         try:
             shutil.rmtree(scene.path)
         except OSError as error:
@@ -211,7 +211,9 @@ class FolderDraft:
         else:
             if suffix not in all_kinds():
                 names = " or ".join(f"`scene{suffix}`" for suffix in readable_suffixes())
-                raise InvalidRequest(f"say what kind of file it is: {names}, or send a ZIP.", where="query.file")
+                raise InvalidRequest(
+                    "the file's format is unknown.", where="query.file", hint=f"Name it, {names}, or send a ZIP."
+                )
             upload.rename(self._folder / f"scene{suffix}")
         try:
             self._require_allowed()
@@ -245,12 +247,14 @@ def _storing(target: Path) -> Iterator[None]:
 
 
 def _exists(scene_id: str) -> SceneExists:
-    return SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+    return SceneExists(f"scene '{scene_id}' already exists.", where="scene", hint="Delete it first.")
 
 
 def check_scene_id(scene_id: str) -> None:
     """Raises InvalidRequest unless it can be the name of a folder anywhere."""
     if not _NAME.fullmatch(scene_id):
-        raise InvalidRequest("must be 1 to 64 letters, digits, _ and -, the first no sign.", where="path.scene_id")
+        raise InvalidRequest(
+            "must be 1 to 64 letters, digits, _ and -, beginning with a letter or digit.", where="path.scene_id"
+        )
     if scene_id == AUTO:
-        raise InvalidRequest(f"no scene can be called '{AUTO}': it stands for all.", where="path.scene_id")
+        raise InvalidRequest(f"'{AUTO}' is a reserved name: it means all scenes.", where="path.scene_id")

@@ -162,7 +162,7 @@ def add_key(path: Path, name: str, role: Role) -> str:
     """Make a key and store its hash; return the key, which can't be read from the file. Raises InvalidRequest."""
     keys = read_keys(path)
     if any(key.name == name for key in keys):
-        raise InvalidRequest(f"there is a key '{name}' already.", where="name", hint="Remove it first.")
+        raise InvalidRequest(f"key '{name}' already exists.", where="name", hint="Remove it first.")
     key = _PREFIX + secrets.token_urlsafe(32)
     _write(path, [*keys, StoredKey(name, role, _digest(key))])
     return key
@@ -173,7 +173,7 @@ def remove_key(path: Path, name: str) -> None:
     keys = read_keys(path)
     left = [key for key in keys if key.name != name]
     if len(left) == len(keys):
-        raise InvalidRequest(f"there is no key '{name}'.", where="name")
+        raise InvalidRequest(f"key '{name}' not found.", where="name")
     _write(path, left)
 
 

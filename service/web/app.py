@@ -208,7 +208,7 @@ def _add_gauges(metrics: Metrics, engine: Engine, jobs: Jobs, workers: int) -> N
     metrics.gauge("jobs_queued", "Queued jobs", (), lambda: {(): jobs.waiting()})
     metrics.gauge("jobs_running", "Running jobs", (), lambda: {(): jobs.running()})
     metrics.gauge("workers", "Worker threads", (), lambda: {(): workers})
-    metrics.gauge("workers_stuck", "Workers given up as stuck", (), lambda: {(): jobs.stuck_workers()})
+    metrics.gauge("workers_stuck", "Stuck workers", (), lambda: {(): jobs.stuck_workers()})
     metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), lambda: _scene_bytes(engine))
 
 
@@ -221,7 +221,7 @@ def _named_scenes(settings: Settings) -> list[StoredScene]:
     named = named_scenes(settings.scenes)
     for scene_id in settings.preload or ():
         if scene_id not in {scene.id for scene in named}:
-            raise SceneNotFound(f"there is no scene '{scene_id}' to preload.", where="preload")
+            raise SceneNotFound(f"unknown scene '{scene_id}'.", where="preload")
     return named
 
 

@@ -34,25 +34,25 @@ class Metrics:
         self._requests = Counter("splatfix_requests", "HTTP requests", ["method", "route", "status"], registry=registry)
         self._request_s = Histogram(
             "splatfix_request_seconds",
-            "Until the response's end",
+            "Time from a request to the end of its response",
             ["route"],
             buckets=_SECONDS,
             registry=registry,
         )
-        self._jobs = Counter("splatfix_jobs", "Jobs that ended", ["estimator", "state", "status"], registry=registry)
+        self._jobs = Counter("splatfix_jobs", "Finished jobs", ["estimator", "state", "status"], registry=registry)
         self._wait_s = Histogram(
-            "splatfix_job_wait_seconds", "Job, from acceptance to start", buckets=_SECONDS, registry=registry
+            "splatfix_job_wait_seconds", "Time of a job from acceptance to start", buckets=_SECONDS, registry=registry
         )
         self._job_s = Histogram(
             "splatfix_job_seconds",
-            "Job, from start to end",
+            "Time of a job from start to end",
             ["estimator"],
             buckets=_SECONDS,
             registry=registry,
         )
         self._stage_s = Histogram(
             "splatfix_stage_seconds",
-            "Job, by stage",
+            "Time of a job by stage",
             ["estimator", "stage"],
             buckets=_SECONDS,
             registry=registry,
@@ -60,7 +60,7 @@ class Metrics:
         self._renders = Counter("splatfix_renders", "Renders made by jobs", ["estimator"], registry=registry)
         self._render_s = Histogram(
             "splatfix_render_seconds",
-            "Time to render an image for a client, with its wait",
+            "Time to render an image for a client, including its wait",
             ["scene"],
             buckets=_SECONDS,
             registry=registry,

@@ -154,7 +154,7 @@ def chosen(
     ):
         for name in names:
             if name not in known:
-                raise UnknownName(f"there is no {what} '{name}'; known: {', '.join(sorted(known))}.", where=what)
+                raise UnknownName(f"unknown {what} '{name}'; known: {', '.join(sorted(known))}.", where=what)
     return tuple(_filtered(studies, methods, protocols))
 
 

@@ -81,7 +81,7 @@ def require_loss(name: str) -> None:
 
 def _maker(name: str) -> Callable[[Photo, LossConfig], Loss]:
     if name not in LOSSES:
-        raise UnknownName(f"there is no loss '{name}'; known: {', '.join(LOSSES)}.", where="loss")
+        raise UnknownName(f"unknown loss '{name}'; known: {', '.join(LOSSES)}.", where="loss")
     return LOSSES[name]
 
 

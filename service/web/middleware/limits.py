@@ -72,7 +72,7 @@ class Limits:
         if policy.queues_job:
             await self._check_queue(client_of(scope), Headers(scope=scope).get("idempotency-key"))
         if policy.body and self._uploads >= self._settings.max_uploads:
-            raise QueueFull(f"{self._uploads} uploads are under way.", hint="Try again later.")
+            raise QueueFull(f"too many uploads at once ({self._uploads}).", hint="Try again later.")
 
     def _check_rate(self, scope: Scope) -> None:
         client = client_of(scope)

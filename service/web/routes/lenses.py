@@ -38,5 +38,5 @@ def delete_lens(
     """Forget a lens. Jobs that were accepted before keep what was recalled for them."""
     deleted = app_state.lenses.delete(lens_id, owner)
     if not deleted:
-        raise LensNotFound(f"you have no lens '{lens_id[:40]}'.", where="lens")
+        raise LensNotFound(f"lens '{lens_id[:40]}' not found.", where="lens")
     return LensesDeleted(deleted=deleted)

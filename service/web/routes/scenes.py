@@ -67,7 +67,7 @@ async def upload_scene(
     # Before the upload of perhaps gigabytes.
     known = await to_thread.run_sync(app_state.engine.scenes)
     if any(scene.id == scene_id for scene in known):
-        raise SceneExists(f"there is a scene '{scene_id}'.", where="scene", hint="Delete it first.")
+        raise SceneExists(f"scene '{scene_id}' already exists.", where="scene", hint="Delete it first.")
     with await to_thread.run_sync(app_state.scene_store.draft, scene_id) as draft:
         async for chunk in request.stream():
             await to_thread.run_sync(draft.write, chunk)

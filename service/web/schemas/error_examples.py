@@ -51,11 +51,11 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         ),
         "/localize",
     ),
-    (e.QueueFull("32 jobs are waiting.", hint=_AGAIN), "/localize"),
+    (e.QueueFull("the queue is full: 32 jobs.", hint=_AGAIN), "/localize"),
     (e.RateLimited("more than 30/second requests of yours.", hint="Slow down.", retry_after_s=1), "/localize"),
     (e.StorageFailed("the service can't write the photo to disk: No space left on device."), "/localize"),
-    (e.BadInput("it has no file to be loaded from again.", where="scene"), f"{_SCENE}/unload"),
-    (e.SceneNotFound("there is no scene 'attic'; known: studio.", where="scene"), "/scenes/attic"),
+    (e.BadInput("the scene has no file to reload it from.", where="scene"), f"{_SCENE}/unload"),
+    (e.SceneNotFound("unknown scene 'attic'; known: studio.", where="scene"), "/scenes/attic"),
     (
         e.SceneNotReady("scene 'studio' is loading.", where="scene", hint=_AGAIN),
         "/localize",
@@ -72,7 +72,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         ),
         "/localize",
     ),
-    (e.SceneExists("there is a scene 'studio'.", where="scene", hint="Delete it first."), _SCENE),
+    (e.SceneExists("scene 'studio' already exists.", where="scene", hint="Delete it first."), _SCENE),
     (e.SceneInUse("2 jobs use the scene.", where="scene", hint="Unload it, and wait for them."), _SCENE),
     (
         e.CorruptScene(
@@ -91,7 +91,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         e.RecordNotFound("the job has 12 records and is succeeded.", where="iterations"),
         f"{_JOB}/iterations/12/render.jpg",
     ),
-    (e.LensNotFound("you have no lens '0123456789abcdef'.", where="lens"), "/lenses/0123456789abcdef"),
+    (e.LensNotFound("lens '0123456789abcdef' not found.", where="lens"), "/lenses/0123456789abcdef"),
     (
         e.RegistrationFailed(
             "scale, up, heading, position can't be determined: all 4 places are one, as far as their noise tells.",

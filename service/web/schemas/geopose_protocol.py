@@ -137,7 +137,7 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
         return None
     where = "cameraReadings.0.params"
     if params.model not in DISTORTION_COUNTS:
-        raise InvalidIntrinsics(f"there is no camera model {str(params.model)[:40]!r}.", where=f"{where}.model")
+        raise InvalidIntrinsics(f"unknown camera model {str(params.model)[:40]!r}.", where=f"{where}.model")
     focals = 1 if params.model in ONE_FOCAL else 2
     expected = focals + 2 + DISTORTION_COUNTS[params.model]
     if len(params.modelParams) != expected or len(reading.size) != 2:

@@ -111,7 +111,7 @@ def _refuse_unknown(names: Iterable[str]) -> None:
     unknown = sorted(set(names) - _FIELDS)
     if unknown:
         known = ", ".join(sorted(_FIELDS))
-        raise InvalidRequest("there is no such field.", where=unknown[0], hint=f"Known: {known}.")
+        raise InvalidRequest("unknown field.", where=unknown[0], hint=f"Known: {known}.")
 
 
 def parsed_json(text: str | bytes, where: str) -> Any:

@@ -11,7 +11,7 @@ let entries = [];
 
 /** Send photos with the same fields, and show their table. */
 export async function start(files, fields) {
-  entries = files.map(file => ({ file, name: file.name || "photo", note: "waiting", job: null }));
+  entries = files.map(file => ({ file, name: file.name || "photo", note: "queued", job: null }));
   const mine = entries;
   location.hash = "#/batch/";
   for (const entry of mine) {
@@ -47,7 +47,7 @@ export function show(main, list) {
     saving("nerfstudio", "transforms.json", () => transforms(found(true))));
   main.append(h("h1", {}, "Photos"), summary, h("div", { class: "filters" }, filter, exports),
     h("div", { class: "scroll", tabIndex: 0, role: "region", "aria-label": "Results" }, h("table", { class: "jobs" },
-      h("thead", {}, h("tr", {}, ["Photo", "Outcome", "Why", "Score", "Scene", "Position", "Took", "3D"]
+      h("thead", {}, h("tr", {}, ["Photo", "Outcome", "Reason", "Score", "Scene", "Position", "Duration", "3D"]
         .map(name => h("th", { scope: "col" }, name)))), rows)));
   const draw = () => {
     const shown = entries.filter(entry => !filter.value || (outcome(entry) ?? "other") === filter.value);

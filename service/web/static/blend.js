@@ -12,7 +12,7 @@ export function blend(photo, render, alt, file = null) {
   const gone = () => {
     below.remove();
     above.classList.add("alone");
-    note.textContent = "The service has not kept the photo.";
+    note.textContent = "The photo was deleted after the job.";
   };
   below.addEventListener("error", () => {
     if (!file) return gone();
@@ -21,7 +21,7 @@ export function blend(photo, render, alt, file = null) {
   }, { once: true });
   above.addEventListener("error", () => {
     above.remove();
-    note.textContent = "There is no render.";
+    note.textContent = "No render available.";
   });
   return { element: figure, share: value => { above.style.opacity = value; } };
 }

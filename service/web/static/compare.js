@@ -22,11 +22,11 @@ function compared(jobs, [sceneA, sceneB]) {
   const pairs = jobs.map(job => blend(photoOf(job), job.links.render, `The scene at the pose that ${job.estimator} found`));
   const same = jobs[0].photo.sha256 === jobs[1].photo.sha256;
   return [
-    h("p", { class: same ? "lead" : "warning" }, same ? jobs[0].photo.name : "These jobs are on different photos."),
+    h("p", { class: same ? "lead" : "warning" }, same ? jobs[0].photo.name : "These jobs are of different photos."),
     h("p", { class: "lead" }, apart(jobs, sceneA, sceneB)),
     h("div", { class: "pair" }, jobs.map((job, i) => h("section", {},
       h("h2", {}, h("a", { href: `#/jobs/${job.id}` }, `${"AB"[i]}: ${job.estimator}`), " ", badge(job.result?.status ?? job.state)),
-      job.result ? pairs[i].element : h("p", {}, "There is no result.")))),
+      job.result ? pairs[i].element : h("p", {}, "No result.")))),
     blendSlider(pairs),
     h("div", { class: "scroll" }, h("table", {}, h("thead", {}, h("tr", {}, h("td", {}),
       jobs.map((_, i) => h("th", { scope: "col" }, "AB"[i])))), h("tbody", {}, differences(jobs, sceneA)))),
@@ -52,8 +52,8 @@ function differences(jobs, scene) {
     prior: job => (job.prior ? "given" : "none"), "intrinsics from": job => job.result?.intrinsics_source,
     reason: job => words(job.result?.reason), score: job => job.result?.score.toFixed(3), inliers: job => job.result?.inliers,
     gradient_correlation: job => job.result?.gradient_correlation.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
-    "error of rotation": job => degrees(error(job)[0]), "error of position": job => length(error(job)[1], scene?.metres_per_unit),
-    "σ of rotation": job => degrees(job.result?.covariance?.sigma_deg), steps: job => job.records,
+    "rotation error": job => degrees(error(job)[0]), "position error": job => length(error(job)[1], scene?.metres_per_unit),
+    "rotation σ": job => degrees(job.result?.covariance?.sigma_deg), steps: job => job.records,
     "wall time": job => seconds(sum(job, "wall_s")), "CPU time": job => seconds(sum(job, "cpu_s")),
   };
   return Object.entries(rows).map(([name, value]) => {

@@ -28,7 +28,7 @@ export function show(main) {
       rows.append(...page.jobs.map(job => row(job, marked, compare)));
       next = page.next;
       more.hidden = !next;
-      note.textContent = rows.children.length ? "" : "No job fits.";
+      note.textContent = rows.children.length ? "" : "No jobs match.";
     } catch (error) {
       note.textContent = error.message;
     }
@@ -51,7 +51,7 @@ export function show(main) {
   main.append(h("h1", {}, "History"),
     h("div", { class: "filters" }, outcome, scene, estimator, compare),
     h("div", { class: "scroll", tabIndex: 0, role: "region", "aria-label": "Jobs" }, h("table", { class: "jobs" },
-      h("thead", {}, h("tr", {}, ["", "Photo", "Outcome", "Score", "Scene", "Estimator", "Took", "When", "3D"]
+      h("thead", {}, h("tr", {}, ["", "Photo", "Outcome", "Score", "Scene", "Estimator", "Duration", "Created", "3D"]
         .map((name, i) => h("th", { scope: "col" }, i ? name : h("span", { class: "sr" }, "Mark"))))), rows)),
     note, more);
   reload();

@@ -25,15 +25,15 @@ export class OptionsForm {
     this.element = h("div", { class: "options" },
       group("Estimator", h("div", { class: "grid" }, field("Estimator", this.estimator), field("Seed", this.seed),
         field("Time budget, seconds", this.budget),
-        field("Keep the photo", this.keep, "As long as the job; else it is deleted soon after it.")), this.options),
+        field("Keep the photo", this.keep, "Keep it as long as the job; by default it is deleted shortly after it.")), this.options),
       group("Intrinsics of the upright photo, in pixels",
         h("div", { class: "grid narrow" }, NUMBERS.map(name => field(name, this.numbers[name]))),
         h("div", { class: "grid" }, field("Camera model, by COLMAP's name", this.model), field("Distortion", this.distortion),
-          field("Approximate", this.approximate, "The focal length is where the search begins."),
-          field("Camera's name", this.camera, "Without intrinsics: its earlier photos tell them.")),
+          field("Approximate", this.approximate, "The focal length is only a starting value."),
+          field("Camera name", this.camera, "Without intrinsics: uses those of the camera's earlier photos.")),
         h("p", { class: "quiet" }, "Left empty: taken from the photo's EXIF data or guessed, then estimated with the pose.")),
-      group("Prior pose, a guess to start from", this.poses.prior.element),
-      group("True pose, to measure errors against: the search does not see it", this.poses.truth.element));
+      group("Prior: approximate pose to start from", this.poses.prior.element),
+      group("True pose, to measure errors; not used by the search", this.poses.truth.element));
   }
 
   used() {

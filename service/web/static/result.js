@@ -41,7 +41,7 @@ function walk(frames) {
 
 function alternatives({ alternatives: others }) {
   const place = ({ pose, probability }) => h("li", {}, `${pose.position.map(x => x.toFixed(3)).join(", ")} (${Math.round(100 * probability)} %)`);
-  return h("div", { class: "warning" }, "It may as well have been taken at", h("ul", {}, ...others.map(place)));
+  return h("div", { class: "warning" }, "Other possible positions:", h("ul", {}, ...others.map(place)));
 }
 
 /** The photo's address; while the job ran, the same one may have had another photo of the sequence. */
@@ -63,7 +63,7 @@ function poses(job) {
   const { status } = job.result;
   return [
     h("h2", {}, "Pose"),
-    ...(status !== "localized" ? [h("p", { class: "warning" }, "The best guess. Don't rely on it.")] : []),
+    ...(status !== "localized" ? [h("p", { class: "warning" }, "Best guess only: not verified.")] : []),
     ...poseFormats(job).map(([name, text], index) => {
       const details = h("details", { class: "pose", open: index === 0 && status !== "not_localized" }, h("summary", {}, name), h("pre", { tabIndex: 0 }, text));
       return h("div", { class: "poserow" }, details, copyButton(() => text, name));
@@ -75,18 +75,18 @@ function numbers(job, scene) {
   const { result } = job;
   const took = job.finished && job.started ? (Date.parse(job.finished) - Date.parse(job.started)) / 1000 : null;
   const scale = scene?.metres_per_unit;
-  const common = [["Scene", scene?.name ?? job.scene], ["Estimator", job.estimator], ["When", when(job.created)],
-    ["Took", seconds(took)], ["Steps", String(job.records)]];
+  const common = [["Scene", scene?.name ?? job.scene], ["Estimator", job.estimator], ["Created", when(job.created)],
+    ["Duration", seconds(took)], ["Steps", String(job.records)]];
   if (!result) return h("section", {}, h("h2", {}, "Job"), facts(common));
   const { covariance, intrinsics } = result;
   const [angle, distance] = job.truth ? poseDistance(result.pose, job.truth) : [null, null];
   return h("section", {}, h("h2", {}, "Evidence"), facts([
     ["Score", result.score.toFixed(2)], ["Right place / precise", parts(result, scale)], ["Inliers", String(result.inliers)],
     ["Gradient correlation", result.gradient_correlation.toFixed(2)], ["Coverage", `${Math.round(100 * result.coverage)} %`],
-    ["σ of rotation", covariance && degrees(covariance.sigma_deg)],
-    ["σ of position", covariance && length(covariance.sigma_units, scale)],
-    ["Error of rotation", job.truth && degrees(angle)],
-    ["Error of position", job.truth && length(distance, scale)],
+    ["Rotation σ", covariance && degrees(covariance.sigma_deg)],
+    ["Position σ", covariance && length(covariance.sigma_units, scale)],
+    ["Rotation error", job.truth && degrees(angle)],
+    ["Position error", job.truth && length(distance, scale)],
     ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${lens(result)}`],
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(

@@ -152,7 +152,7 @@ async function listScenes(place, timer, example) {
   offer();
   const cards = scenes.map(scene => card(scene, changed));
   place.replaceChildren(h("legend", {}, "Scene"),
-    scenes.length ? h("div", { class: "cards" }, several ? anyCard(changed) : null, cards) : h("p", {}, "There is no scene."));
+    scenes.length ? h("div", { class: "cards" }, several ? anyCard(changed) : null, cards) : h("p", {}, "No scenes yet."));
   if (scenes.some(scene => ["loading", "preparing", "unloading"].includes(scene.state))) {
     timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
   }

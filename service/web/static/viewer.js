@@ -57,10 +57,16 @@ async function compare() {
   else show(`The service is starting (${pending[0]}).`);
 }
 
-// viser's labels have a contrast of 4.0 : 1.
-const labels = document.createElement("style");
-labels.textContent = ":root { --mantine-color-dimmed: #c3c6ca !important; --mantine-color-placeholder: #c3c6ca !important; }";
-document.head.append(labels);
+// viser's labels have a contrast of 4.0 : 1. On narrow screens its panel, 20em wide, covers a half of the view: there it
+// is a sheet along the lower edge, which folds by its handle.
+const styles = document.createElement("style");
+styles.textContent = `
+:root { --mantine-color-dimmed: #c3c6ca !important; --mantine-color-placeholder: #c3c6ca !important; }
+@media (max-width: 36em) {
+  [style*="width: 20em"] { width: 100vw !important; }
+  [style*="width: 20em"][style*="fixed"] { max-height: 42dvh !important; border-radius: 14px 14px 0 0 !important; }
+}`;
+document.head.append(styles);
 
 const bar = document.createElement("div");
 bar.setAttribute("role", "alert");
