@@ -185,6 +185,13 @@ class MemoryJobStore:
                 del self._rows[job_id]
             return gone
 
+    def delete(self, job_id: str) -> bool:
+        with self._lock:
+            ended = job_id in self._rows and self._rows[job_id].job.ended
+            if ended:
+                del self._rows[job_id]
+            return ended
+
     def ids(self) -> set[str]:
         with self._lock:
             return set(self._rows)

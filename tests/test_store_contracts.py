@@ -312,6 +312,16 @@ def test_the_oldest_ended_jobs_are_forgotten(store, kept, left, monkeypatch):
     assert [job.id for job in store.page(JobFilter(), 9)] == left
 
 
+def test_only_an_ended_job_is_deleted_with_all_that_it_has(store):
+    store.claim(store.accept(new_job("running")), math.inf)
+    store.claim(store.accept(new_job("ended")), math.inf)
+    store.finish("ended", 1, NONE, Ending("cancelled"), None)
+    assert [store.delete(name) for name in ("running", "ended", "ended", "nothing")] == [False, True, False, False]
+    assert store.ids() == {"running"}
+    with pytest.raises(JobNotFound):
+        store.get("ended")
+
+
 def test_photos_are_stale_when_their_time_is_over(store):
     for name, keep, until in (("old", False, 1.0), ("new", False, time.time() + 60), ("kept", True, 1.0)):
         store.claim(store.accept(new_job(name, keep_photo=keep)), math.inf)

@@ -78,7 +78,7 @@ class EmbeddedEngine:
     # ------------------------------------------------------------------ scenes
 
     def add(self, scene: StoredScene, *, required: bool = False) -> None:
-        self._manager.add(Entry(scene.id, scene.path, required=required))
+        self._manager.add(Entry(scene.id, scene.path, required=required, uploaded=scene.uploaded))
 
     def add_loaded(self, scene_id: str, loaded: LoadedScene) -> None:
         """Add a scene that is in memory already and has no file; it is required."""

@@ -249,6 +249,12 @@ class Jobs:
             self._queue.withdraw(live)
             self._worker.clean_up(live)
 
+    def delete(self, job: StoredJob) -> None:
+        """Delete an ended job with its records, result and photo. Raises JobNotReady while it is queued or running."""
+        if not self._store.delete(job.id) and job.id in self._store.ids():
+            raise JobNotReady(f"the job is {job.state}.", where="job", hint="Cancel it first: DELETE /jobs/ID.")
+        self._photos.delete(job.id)
+
     def close(self) -> None:
         """Let what runs finish within the grace period; the rest waits on disk for the next start."""
         self._worker.closing.set()

@@ -282,6 +282,14 @@ class SqliteJobStore:
             self._database.give_space_back()
         return [job_id for (job_id,) in ids]
 
+    def delete(self, job_id: str) -> bool:
+        with self._database.transaction() as writer:
+            ended = f"DELETE FROM jobs WHERE id = ? AND state IN ({_ENDED_SQL})"
+            deleted = writer.execute(ended, (job_id,)).rowcount > 0
+            if deleted:
+                writer.execute("DELETE FROM events WHERE job = ?", (job_id,))
+        return deleted
+
     def ids(self) -> set[str]:
         with self._database.reading() as reader:
             return {job_id for (job_id,) in reader.execute("SELECT id FROM jobs")}

@@ -104,6 +104,10 @@ class JobStore(Protocol):
         """Delete the oldest ended jobs beyond what shall be kept; return their ids."""
         ...
 
+    def delete(self, job_id: str) -> bool:
+        """Delete an ended job with its records and result. Return False if it hasn't ended, or is not there."""
+        ...
+
     def ids(self) -> set[str]:
         """Return the ids of all jobs."""
         ...

@@ -53,6 +53,8 @@ class Entry:
     """Load it when it is asked for."""
     required: bool = False
     """The service isn't ready without it."""
+    uploaded: bool = False
+    """It came over HTTP, and may be deleted."""
     jobs: int = 0
     """That use it, waiting or running: while there are any it stays."""
     used: float = 0.0
@@ -65,12 +67,13 @@ class Entry:
         failure = Failure.of(self.error) if self.error else None
         loaded = self.loaded
         if loaded is None:
-            return SceneStatus(self.id, self.state, self.jobs, failure)
+            return SceneStatus(self.id, self.state, self.jobs, self.uploaded, failure)
         scene = loaded.scene
         return SceneStatus(
             self.id,
             self.state,
             self.jobs,
+            self.uploaded,
             failure,
             info=scene.info,
             gaussians=scene.count,

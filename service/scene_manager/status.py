@@ -37,6 +37,8 @@ class SceneStatus:
     state: SceneState
     jobs: int = 0
     """That use it, waiting or running."""
+    uploaded: bool = False
+    """It came over HTTP, and may be deleted."""
     failure: Failure | None = None
     """Why it could not be loaded."""
     info: SceneInfo | None = None

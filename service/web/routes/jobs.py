@@ -64,10 +64,26 @@ def get_job(job: JobOf, app_state: AppStateOf, root: RootOf) -> JobOut:
     return job_document(app_state, job.id, root)
 
 
-@router.delete("/jobs/{job_id}", tags=["jobs"], responses=errors("job_not_found", "storage_failed", body=True))
+@router.delete(
+    "/jobs/{job_id}",
+    tags=["jobs"],
+    responses=errors("job_not_found", "job_not_ready", "invalid_request", "storage_failed", body=True),
+)
 @route_policy(role="localize", body=SMALL_BODY, rate_limited=True)
-def cancel_job(job: JobOf, app_state: AppStateOf, root: RootOf) -> JobOut:
-    """Cancel a job: at once if it is queued, after its current step if it runs, without effect if it has ended."""
+def cancel_job(
+    job: JobOf,
+    app_state: AppStateOf,
+    root: RootOf,
+    purge: Annotated[bool, Query(description="Delete an ended job with its records, result and photo.")] = False,
+) -> JobOut:
+    """Cancel a job: at once if it is queued, after its current step if it runs, without effect if it has ended.
+
+    With `purge` an ended job is deleted instead, and returned as it was; one that has not ended is refused.
+    """
+    if purge:
+        document = job_document(app_state, job.id, root)
+        app_state.jobs.delete(job)
+        return document
     app_state.jobs.cancel(job)
     return job_document(app_state, job.id, root)
 

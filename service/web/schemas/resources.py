@@ -139,6 +139,7 @@ def _scene(scene: SceneStatus, root: str) -> dict:
         "cameras": scene.cameras,
         "memory_bytes": scene.memory_bytes,
         "jobs": scene.jobs,
+        "uploaded": scene.uploaded,
         "error": scene.failure and problem_of_failure(scene.failure, self),
         "links": SceneLinks(self=self, splats=f"{self}/splats", thumbnail=f"{self}/thumbnail.jpg"),
     }

@@ -31,6 +31,8 @@ class SceneSummary(Model):
     memory_bytes: int | None
     jobs: int
     """Number of queued and running jobs on the scene."""
+    uploaded: bool
+    """Whether it came over the API, and may be deleted."""
     error: Problem | None
     """Why loading failed."""
     links: SceneLinks

@@ -1,6 +1,6 @@
 // Several photos, each a job of its own: sent one after the other, shown as a table that can be exported.
 
-import { ask, ENDED } from "./api.js";
+import { ENDED, service } from "./service.js";
 import { badge, h, say, seconds, words } from "./dom.js";
 import { cameraTable, csvTable, imageTable, transforms } from "./tables.js";
 import { sendPhoto } from "./sending.js";
@@ -100,7 +100,7 @@ function summed() {
 async function refresh() {
   await Promise.all(entries.filter(entry => entry.job && !done(entry)).slice(0, 8).map(async entry => {
     try {
-      const job = await ask(`jobs/${entry.job.id}`);
+      const job = await service.ask(`jobs/${entry.job.id}`);
       entry.job = job;
       entry.name = job.photo.name || entry.name;
     } catch (error) {

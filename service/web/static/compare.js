@@ -1,6 +1,6 @@
 // Two answers side by side: renders against the photo under one slider, and what differs between them.
 
-import { ask } from "./api.js";
+import { service } from "./service.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, degrees, h, length, seconds, words } from "./dom.js";
 import { poseDistance } from "./formats.js";
@@ -9,13 +9,13 @@ import { photoOf } from "./result.js";
 export function show(main, first, second) {
   document.title = "comparison – splatfix";
   main.append(h("h1", {}, "Comparison"));
-  Promise.all([first, second].map(id => ask(`jobs/${id}`)))
+  Promise.all([first, second].map(id => service.ask(`jobs/${id}`)))
     .then(async jobs => main.append(...compared(jobs, await scenes(jobs))))
     .catch(error => main.append(h("p", { class: "trouble", role: "alert" }, error.message)));
 }
 
 function scenes(jobs) {
-  return Promise.all(jobs.map(job => ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null)));
+  return Promise.all(jobs.map(job => service.ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null)));
 }
 
 function compared(jobs, [sceneA, sceneB]) {

@@ -1,24 +1,20 @@
 // A photo for who has none at hand: the scene itself, seen from a training camera's place, but turned.
 
-import { ask, send } from "./api.js";
+import { service } from "./service.js";
 
 const LONG_SIDE = 800;
 const TURN = 0.25;  // rad, at most
 
 /** Render a view of a scene that has training cameras. Returns its file, and as fields its intrinsics and its true
- * pose, so that the answer's errors are shown. Raises Problem. */
+ * pose, so that the answer's errors are shown. Raises ServiceError. */
 export async function viewOf(id) {
   const path = `scenes/${encodeURIComponent(id)}`;
-  const { training_cameras: cameras } = await ask(path);
+  const { training_cameras: cameras } = await service.ask(path);
   const camera = cameras[Math.floor(Math.random() * cameras.length)];
   const intrinsics = pinhole(camera.intrinsics);
   const pose = { world_from_camera: turned(camera.world_from_camera, TURN * (2 * Math.random() - 1)) };
-  const picture = await send(`${path}/render`, {
-    method: "POST",
-    headers: { "Content-Type": "application/json" },
-    body: JSON.stringify({ pose, intrinsics, format: "jpeg" }),
-  });
-  const file = new File([await picture.blob()], `view-of-${id}.jpg`, { type: "image/jpeg" });
+  const picture = await service.render(id, pose, intrinsics);
+  const file = new File([picture], `view-of-${id}.jpg`, { type: "image/jpeg" });
   return { file, fields: { intrinsics: JSON.stringify(intrinsics), truth: JSON.stringify(pose) } };
 }
 

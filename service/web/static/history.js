@@ -1,7 +1,8 @@
 // All jobs, newest first, with filters; two of them can be compared.
 
-import { ask } from "./api.js";
-import { badge, h, seconds, when } from "./dom.js";
+import { ENDED, service } from "./service.js";
+import { badge, h, say, seconds, when } from "./dom.js";
+import { repeat } from "./repeat.js";
 
 const PAGE = 30;
 const FILTERS = {
@@ -24,8 +25,8 @@ export function show(main) {
 
   const load = async path => {
     try {
-      const page = await ask(path);
-      rows.append(...page.jobs.map(job => row(job, marked, compare)));
+      const page = await service.ask(path);
+      rows.append(...page.jobs.map(job => row(job, marked, compare, note)));
       next = page.next;
       more.hidden = !next;
       note.textContent = rows.children.length ? "" : "No jobs match.";
@@ -44,20 +45,20 @@ export function show(main) {
   for (const filter of [outcome, scene, estimator]) filter.addEventListener("change", reload);
   more.addEventListener("click", () => load(next));
   compare.addEventListener("click", () => { location.hash = `#/compare/${[...marked].join("/")}`; });
-  ask("scenes").then(({ scenes }) => scene.append(...scenes.map(s => h("option", { value: s.id }, s.name))), () => {});
-  ask("capabilities").then(({ estimators }) => estimator.append(
+  service.ask("scenes").then(({ scenes }) => scene.append(...scenes.map(s => h("option", { value: s.id }, s.name))), () => {});
+  service.ask("capabilities").then(({ estimators }) => estimator.append(
     ...estimators.filter(e => e.available).map(e => h("option", { value: e.name }, e.name))), () => {});
 
   main.append(h("h1", {}, "History"),
     h("div", { class: "filters" }, outcome, scene, estimator, compare),
     h("div", { class: "scroll", tabIndex: 0, role: "region", "aria-label": "Jobs" }, h("table", { class: "jobs" },
-      h("thead", {}, h("tr", {}, ["", "Photo", "Outcome", "Score", "Scene", "Estimator", "Duration", "Created", "3D"]
+      h("thead", {}, h("tr", {}, ["", "Photo", "Outcome", "Score", "Scene", "Estimator", "Duration", "Created", "3D", "Actions"]
         .map((name, i) => h("th", { scope: "col" }, i ? name : h("span", { class: "sr" }, "Mark"))))), rows)),
     note, more);
   reload();
 }
 
-function row(job, marked, compare) {
+function row(job, marked, compare, note) {
   const name = job.photo.name || "photo";
   const mark = h("input", { type: "checkbox", disabled: !job.status, "aria-label": `Mark ${name} of ${when(job.created)}` });
   mark.addEventListener("change", () => {
@@ -74,7 +75,32 @@ function row(job, marked, compare) {
     h("td", { class: "number" }, job.score === null ? "–" : job.score.toFixed(2)),
     h("td", {}, job.scene), h("td", {}, job.estimator),
     h("td", { class: "number" }, seconds(took)), h("td", {}, when(job.created)),
-    h("td", {}, h("a", { href: job.links.viewer, "aria-label": `${name} in the viewer` }, "viewer")));
+    h("td", {}, h("a", { href: job.links.viewer, "aria-label": `${name} in the viewer` }, "viewer")),
+    h("td", {}, h("span", { class: "actions" }, actions(job, name, marked, compare, note))));
+}
+
+function actions(job, name, marked, compare, note) {
+  if (!ENDED.includes(job.state)) return [];
+  const button = (label, act) => {
+    const element = h("button", { type: "button", class: "plain", "aria-label": `${label} ${name} of ${when(job.created)}` }, label);
+    element.addEventListener("click", async () => {
+      element.disabled = true;
+      await act(element).catch(error => { note.textContent = error.message; say(error.message); });
+      element.disabled = false;
+    });
+    return element;
+  };
+  return [
+    button("Run again", () => repeat(job.id)),
+    button("Delete", async element => {
+      if (!confirm(`Delete the job of ${name}, with its result and photo?`)) return;
+      await service.ask(`jobs/${job.id}?purge=true`, { method: "DELETE" });
+      marked.delete(job.id);
+      compare.disabled = marked.size !== 2;
+      element.closest("tr").remove();
+      say(`${name} was deleted`);
+    }),
+  ];
 }
 
 function select(label, pairs) {

@@ -1,6 +1,6 @@
 // One job: its progress while it runs, then its answer.
 
-import { ask, ENDED, follow } from "./api.js";
+import { ENDED, service } from "./service.js";
 import { h, say, seconds, sentence, words } from "./dom.js";
 import { result } from "./result.js";
 import { recalled } from "./sent.js";
@@ -21,13 +21,13 @@ function refused({ main }, error) {
 }
 
 async function open(view, id) {
-  const job = await ask(`jobs/${id}`);
+  const job = await service.ask(`jobs/${id}`);
   if (ENDED.includes(job.state)) finish(view, job);
   else progress(view, job);
 }
 
 async function finish(view, job) {
-  const scene = await ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null);
+  const scene = await service.ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null);
   const status = job.result?.status ?? job.state;
   document.title = `${words(status)} – splatfix`;
   const preview = view.main.querySelector("img.preview")?.src;
@@ -44,7 +44,7 @@ function progress(view, job) {
   const cancel = h("button", { type: "button" }, "Cancel");
   cancel.addEventListener("click", async () => {
     cancel.disabled = true;
-    await ask(job.links.self, { method: "DELETE" }).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
+    await service.ask(job.links.self, { method: "DELETE" }).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
   });
   view.main.replaceChildren(h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
     h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages,
@@ -58,7 +58,9 @@ function progress(view, job) {
   };
   const timers = [setInterval(draw, 100), setInterval(() => state.latest || refresh(state), 1000)];
   refresh(state);
-  const leave = follow(job, {
+  const stop = new AbortController();
+  const ended = service.follow(job.id, {
+    signal: stop.signal,
     onRecord: record => {
       if (record.stage !== state.latest?.stage) stages.append(h("li", {}, words(record.stage)));
       [state.latest, state.latestAt] = [record, performance.now()];
@@ -69,26 +71,26 @@ function progress(view, job) {
       state.latest = null;
       draw();
     },
-    onEnd: ended => { stop(); finish(view, ended); },
     onLost: () => {
       trouble.hidden = false;
       trouble.textContent = "The connection to the service is lost. Reconnecting…";
     },
-    onBack: () => {
+    onResumed: () => {
       trouble.hidden = true;
       say("Connected again");
     },
-    onRefused: error => { stop(); refused(view, error); },
   });
-  const stop = () => { timers.forEach(clearInterval); leave(); };
-  view.onLeave(stop);
+  ended.finally(() => timers.forEach(clearInterval))
+    .then(done => finish(view, done))
+    .catch(error => { if (error.name !== "AbortError") refused(view, error); });
+  view.onLeave(() => stop.abort());
   draw();
 }
 
 /** While there is no record, ask in which state the job and its scene are. */
 async function refresh(state) {
   const [job, scene] = await Promise.all([
-    ask(state.job.links.self).catch(() => null), ask(`scenes/${encodeURIComponent(state.job.scene)}`).catch(() => null)]);
+    service.ask(state.job.links.self).catch(() => null), service.ask(`scenes/${encodeURIComponent(state.job.scene)}`).catch(() => null)]);
   if (job) state.job = job;
   state.scene = scene;
 }
@@ -111,7 +113,7 @@ function described(state) {
 
 /** The median time of the last jobs of this kind, in seconds; null if there are none. */
 async function usualTime(job) {
-  const { jobs } = await ask(`jobs?scene=${encodeURIComponent(job.scene)}&state=succeeded&limit=50`).catch(() => ({ jobs: [] }));
+  const { jobs } = await service.ask(`jobs?scene=${encodeURIComponent(job.scene)}&state=succeeded&limit=50`).catch(() => ({ jobs: [] }));
   const times = jobs
     .filter(other => other.estimator === job.estimator && other.finished && other.started)
     .map(other => (Date.parse(other.finished) - Date.parse(other.started)) / 1000)

@@ -1,6 +1,6 @@
 // The API key: sent once, for a session's cookie. It never stands in an address.
 
-import { Problem, send } from "./api.js";
+import { service, ServiceError } from "./service.js";
 import { h } from "./dom.js";
 
 const AFTER = /^viewer\/[\w/-]*$/;
@@ -28,8 +28,8 @@ export function show(main, query) {
 }
 
 async function enter(key, then, back) {
-  if (!/^[\x21-\x7e]+$/.test(key)) throw new Problem({ detail: "The key is not valid." }, 401);
-  const answer = await send("tokens", { method: "POST", headers: { Authorization: `Bearer ${key}` } });
+  if (!/^[\x21-\x7e]+$/.test(key)) throw new ServiceError({ detail: "The key is not valid." }, 401);
+  const answer = await service.send("tokens", { method: "POST", headers: { Authorization: `Bearer ${key}` } });
   // A token of some minutes: the page that it opens leaves the cookie, and takes it out of the address.
   const { token } = await answer.json();
   location.href = `./${AFTER.test(then) ? then : ""}?token=${encodeURIComponent(token)}${back.startsWith("#/") ? back : ""}`;

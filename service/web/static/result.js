@@ -1,11 +1,12 @@
 // The answer of an ended job: photo and render blended, the pose in every convention, why, and what to export.
 
-import { ask, asksForKey } from "./api.js";
+import { asksForKey, service } from "./service.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
 import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
-import { submit, told } from "./start.js";
+import { repeat } from "./repeat.js";
 import { recalled } from "./sent.js";
+import { told } from "./start.js";
 
 /** Return the elements that show an ended job; `scene` is its document, null if it is gone. */
 export function result(job, scene) {
@@ -127,13 +128,13 @@ function exports({ result }) {
 
 function again(job) {
   const place = h("p", { class: "buttons" });
-  const file = recalled(job.id)?.file;
-  if (file) {
-    const button = h("button", { type: "button" }, "Localize this photo again");
-    button.addEventListener("click", () => submit([file]).catch(told));
+  if (!job.result?.frames) {
+    const button = h("button", { type: "button" }, "Run again");
+    button.addEventListener("click", () => repeat(job.id).catch(told));
     place.append(button);
   }
   place.append(h("a", { class: "button", href: "#/" }, "Another photo"));
+  if (job.result) place.append(h("a", { class: "button", href: asPrior(job) }, "Another photo with this pose as prior"));
   others(job).then(jobs => {
     if (!jobs.length) return;
     const list = h("select", { "aria-label": "Another job on the same photo" },
@@ -145,8 +146,13 @@ function again(job) {
   return place;
 }
 
+function asPrior({ result, scene, photo }) {
+  const prior = JSON.stringify({ world_from_camera: result.pose.world_from_camera.matrix });
+  return `#/?${new URLSearchParams({ prior, scene, of: photo.name || "a photo" })}`;
+}
+
 /** Other jobs that have found a pose for the same photo. */
 async function others(job) {
-  const { jobs } = await ask(`jobs?photo=${job.photo.sha256}&limit=50`).catch(() => ({ jobs: [] }));
+  const { jobs } = await service.ask(`jobs?photo=${job.photo.sha256}&limit=50`).catch(() => ({ jobs: [] }));
   return jobs.filter(other => other.id !== job.id && other.status);
 }

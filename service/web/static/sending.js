@@ -1,6 +1,6 @@
 // From a photo's file to its job: the upload with its progress, and waiting until the scene is loaded.
 
-import { ask, upload } from "./api.js";
+import { service } from "./service.js";
 import { h, seconds, words } from "./dom.js";
 import { remember } from "./sent.js";
 
@@ -8,7 +8,7 @@ const POLL_MS = 1000;
 
 /**
  * Send a photo with its fields, and return the job. While the scene is being loaded, or there is no free place, it
- * waits and sends again; `told` gets a text, and the sent share where that is known. Raises Problem, AbortError.
+ * waits and sends again; `told` gets a text, and the sent share where that is known. Raises ServiceError, AbortError.
  */
 export async function sendPhoto(file, fields, told, signal) {
   const form = new FormData();
@@ -18,7 +18,7 @@ export async function sendPhoto(file, fields, told, signal) {
     await untilLoaded(fields.scene, told, signal);
     try {
       const progress = share => told(share < 1 ? `Uploading, ${Math.round(100 * share)} %` : "Reading the photo…", share);
-      const job = await upload("localize", form, progress, signal);
+      const job = await service.upload("POST", "localize", form, progress, signal);
       remember(job.id, file, fields);
       return job;
     } catch (error) {
@@ -30,7 +30,7 @@ export async function sendPhoto(file, fields, told, signal) {
 async function untilLoaded(scene, told, signal) {
   if (!scene || scene === "auto") return;
   for (;;) {
-    const { state, gaussians } = await ask(`scenes/${encodeURIComponent(scene)}`);
+    const { state, gaussians } = await service.ask(`scenes/${encodeURIComponent(scene)}`);
     if (gaussians !== null || !["loading", "preparing"].includes(state)) return;
     told(`Waiting: the scene is ${words(state)}…`);
     await pause(POLL_MS, signal);
@@ -39,8 +39,8 @@ async function untilLoaded(scene, told, signal) {
 
 /** Wait for what may pass by itself, and load a scene that isn't in memory; raise any other error. */
 async function mayPass(error, scene, told, signal) {
-  const { code } = error.body ?? {};
-  if (code === "scene_unloaded") await ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
+  const { code } = error;
+  if (code === "scene_unloaded") await service.ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
   else if (!["scene_not_ready", "queue_full", "rate_limited"].includes(code)) throw error;
   const what = code === "queue_full" || code === "rate_limited" ? "the service is busy" : "the scene is loading";
   told(`Waiting: ${what}…`);

@@ -1,38 +1,59 @@
 // The first view: scenes, the photo, and what may be sent beside it.
 
-import { ask } from "./api.js";
+import { service } from "./service.js";
 import * as batch from "./batch.js";
-import { bytes, count, h, say, sentence } from "./dom.js";
+import { h, say } from "./dom.js";
 import { viewOf } from "./example.js";
 import { OptionsForm } from "./options.js";
+import { isScene, SceneList } from "./scenes.js";
 import { sendingBox, sendPhoto } from "./sending.js";
 
-const ANY = "auto";
 const SCENE_KEY = "splatfix-scene";
 // Kept while other views are shown, so that the next photo goes the same way; the scene also over a reload.
-const chosen = { scene: stored(), form: null };
-let alertLine = null;
+const chosen = { scene: stored(), form: null, prior: null };
+let alertLine = null, list = null;
 
-export function show(main) {
+/** `query` may have a `prior` in JSON for the next photo, its `scene`, and `of`, what it is the pose of. */
+export function show(main, query) {
   document.title = "splatfix";
+  takePrior(new URLSearchParams(query));
   alertLine = h("p", { class: "trouble", role: "alert", hidden: true });
-  const scenes = h("fieldset", { class: "scenes" }, h("legend", {}, "Scene"), h("p", { class: "quiet" }, "Loading…"));
   const example = exampleButton();
+  const choose = (id, scenes, byUser) => {
+    byUser ? remember(id) : chosen.scene = id;
+    example.hidden = !scenes.some(scene => scene.id === id && scene.state === "ready" && scene.cameras);
+  };
+  list = new SceneList({ chosen: () => chosen.scene, onChoose: choose, onError: told });
   main.append(
     h("h1", {}, "Where was this photo taken?"),
     h("p", { class: "lead" }, "splatfix finds the camera's pose of a photo inside a 3D Gaussian Splatting scene."),
-    alertLine, picker(example), scenes, more(),
+    alertLine, priorLine(), picker(example), list.element, more(),
   );
-  const timer = { id: null };
-  listScenes(scenes, timer, example);
-  return () => { clearTimeout(timer.id); alertLine = null; };
+  return () => { list.stop(); list = alertLine = null; };
+}
+
+function takePrior(query) {
+  if (!query.has("prior")) return;
+  chosen.prior = { value: query.get("prior"), of: query.get("of") ?? "a view" };
+  if (query.get("scene")) remember(query.get("scene"));
+  history.replaceState(null, "", "#/");  // taken once: a reload begins without it
+}
+
+function priorLine() {
+  const line = h("p", { class: "note", hidden: !chosen.prior });
+  const remove = h("button", { type: "button" }, "Remove");
+  remove.addEventListener("click", () => { chosen.prior = null; line.hidden = true; });
+  line.append(h("span", {}, `Photos are sent with a prior: the pose of ${chosen.prior?.of}.`), " ", remove);
+  return line;
 }
 
 /** Send photos with what is chosen, and show their job or table; `known` are fields that go before those. */
 export async function submit(files, known = {}) {
   if (!files.length) return;
   if (alertLine) alertLine.hidden = true;
-  const fields = { ...(chosen.form ? chosen.form.fields() : {}), ...known };
+  const scenes = files.filter(isScene);
+  if (scenes.length) return addScenes(scenes);
+  const fields = { ...(chosen.prior && { prior: chosen.prior.value }), ...(chosen.form ? chosen.form.fields() : {}), ...known };
   const scene = chosen.scene ?? await onlyScene();
   if (scene) fields.scene = scene;
   if (files.length > 1) return batch.start([...files], fields);
@@ -48,6 +69,15 @@ export async function submit(files, known = {}) {
   } finally {
     box.element.remove();
   }
+}
+
+/** Upload scenes one after the other; they are shown on the first view. */
+async function addScenes(files) {
+  if (!list) {
+    location.hash = "#/";
+    await new Promise(resolve => addEventListener("hashchange", resolve, { once: true }));  // after which it is shown
+  }
+  for (const file of files) await list?.upload(file);
 }
 
 /** Show an error: at its place in this view, above any other. */
@@ -68,7 +98,7 @@ function stored() {
   }
 }
 
-function choose(id) {
+function remember(id) {
   chosen.scene = id;
   try {
     localStorage.setItem(SCENE_KEY, id);
@@ -76,7 +106,7 @@ function choose(id) {
 }
 
 async function onlyScene() {
-  const { scenes } = await ask("scenes");
+  const scenes = await service.scenes();
   return scenes.find(scene => scene.state === "ready")?.id ?? null;
 }
 
@@ -123,59 +153,11 @@ function more() {
   details.addEventListener("toggle", async () => {
     if (!details.open || chosen.form) return;
     try {
-      chosen.form = new OptionsForm(await ask("capabilities"));
+      chosen.form = new OptionsForm(await service.ask("capabilities"));
       details.append(chosen.form.element);
     } catch (error) {
       told(error);
     }
   });
   return details;
-}
-
-async function listScenes(place, timer, example) {
-  let scenes;
-  try {
-    ({ scenes } = await ask("scenes"));
-  } catch (error) {
-    if (error.status === 401) return;
-    place.replaceChildren(h("legend", {}, "Scene"), h("p", { class: "trouble", role: "alert" }, `${error.message} Trying again…`));
-    timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
-    return;
-  }
-  const several = scenes.length > 1;
-  if (!scenes.some(scene => scene.id === chosen.scene) && !(several && chosen.scene === ANY)) chosen.scene = null;
-  chosen.scene ??= (scenes.find(scene => scene.state === "ready") ?? scenes[0])?.id ?? null;
-  const offer = () => {
-    example.hidden = !scenes.some(scene => scene.id === chosen.scene && scene.state === "ready" && scene.cameras);
-  };
-  const changed = id => { choose(id); offer(); };
-  offer();
-  const cards = scenes.map(scene => card(scene, changed));
-  place.replaceChildren(h("legend", {}, "Scene"),
-    scenes.length ? h("div", { class: "cards" }, several ? anyCard(changed) : null, cards) : h("p", {}, "No scenes yet."));
-  if (scenes.some(scene => ["loading", "preparing", "unloading"].includes(scene.state))) {
-    timer.id = setTimeout(() => listScenes(place, timer, example), 1000);
-  }
-}
-
-function anyCard(changed) {
-  const radio = h("input", { type: "radio", name: "scene", value: ANY, checked: chosen.scene === ANY });
-  radio.addEventListener("change", () => changed(ANY));
-  return h("label", { class: "card any" }, radio, h("span", { class: "name" }, "Any scene"),
-    h("span", { class: "quiet" }, "Search all loaded scenes; single photos only."));
-}
-
-function card(scene, changed) {
-  const radio = h("input", { type: "radio", name: "scene", value: scene.id, checked: scene.id === chosen.scene });
-  radio.addEventListener("change", () => changed(scene.id));
-  const ready = scene.gaussians !== null;
-  const picture = ready
-    ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
-    : h("span", { class: "nopicture" });
-  const size = ready
-    ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)}`
-    : scene.error?.detail ?? "";
-  return h("label", { class: "card" }, radio, picture,
-    h("span", { class: "name" }, scene.name),
-    h("span", { class: "quiet" }, scene.state === "ready" ? size : `${sentence(scene.state)}${size ? `: ${size}` : "…"}`));
 }
