@@ -282,6 +282,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("cancel_job", "invalid_request"): lambda s: s.client.delete(f"/jobs/{s.done}?purge=perhaps"),
     ("cancel_job", "job_not_ready"): lambda s: s.client.delete(f"/jobs/{s.running}?purge=true"),
     ("cancel_job", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete(f"/jobs/{s.running}")),
+    ("job_photo", "invalid_request"): lambda s: s.client.get(f"/jobs/{s.done}/photo?undistorted=perhaps"),
     ("job_photo", "photo_gone"): lambda s: s.client.get(f"/jobs/{s.done}/photo"),
     ("job_photo", "job_not_ready"): lambda s: s.client.get(f"/jobs/{recovered(s)}/photo"),
     ("job_render", "invalid_request"): lambda s: s.client.get(f"/jobs/{s.done}/iterations/x/render.jpg"),

@@ -324,6 +324,62 @@ def test_the_api_page_needs_no_other_server(page: Page, url: str) -> None:
     assert [address for address in asked if not address.startswith((f"{url}/", "data:", "blob:"))] == []
 
 
+def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_path: Path) -> None:
+    file = tmp_path / "my attic.ply"
+    file.write_bytes(next(write_room(tmp_path / "room").glob("*.ply")).read_bytes())
+    page.set_input_files("#scenefile", file)
+    expect(page.get_by_role("radio", name="my_attic")).to_be_checked()
+    card = page.locator(".card").filter(has=page.get_by_role("radio", name="my_attic"))
+    card.get_by_role("button", name="Unload").click()
+    expect(card).to_contain_text("Unloaded")
+    card.get_by_role("button", name="Load", exact=False).click()
+    expect(card).to_contain_text("Gaussians")
+    _audit(page)
+    # The operator's own scenes can't be deleted.
+    expect(page.get_by_role("button", name="Delete")).to_have_count(1)
+    page.once("dialog", lambda dialog: dialog.accept())
+    card.get_by_role("button", name="Delete").click()
+    expect(card).to_have_count(0)
+    assert httpx.get(f"{url}/scenes/my_attic", trust_env=False).status_code == 404
+
+
+def test_a_dropped_file_that_is_no_scene_is_refused(page: Page, url: str) -> None:
+    page.get_by_role("radio").first.wait_for()
+    drop(page, b"not a scene", "junk.ply")
+    expect(page.get_by_role("alert")).to_contain_text("ply")
+    assert httpx.get(f"{url}/scenes/junk", trust_env=False).status_code == 404
+
+
+def test_a_job_is_run_again_and_deleted_from_the_history(page: Page, url: str) -> None:
+    job = posted(url, PHOTO.read_bytes(), {"scene": "studio", "seed": 11})
+    page.goto(f"{url}/#/jobs")
+    row = page.locator("tbody tr").filter(has=page.locator(f"a[href='#/jobs/{job['id']}']"))
+    row.get_by_role("button", name="Run again").click()
+    page.locator(".badge.localized").wait_for()
+    again = job_of(page, url)
+    assert (again["id"] != job["id"], again["seed"]) == (True, 11)
+    np.testing.assert_allclose(again["result"]["pose"]["position"], job["result"]["pose"]["position"], atol=0.05)
+    page.goto(f"{url}/#/jobs")
+    page.once("dialog", lambda dialog: dialog.accept())
+    row.get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    assert httpx.get(f"{url}/jobs/{job['id']}", trust_env=False).status_code == 404
+
+
+def test_a_pose_becomes_the_prior_of_the_next_photo(page: Page, url: str) -> None:
+    job = posted(url, PHOTO.read_bytes(), {"scene": "studio"})
+    page.goto(f"{url}/#/jobs/{job['id']}")
+    page.get_by_role("link", name="Another photo with this pose as prior").click()
+    expect(page.locator(".note")).to_contain_text("a prior")
+    page.set_input_files("#photo", PHOTO)
+    page.locator(".verdict .badge").wait_for()
+    prior = job_of(page, url)["prior"]["world_from_camera"]["matrix"]
+    np.testing.assert_allclose(prior, job["result"]["pose"]["world_from_camera"]["matrix"], atol=1e-9)
+    page.get_by_role("link", name="Localize").click()
+    page.get_by_role("button", name="Remove").click()
+    expect(page.locator(".note")).to_be_hidden()
+
+
 def test_a_job_that_is_not_there_is_told(page: Page, url: str) -> None:
     page.goto(f"{url}/#/jobs/nothing")
     expect(page.get_by_role("alert")).to_contain_text("job 'nothing' not found")

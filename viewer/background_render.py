@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -19,7 +20,7 @@ from jaxtyping import UInt8
 
 from service.client import Client, ServiceError
 from service.types import Camera, Intrinsics, Pose
-from viewer.comparison_images import decode
+from viewer.comparison_images import decode, with_photo
 from viewer.service_values import api_camera
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,21 @@ _LONG_SIDE_PX, _MOVING_LONG_SIDE_PX = 1280, 480
 
 
 ShowImage = Callable[[UInt8[np.ndarray, "h w 3"] | None], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """A photo that is shown over renders from its own position."""
+
+    photo: UInt8[np.ndarray, "h w 3"]
+    camera: Camera
+    """Of the photo, which is undistorted; a pinhole."""
+
+    def fits(self, view: Camera) -> bool:
+        """Return whether a view is from the photo's position, and shows what the photo may show."""
+        ours, theirs = self.camera.pose, view.pose
+        same_place = np.allclose(ours.position_in_world, theirs.position_in_world, rtol=1e-4, atol=1e-4)
+        return bool(same_place) and float(ours.axis_in_world @ theirs.axis_in_world) > 0.5
 
 
 class BackgroundRender:
@@ -46,6 +62,10 @@ class BackgroundRender:
         self._view: Camera | None = None
         """The browser's camera at the last render."""
         self._showing = False
+        self._overlay: Overlay | None = None
+        self._opacity = 0.5
+        self._rendered: tuple[UInt8[np.ndarray, "h w 3"], Camera] | None = None
+        """The last render, without the photo, and its camera."""
         self._closed = False
         self._changed = threading.Condition()
 
@@ -70,6 +90,24 @@ class BackgroundRender:
         with self._changed:
             self._scene_id = scene_id
         self.moved()
+
+    @property
+    def view(self) -> Camera:
+        """The browser's camera."""
+        return self._camera()
+
+    def set_overlay(self, overlay: Overlay | None) -> None:
+        """Show a photo over the renders from its position; None: no photo."""
+        with self._changed:
+            self._overlay = overlay
+        self.moved()
+
+    def set_opacity(self, opacity: float) -> None:
+        """Choose the opacity of the photo, 0..1."""
+        with self._changed:
+            self._opacity = opacity
+            if self._showing and self._rendered is not None:
+                self._show(self._with_overlay(*self._rendered))
 
     def set_enabled(self, enabled: bool) -> None:
         """Render at all, or leave the view to the browser's splats."""
@@ -113,13 +151,15 @@ class BackgroundRender:
 
     def _render(self, move: int, long_side_px: int) -> None:
         with self._changed:
-            scene_id, without_splats = self._scene_id if self._enabled else None, self._without_splats
+            enabled = self._enabled or self._overlay is not None
+            scene_id, without_splats = self._scene_id if enabled else None, self._without_splats
         if scene_id is None:
             return
         # At full size whatever the size of this render: only then it compares equal to the browser's next report.
         self._view = self._camera()
+        camera = self._camera(long_side_px)
         try:
-            image = decode(self._service.render(scene_id, *api_camera(self._camera(long_side_px))))
+            image = decode(self._service.render(scene_id, *api_camera(camera)))
         except (ServiceError, ValueError) as error:
             log.warning("no full-quality render: %s", error)
             return
@@ -128,8 +168,14 @@ class BackgroundRender:
                 return
             # Without splats, a render of a moment ago is better than an empty view.
             if self._moves == move or (without_splats and self._without_splats):
-                self._showing = True
-                self._show(image)
+                self._showing, self._rendered = True, (image, camera)
+                self._show(self._with_overlay(image, camera))
+
+    def _with_overlay(self, image: UInt8[np.ndarray, "h w 3"], view: Camera) -> UInt8[np.ndarray, "h w 3"]:
+        overlay = self._overlay
+        if overlay is None or not overlay.fits(view):
+            return image
+        return with_photo(image, view, overlay.photo, overlay.camera, self._opacity)
 
     def _camera(self, long_side_px: int = _LONG_SIDE_PX) -> Camera:
         """Return the browser's camera with an image of at most this size."""

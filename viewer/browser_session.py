@@ -9,6 +9,7 @@ from __future__ import annotations
 import gc
 import logging
 import threading
+from collections.abc import Sequence
 from functools import partial
 from typing import cast
 
@@ -107,6 +108,9 @@ class BrowserSession:
         on_user_change(controls.newest, lambda follow: post(partial(self._selection.choose_newest, follow), "newest"))
         on_user_change(controls.scenes, lambda name: post(partial(self._selection.choose_scene, name), "scene"))
         on_user_change(controls.step, lambda index: post(partial(self._job.go_to, index), "step"))
+        on_user_change(
+            controls.photo_opacity, lambda opacity: post(partial(self._background.set_opacity, opacity), "opacity")
+        )
         for widget in (controls.match_lines, controls.weight, controls.colour_by):
             on_user_change(widget, lambda _: post(self._job.redraw))
         on_user_change(
@@ -123,13 +127,16 @@ class BrowserSession:
         controls.look_through.on_click(lambda _: post(self._job.look_through))
         controls.fly.on_click(lambda _: post(self._job.fly_to_result))
         controls.replay.on_click(lambda _: post(self._save_replay))
-        self._client.scene.on_click()(
-            lambda event: post(partial(self._job.click, event.ray_origin, event.ray_direction))
-        )
+        controls.use_view.on_click(lambda _: post(self._scene_display.offer_prior))
+        self._client.scene.on_click()(lambda event: post(partial(self._click, event.ray_origin, event.ray_direction)))
         command = self._client.gui.add_command
         command("Next step", hotkey="N").on_trigger(lambda _: post(partial(self._job.press, NEXT)))
         command("Previous step", hotkey="P").on_trigger(lambda _: post(partial(self._job.press, PREVIOUS)))
         command("Play or pause", hotkey="space").on_trigger(lambda _: post(partial(self._job.press, PLAY)))
+
+    def _click(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+        react = self._scene_display.measure if self._controls.measure.value else self._job.click
+        react(origin, direction)
 
     def _lists_changed(self) -> None:
         self._queue.post(self._selection.sync)

@@ -10,8 +10,9 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int32, UInt8
+from jaxtyping import Float, Float64, Int32, UInt8
 
+from service.types import Camera, Intrinsics
 from viewer.match_geometry import MatchView
 
 Overlay = Literal["blend", "checker", "difference"]
@@ -46,6 +47,37 @@ def shrink(image: UInt8[np.ndarray, "h w 3"], long_side: int) -> UInt8[np.ndarra
     """Return the image with its longer side at most `long_side` px."""
     factor = min(1.0, long_side / max(image.shape[:2]))
     return _resize(image, round(image.shape[1] * factor), round(image.shape[0] * factor))
+
+
+def undistorted(photo: UInt8[np.ndarray, "h w 3"], camera: Intrinsics, k1: float) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a photo without its radial distortion `k1`, as the pinhole `camera` sees it; black beside the photo."""
+    return cv2.undistort(photo, _matrix(camera), np.array([k1, 0.0, 0.0, 0.0])).astype(np.uint8)
+
+
+def with_photo(
+    image: UInt8[np.ndarray, "h w 3"],
+    view: Camera,
+    photo: UInt8[np.ndarray, "a b 3"],
+    camera: Camera,
+    opacity: float,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return a view's image with a photo over it that was taken from the view's position.
+
+    The photo is warped by the homography between the pinholes `view` and `camera`, of the sizes of image and photo, so
+    that it keeps its own aspect. `opacity`: the photo's, 0..1.
+    """
+    turn = view.pose.world_from_camera[:3, :3].T @ camera.pose.world_from_camera[:3, :3]
+    homography = _matrix(view.intrinsics) @ turn @ np.linalg.inv(_matrix(camera.intrinsics))
+    size = image.shape[1], image.shape[0]
+    inside = cv2.warpPerspective(np.full(photo.shape[:2], 255, np.uint8), homography, size)
+    share = (opacity / 255 * inside)[..., None]
+    warped = cv2.warpPerspective(photo, homography, size)
+    return ((1 - share) * image + share * warped).round().astype(np.uint8)
+
+
+def _matrix(camera: Intrinsics) -> Float64[np.ndarray, "3 3"]:
+    # OpenCV's centre of the top-left pixel is (0, 0).
+    return np.array([[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]], np.float64)
 
 
 def overlay(

@@ -10,7 +10,15 @@ from jaxtyping import UInt8
 from service.results import IterationRecord
 from viewer.charts import vectors_html
 from viewer.colours import ColourBy, match_colours
-from viewer.comparison_images import Mode, Overlay, flicker_html, match_vectors_image, overlay, side_by_side
+from viewer.comparison_images import (
+    Mode,
+    Overlay,
+    flicker_html,
+    match_vectors_image,
+    overlay,
+    side_by_side,
+    undistorted,
+)
 from viewer.controls import Controls
 from viewer.job_stream import JobStream
 from viewer.match_geometry import MatchView
@@ -111,9 +119,13 @@ class ComparisonPanel:
 
 
 def photo_of(stream: JobStream, record: IterationRecord) -> UInt8[np.ndarray, "h w 3"] | None:
-    """Return the photo that a record belongs to; None if the service doesn't keep it.
+    """Return the photo that a record belongs to, without the distortion that the record estimates.
 
-    Raises ServiceError, ValueError.
+    None if the service doesn't keep it. Raises ServiceError, ValueError.
     """
-    step = stream.job.photo_step if stream.job else None
-    return stream.photo() if step in (None, record.index) else None
+    if stream.job is None or stream.job.photo_step not in (None, record.index):
+        return None
+    photo, correction = stream.photo(), record.correction
+    if photo is None or not correction.k1:
+        return photo
+    return undistorted(photo, stream.job.photo.corrected(correction), correction.k1)

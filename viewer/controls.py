@@ -49,9 +49,16 @@ class Controls:
         self.numbers = gui.add_html("")
         self.look_through = gui.add_button("look through this camera", disabled=True)
         self.fly = gui.add_button("fly to result", disabled=True)
+        self.photo_opacity = gui.add_slider(
+            "photo opacity", 0.0, 1.0, 0.05, 0.5, visible=False, hint="Of the photo over the view through its camera."
+        )
+        self.measure = gui.add_checkbox("measure distances", False, hint="Click two points of the scene.")
+        self.use_view = gui.add_button("use this view as prior", hint="For the next photo: a pose to start from.")
+        self.prior = gui.add_html("")
         self.replay = gui.add_button(_REPLAY_LABEL, disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
-            self.layers = {layer: gui.add_checkbox(layer, layer != "splats" or splats) for layer in get_args(LayerName)}
+            shown = {"splats": splats, "axes and scale": False}
+            self.layers = {layer: gui.add_checkbox(layer, shown.get(layer, True)) for layer in get_args(LayerName)}
             self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
                 "full-quality render when still",

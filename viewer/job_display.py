@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable, Sequence
 
 from service.types import Camera
+from viewer.background_render import Overlay
 from viewer.comparison_images import Mode
+from viewer.comparison_panel import photo_of
 from viewer.controls import NEXT, PLAY, Controls
 from viewer.job_stream import JobStream, JobStreams
 from viewer.panel_html import headline_html, legend_html
@@ -53,6 +55,7 @@ class JobDisplay:
         self.close()
         self.stream = None
         self._playback = Playback()
+        self._scene_display.show_photo(None)
         self.step.clear()
 
     def close(self) -> None:
@@ -129,7 +132,11 @@ class JobDisplay:
         """Take the view of the camera of the record that is shown."""
         stream, index = self.stream, self._playback.index
         if stream is not None and stream.job is not None and index < len(stream.records):
-            self._look_through(stream.job.camera(stream.records[index]))
+            record = stream.records[index]
+            camera = stream.job.camera(record)
+            self._look_through(camera)
+            photo = photo_of(stream, record)
+            self._scene_display.show_photo(None if photo is None else Overlay(photo, camera))
 
     def fly_to_result(self) -> None:
         """Move the view to the newest pose."""
@@ -147,6 +154,7 @@ class JobDisplay:
 
     def _look_through(self, camera: Camera) -> None:
         self._opened = 0.0
+        self._scene_display.show_photo(None)
         self._scene.look_through(camera)
 
     def _show(self) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping
 from datetime import datetime
 from html import escape
+from urllib.parse import urlencode
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -58,6 +61,12 @@ def headline_html(job: Job | None, records: int, error: str) -> str:
         outcome.hint,
         link,
     )
+
+
+def prior_link_html(scene: str, prior: Mapping[str, object]) -> str:
+    """Return a link to the start page that has a prior for the next photo."""
+    query = urlencode({"prior": json.dumps(prior), "scene": scene, "of": "a view in the viewer"})
+    return _padded(f"<a href='/' data-splatfix='./#/?{escape(query)}'>Choose the photo for this prior</a>")
 
 
 def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_unit: float | None = None) -> str:

@@ -9,12 +9,15 @@ import numpy as np
 from service.types import Camera, Pose
 from viewer.browser_camera import BrowserCamera
 from viewer.camera_views import initial_view, view_from_behind, view_through
+from viewer.layers.axes_layer import AxesLayer
 from viewer.layers.candidate_layer import CandidateLayer
 from viewer.layers.layer import Canvas, Layer, LayerName
 from viewer.layers.match_layer import MatchLayer
+from viewer.layers.measure_layer import MeasureLayer
 from viewer.layers.splat_layer import SplatLayer
 from viewer.layers.training_camera_layer import TrainingCameraLayer
 from viewer.layers.trajectory_layer import TrajectoryLayer
+from viewer.picking import first_surface
 from viewer.scene_cache import SceneContent
 
 
@@ -28,7 +31,10 @@ class Scene3D:
         self.trajectory = TrajectoryLayer(canvas)
         self.candidates = CandidateLayer(canvas)
         self.matches = MatchLayer(canvas)
+        self.axes = AxesLayer(canvas, visible=False)
+        self.measured = MeasureLayer(canvas)
         layers = self.splats, self.training_cameras, self.trajectory, self.candidates, self.matches
+        layers += self.axes, self.measured
         self._layers: dict[LayerName, Layer] = {layer.name: layer for layer in layers}
         self._canvas = canvas
         self._camera = BrowserCamera(canvas)
@@ -58,6 +64,8 @@ class Scene3D:
         self.splats.show_background(None)
         self._canvas.flush()
         self.training_cameras.show(cameras)
+        self.axes.show(self.metres_per_unit)
+        self.measured.clear()
 
     def clear_job(self) -> None:
         """Remove everything that belongs to a job."""
@@ -74,6 +82,14 @@ class Scene3D:
         # A step first: its frusta often stand among training cameras.
         step = self.trajectory.hit(*ray)
         return self.training_cameras.hit(*ray) if step is None else step
+
+    def measure(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+        """Take what a click's ray hits as a point of the measured distance."""
+        if self._content is not None:
+            ray = np.array(origin, np.float64), np.array(direction, np.float64)
+            point = first_surface(*ray, self._content.splats)
+            if point is not None:
+                self.measured.add(point, self.metres_per_unit)
 
     def look_through(self, camera: Camera) -> None:
         """Take the view of a camera."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from service.types import Pose
-from viewer.background_render import BackgroundRender
+from viewer.background_render import BackgroundRender, Overlay
 from viewer.controls import Controls
 from viewer.layers.layer import LayerName
-from viewer.panel_html import scene_html
+from viewer.panel_html import prior_link_html, scene_html
 from viewer.scene_3d import Scene3D
 from viewer.scene_cache import SceneCache
 
@@ -38,6 +40,21 @@ class SceneDisplay:
         """Send the splats to the browser, which from now on draws the scene while the view moves."""
         self._scene.splats.send()
         self._background.set_without_splats(False)
+
+    def show_photo(self, overlay: Overlay | None) -> None:
+        """Show a photo over the view from its position; None: no photo."""
+        self._controls.photo_opacity.visible = overlay is not None
+        self._background.set_overlay(overlay)
+
+    def measure(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+        """Take what a click's ray hits as a point of the measured distance."""
+        self._scene.measure(origin, direction)
+
+    def offer_prior(self) -> None:
+        """Show a link to the start page, with the view of this moment as the next photo's prior."""
+        if self.scene_id is not None:
+            prior = {"world_from_camera": self._background.view.pose.world_from_camera.tolist()}
+            self._controls.prior.content = prior_link_html(self.scene_id, prior)
 
     def set_layer_visible(self, name: LayerName, visible: bool) -> None:
         """Show or hide a layer. Raises ServiceError, ValueError."""

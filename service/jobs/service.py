@@ -39,7 +39,8 @@ from service.jobs.read_photo import DecodedPhoto, Recall, read_photo
 from service.jobs.store import JobStore
 from service.jobs.worker import Worker
 from service.lenses.lens_memory import LensMemory
-from service.photos.images import encode_image
+from service.photos.images import encode_image, undistorted_jpeg
+from service.types import NO_CORRECTION
 
 _log = logging.getLogger(__name__)
 
@@ -204,6 +205,18 @@ class Jobs:
             return records[-1 if index is None else index]
         kind = RecordNotFound if job.ended else JobNotReady
         raise kind(f"the job has {len(records)} records and is {job.state}.", where="iterations")
+
+    def undistorted_photo(self, job: StoredJob) -> bytes:
+        """Return the photo without the distortion that the latest record estimates: as its render has it, as JPEG.
+
+        Raises PhotoGone, JobNotReady.
+        """
+        photo, records = self.photo(job), self.records(job)
+        correction = records[-1].step.correction if records else NO_CORRECTION
+        if not correction.k1:
+            return photo
+        camera = job.photo.intrinsics.corrected(correction)
+        return undistorted_jpeg(photo, replace(camera, model="SIMPLE_RADIAL", distortion=(correction.k1,)))
 
     def photo(self, job: StoredJob) -> bytes:
         """Return the photo as the estimator sees it, as JPEG. Raises PhotoGone, JobNotReady."""

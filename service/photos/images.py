@@ -189,6 +189,13 @@ def encode_image(
     return data.tobytes()
 
 
+def undistorted_jpeg(jpeg: bytes, intrinsics: Intrinsics) -> bytes:
+    """Return one of our own JPEGs as the image of a pinhole, black outside the photo; see `undistorted`."""
+    with JpegImageFile(BytesIO(jpeg)) as image:
+        rgb = np.asarray(image.convert("RGB"))
+    return encode_image(undistorted(rgb, intrinsics)[0])
+
+
 def with_focal_35mm(jpeg: bytes, focal_mm: int) -> bytes:
     """Return a JPEG without EXIF with this 35 mm equivalent focal length in one."""
     exif = Image.Exif()

@@ -15,7 +15,9 @@ from viewer.camera_views import SceneExtent
 from viewer.colours import RGB
 from viewer.frusta import viser_frustum
 
-LayerName = Literal["splats", "training cameras", "trajectory", "candidates", "match vectors"]
+LayerName = Literal[
+    "splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance"
+]
 
 _WIDTH_PX = 2.0
 """Of the trajectory's and of single frusta's lines."""
@@ -130,6 +132,11 @@ class Layer:
             point_shape="circle",
             precision="float32",
             visible=self._nodes_visible,
+        )
+
+    def _draw_label(self, name: str, text: str, position: Float64[np.ndarray, "3"]) -> None:
+        self._nodes[name] = self._canvas.scene.add_label(
+            self._path(name), text, position=position, visible=self._nodes_visible
         )
 
     def _draw_frustum(

@@ -158,15 +158,22 @@ def _record_texts(records: Sequence[JobRecord]) -> list[str]:
     "/jobs/{job_id}/photo",
     tags=["jobs"],
     response_class=Response,
-    responses=JPEG | errors("job_not_found", "photo_gone", "job_not_ready"),
+    responses=JPEG | errors("invalid_request", "job_not_found", "photo_gone", "job_not_ready"),
 )
 @route_policy(role="read")
-async def job_photo(job: JobOf, app_state: AppStateOf) -> Response:
-    """Return the photo as the estimator gets it: upright, undistorted, reduced if large.
+async def job_photo(
+    job: JobOf,
+    app_state: AppStateOf,
+    undistorted: Annotated[
+        bool, Query(description="Remove the distortion that the latest record estimates, too: it then fits its render.")
+    ] = False,
+) -> Response:
+    """Return the photo as the estimator gets it: upright, without the distortion of its intrinsics, reduced if large.
 
     It is deleted some time after the job, unless the request has `keep_photo`.
     """
-    photo = await to_thread.run_sync(app_state.jobs.photo, job, limiter=app_state.rendering)
+    read = app_state.jobs.undistorted_photo if undistorted else app_state.jobs.photo
+    photo = await to_thread.run_sync(read, job, limiter=app_state.rendering)
     return Response(photo, media_type="image/jpeg")
 
 

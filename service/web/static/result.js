@@ -45,9 +45,10 @@ function alternatives({ alternatives: others }) {
   return h("div", { class: "warning" }, "Other possible positions:", h("ul", {}, ...others.map(place)));
 }
 
-/** The photo's address; while the job ran, the same one may have had another photo of the sequence. */
+/** The photo's address, as the render has it: undistorted. While the job ran, the same address without the number of
+ * records may have had another photo of the sequence. */
 export function photoOf(job) {
-  return `${job.links.photo}?records=${job.records}`;
+  return `${job.links.photo}?${job.records ? "undistorted=true&" : ""}records=${job.records}`;
 }
 
 function pictures(job) {
@@ -55,7 +56,7 @@ function pictures(job) {
   return [
     pair.element, blendSlider([pair]),
     h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Open in viewer"),
-      h("a", { class: "button", href: photoOf(job), download: "" }, "Photo"),
+      h("a", { class: "button", href: job.links.photo, download: "" }, "Photo"),
       h("a", { class: "button", href: job.links.render, download: "" }, "Render")),
   ];
 }

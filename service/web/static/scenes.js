@@ -119,7 +119,7 @@ export class SceneList {
       if (file) this.upload(file);
     });
     return h("div", { class: "card adding" }, pick, h("label", { for: "scenefile", class: "button" }, "Add a scene"),
-      h("span", { class: "quiet" }, "A scene file, or a ZIP of a scene folder; it may also be dropped anywhere."));
+      h("span", { class: "quiet" }, "A scene file, or a ZIP of a scene folder. You can also drop it on this page."));
   }
 
   /** Upload a scene under its file's name, and choose it. */
