@@ -338,6 +338,7 @@ class FakeService:
             cameras=len(self.scene.cameras),
             memory_bytes=self.scene.nbytes,
             jobs=0,
+            uploaded=False,
             error=None,
             links=SceneLinks(self="/", splats="/", thumbnail="/"),
             sha256=info.sha256,

@@ -27,11 +27,13 @@ from service.web.schemas.conversion import record_out
 from viewer import camera_views, charts, colours, frusta, job_stream, match_geometry, service_lists
 from viewer import comparison_images as images
 from viewer.job_stream import JobStream
+from viewer.layers.axes_layer import round_length
 from viewer.layers.splat_layer import full_covariances
 from viewer.panel_html import headline_html, job_label, record_html, scene_html
+from viewer.picking import first_surface
 from viewer.playback import Playback
 from viewer.service_lists import ServiceLists
-from viewer.service_values import Job, JobOutcome, ListedJob, parse_splats, record_of
+from viewer.service_values import Job, JobOutcome, ListedJob, Splats, parse_splats, record_of
 from viewer.shared_data import SharedData
 
 # ---------------------------------------------------------------- what the service says
@@ -560,3 +562,70 @@ def test_pictures_and_scenes_are_fetched_once() -> None:
     assert stream.render(1, matched=False) is pose
     assert stream.photo() is stream.photo()
     assert len(fake.asked) == len(set(fake.asked)) + 1  # the two renders have the same path
+
+
+# ---------------------------------------------------------------- the photo over the view, points of the scene
+
+
+VIEW = Camera(
+    Intrinsics(400, 300, 250.0, 250.0, 200.0, 150.0), look_at(np.zeros(3), np.array([0.2, 0.1, 1]), -np.eye(3)[1])
+)
+LENS = Intrinsics(200, 120, 180.0, 190.0, 90.0, 65.0)
+
+
+def dots(size: Intrinsics, pixels: np.ndarray) -> np.ndarray:
+    """Black with a white dot around each pixel."""
+    rows, columns = np.indices((size.height, size.width)) + 0.5
+    near = [np.hypot(columns - x, rows - y) < 2.5 for x, y in pixels]
+    return np.repeat(255 * np.any(near, 0).astype(np.uint8)[..., None], 3, 2)
+
+
+def dot_in(image: np.ndarray) -> np.ndarray:
+    """The centre of the only white dot."""
+    rows, columns = np.nonzero(image[..., 0] > 128)
+    return np.array([columns.mean(), rows.mean()]) + 0.5
+
+
+@pytest.mark.parametrize("point", [(0.3, 0.2, 1.0), (-0.1, 0.0, 1.0), (0.4, -0.1, 1.0)])
+def test_a_photo_over_a_view_shows_each_point_where_the_view_has_it(point: tuple[float, float, float]) -> None:
+    camera = Camera(LENS, look_at(np.zeros(3), np.array([0.1, 0.0, 1.0]), np.array([0.3, -1.0, 0.0])))
+    seen = [
+        project(transformed(np.linalg.inv(c.pose.world_from_camera), np.array([point])), c.intrinsics)
+        for c in (camera, VIEW)
+    ]
+    photo, below = dots(LENS, seen[0]), np.zeros((300, 400, 3), np.uint8)
+    np.testing.assert_allclose(dot_in(images.with_photo(below, VIEW, photo, camera, 1.0)), seen[1][0], atol=0.5)
+    white = np.full_like(below, 200)
+    assert (images.with_photo(white, VIEW, photo, camera, 0.0) == 200).all()
+    half = images.with_photo(white, VIEW, np.zeros_like(photo), camera, 0.5)
+    assert set(np.unique(half[150:160, 200:210])) == {100}
+
+
+@pytest.mark.parametrize("k1", [-0.2, 0.15])
+def test_the_distortion_that_a_step_estimates_is_removed_from_the_photo(k1: float) -> None:
+    x, y = 0.35, -0.22
+    bent = 1 + k1 * (x * x + y * y)
+    taken = dots(LENS, np.array([[LENS.fx * x * bent + LENS.cx, LENS.fy * y * bent + LENS.cy]]))
+    straight = [LENS.fx * x + LENS.cx, LENS.fy * y + LENS.cy]
+    np.testing.assert_allclose(dot_in(images.undistorted(taken, LENS, k1)), straight, atol=0.5)
+
+
+def test_a_click_hits_the_first_surface_that_is_opaque() -> None:
+    grid = np.stack(np.meshgrid(np.arange(-1, 1.01, 0.1), np.arange(-1, 1.01, 0.1)), -1).reshape(-1, 2)
+    at = lambda z: np.c_[grid, np.full(len(grid), z)]  # noqa: E731
+    flat = np.tile([0.01, 0, 0, 0.01, 0, 1e-8], (len(grid), 1))
+    walls = [(1.0, 20), (3.0, 250), (4.0, 250)]  # the first is haze
+    rgba = np.concatenate([np.tile([0, 0, 0, alpha], (len(grid), 1)) for _, alpha in walls]).astype(np.uint8)
+    centres = np.concatenate([at(z) for z, _ in walls]).astype(np.float32)
+    splats = Splats(centres, np.tile(flat, (3, 1)).astype(np.float32), rgba, len(rgba))
+    for direction in ([0, 0, 1.0], [0.1, -0.2, 1.0]):
+        hit = first_surface(np.zeros(3), np.array(direction), splats)
+        assert hit is not None
+        np.testing.assert_allclose(hit, 3 * np.array(direction), atol=1e-2)
+    assert first_surface(np.zeros(3), np.array([0, 0, -1.0]), splats) is None
+    assert first_surface(np.zeros(3), np.array([1.0, 0, 0.1]), splats) is None
+
+
+@pytest.mark.parametrize(("limit", "length"), [(0.99, 0.5), (1.0, 1.0), (4.9, 2.0), (73.0, 50.0), (0.002, 0.002)])
+def test_the_scale_is_a_round_length(limit: float, length: float) -> None:
+    assert round_length(limit) == pytest.approx(length)

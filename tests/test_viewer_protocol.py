@@ -327,6 +327,42 @@ def test_a_click_on_a_frustum_jumps_there(fake: FakeService, viewer: Viewer) -> 
         browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "the clicked training camera")
 
 
+def test_the_photo_lies_over_the_view_through_its_camera_only(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 3, finished=True)
+    shown = lambda: images.decode(bytes(browser.background["rgb_data"])).astype(float)  # noqa: E731
+    middle = lambda: shown()[200:400, 300:500].reshape(-1, 3)  # noqa: E731
+    is_colour = lambda rgb: len(middle()) > 0 and np.abs(middle().mean(0) - rgb).max() < 4  # noqa: E731
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: _background(browser) == "exact", "the view from behind")
+        assert not browser.widget("photo opacity")["visible"]
+        browser.set("look through this camera", True)
+        browser.wait(lambda: browser.widget("photo opacity")["visible"] and is_colour((150, 110, 180)), "both, half")
+        # The photo's own aspect, 3:2 in a view of 4:3: above and below it there is the render alone.
+        assert np.abs(shown()[:20].mean((0, 1)) - EXACT_RGB).max() < 4
+        browser.set("photo opacity", 1.0)
+        browser.wait(lambda: is_colour((120, 160, 200)), "the photo alone")
+        browser.send(**CAMERA)
+        browser.wait(lambda: is_colour(EXACT_RGB), "another view")
+
+
+def test_two_clicks_measure_a_distance_and_a_view_becomes_a_prior(fake: FakeService, viewer: Viewer) -> None:
+    fake.job("j", 2, finished=True)
+    with _browser(viewer, "/jobs/j") as browser:
+        browser.wait(lambda: "/splats/splats" in browser.nodes, "the scene")
+        centres = viewer._shared.scenes.get("ball").splats.centres[:2].astype(float)
+        browser.set("measure distances", True)
+        browser.set("axes and scale", True)
+        for centre in centres:
+            _click(browser, centre + np.array([0, 0, 1e-3]), np.array([0, 0, -1.0]))
+        browser.wait(lambda: "/measured distance/length" in browser.nodes, "a distance")
+        told = browser.nodes["/measured distance/length"]["props"]["text"]
+        assert re.fullmatch(r"[\d.]+ units", told)
+        browser.wait(lambda: browser.nodes["/axes and scale/up"], "the axes")
+        browser.set("use this view as prior", True)
+        browser.wait(lambda: "scene=ball" in browser.text(), "a link")
+        assert "data-splatfix='./#/?prior=" in browser.text()
+
+
 def test_matches_can_be_coloured_by_residual_and_are_carried_on(fake: FakeService, viewer: Viewer) -> None:
     job = fake.job("j", 2)
     job.add(replace(records(3)[2], matches=None))

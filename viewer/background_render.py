@@ -99,8 +99,9 @@ class BackgroundRender:
     def set_overlay(self, overlay: Overlay | None) -> None:
         """Show a photo over the renders from its position; None: no photo."""
         with self._changed:
-            self._overlay = overlay
-        self.moved()
+            before, self._overlay = self._overlay, overlay
+        if before is not overlay:
+            self.moved()
 
     def set_opacity(self, opacity: float) -> None:
         """Choose the opacity of the photo, 0..1."""

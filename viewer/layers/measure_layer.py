@@ -26,7 +26,7 @@ class MeasureLayer(Layer):
         self._points = [*(self._points if len(self._points) < 2 else []), point]
         drawn = np.array(self._points)
         colours = np.tile(np.array(_COLOUR, np.uint8), (len(drawn), 1))
-        self._draw_points("points", drawn, colours, 0.06 * self.extent.frustum_depth)
+        self._draw_points("points", drawn, colours, 0.1 * self.extent.frustum_depth)
         self._draw_lines("line", drawn[None].astype(np.float32)[:, :2] if len(drawn) == 2 else drawn[:0], _COLOUR, 3.0)
         if len(drawn) == 2:
             units = float(np.linalg.norm(drawn[1] - drawn[0]))
