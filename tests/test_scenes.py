@@ -88,7 +88,7 @@ def test_a_photo_is_looked_for_in_several_scenes(folder, stepping):
 def test_no_scene_is_called_auto(tmp_path):
     (tmp_path / "auto").mkdir()
     (tmp_path / "auto" / "scene.ply").write_bytes(ply())
-    with pytest.raises(BadInput, match="stands for all"):
+    with pytest.raises(BadInput, match="means all scenes"):
         named_scenes([tmp_path])
 
 
@@ -139,7 +139,7 @@ def test_only_what_is_preloaded_is_awaited_and_the_rest_comes_when_asked_for(ste
 
 
 def test_an_unknown_scene_to_preload_stops_the_start(folder):
-    with pytest.raises(Exception, match="to preload"):
+    with pytest.raises(Exception, match="unknown scene"):
         create_app(settings(scenes=[folder], preload=["roof"]))
 
 
