@@ -355,7 +355,7 @@ def test_a_job_is_run_again_and_deleted_from_the_history(page: Page, url: str) -
     page.goto(f"{url}/#/jobs")
     row = page.locator("tbody tr").filter(has=page.locator(f"a[href='#/jobs/{job['id']}']"))
     row.get_by_role("button", name="Run again").click()
-    page.locator(".badge.localized").wait_for()
+    page.locator(".verdict .badge.localized").wait_for()
     again = job_of(page, url)
     assert (again["id"] != job["id"], again["seed"]) == (True, 11)
     np.testing.assert_allclose(again["result"]["pose"]["position"], job["result"]["pose"]["position"], atol=0.05)

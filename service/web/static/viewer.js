@@ -63,8 +63,8 @@ const styles = document.createElement("style");
 styles.textContent = `
 :root { --mantine-color-dimmed: #c3c6ca !important; --mantine-color-placeholder: #c3c6ca !important; }
 @media (max-width: 36em) {
-  [style*="width: 20em"] { width: 100vw !important; }
-  [style*="width: 20em"][style*="fixed"] { max-height: 42dvh !important; border-radius: 14px 14px 0 0 !important; }
+  [style^="width: 20em"], [style*=" width: 20em"] { width: 100vw !important; }
+  [style*=" width: 20em"] { max-height: 42dvh !important; border-radius: 14px 14px 0 0 !important; }
 }`;
 document.head.append(styles);
 
