@@ -49,8 +49,11 @@ def extent_of(raw: RawGaussians, config: NumbersConfig = NUMBERS) -> Extent:
 
 
 def origin_for(extent: Extent, config: NumbersConfig = NUMBERS) -> tuple[float, float, float]:
-    """Return the origin that the scene's coordinates should be relative to: zero unless they are far from it."""
-    if np.linalg.norm(extent.middle) <= config.far * extent.radius:
+    """Return the origin that the scene's coordinates should be relative to: zero unless they are far from it.
+
+    Gaussians in one place have no size that rounding could be compared with: they stay.
+    """
+    if extent.radius == 0 or np.linalg.norm(extent.middle) <= config.far * extent.radius:
         return 0.0, 0.0, 0.0
     x, y, z = (float(v) for v in extent.middle)
     return x, y, z
