@@ -121,6 +121,16 @@ def test_lines_are_drawn_on_the_render_that_they_belong_to(
             assert ("lines:" in controls.caption.content) is (mode == "side by side" and lines)
 
 
+@pytest.mark.parametrize(("mode", "renders"), [("side by side", 1), ("blend", 1), ("flicker", 2)])
+def test_what_was_prepared_is_shown_at_once(mode: str, renders: int) -> None:
+    """Flickering images are not composed; the stream keeps them."""
+    found, _ = panel(mode)
+    stream: Any = Stream()
+    found.prepare(stream, RECORD, None)
+    found.show_comparison(stream, RECORD, None)
+    assert len(stream.rendered) == renders
+
+
 def test_a_composed_image_is_kept_for_four_steps_and_made_anew_for_another_choice() -> None:
     found, controls = panel("blend")
     stream: Any = Stream()
