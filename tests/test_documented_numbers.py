@@ -27,9 +27,12 @@ from service.bench.paper.plan import MAIN, cells
 from service.bench.pose_metrics import Units
 from service.bench.scene_modifications import SCENE_MODIFICATIONS, require_scene_modifications
 from service.bench.start_poses import start_pose
+from service.cli.server import _CONNECTIONS_S
 from service.errors import InvalidOptions
 from service.geometry import pose_distance
 from service.jobs.config import JobsConfig
+from service.photos.decode_config import DEFAULTS
+from service.smoothing import SMOOTHING
 from service.types import LENS_PRIORS, Camera, Intrinsics
 from service.web.settings import Settings
 
@@ -212,3 +215,39 @@ def test_what_the_jobs_have_by_default_is_what_the_service_sets() -> None:
 
 def test_every_layout_is_documented() -> None:
     assert {row[0].strip("` ") for row in rows_of("benchmarks.md", "layout | what")} == set(LAYOUTS)
+
+
+def sentence(document: str, around: str) -> str:
+    """Return the sentence of a document that has these words."""
+    text = " ".join((ROOT / document).read_text("utf-8").split())
+    (found,) = [part for part in re.split(r"(?<=[a-z)\d])[.:;] ", text) if around in part]
+    return found
+
+
+def test_uploads_are_as_large_as_the_changelog_says() -> None:
+    alone, others = numbers(sentence("CHANGELOG.md", "Uploads are limited to"))
+    assert Settings(scenes=[], host="127.0.0.1").upload_limit == alone * 1e9
+    assert Settings(scenes=[], host="0.0.0.0").upload_limit == others * 1e6
+    assert Settings(scenes=[], host="0.0.0.0", max_upload_bytes=7).upload_limit == 7
+
+
+def test_photos_have_as_many_pixels_as_the_documents_say() -> None:
+    webp, other = numbers(sentence("docs/accuracy.md", "WebP photos have at most"))
+    assert webp * 1e6 <= DEFAULTS.max_pixels_webp < (webp + 1) * 1e6
+    # A phone's 64 megapixels are a few more.
+    assert other * 1e6 <= 9248 * 6936 <= DEFAULTS.max_pixels < (other + 4) * 1e6
+
+
+def test_gaps_are_interpolated_as_the_api_says() -> None:
+    (longest,) = numbers(sentence("docs/api.md", "between two that are at most"))[-1:]
+    assert longest == SMOOTHING.max_gap_s
+
+
+def test_a_container_is_given_time_to_end_its_jobs() -> None:
+    compose = (ROOT / "docker/compose.yaml").read_text()
+    kubernetes = (ROOT / "docker/kubernetes.yaml").read_text()
+    given = [int(re.findall(pattern, text)[0]) for pattern, text in (
+        (r"stop_grace_period: (\d+)s", compose), (r"terminationGracePeriodSeconds: (\d+)", kubernetes),
+    )]  # fmt: skip
+    # Open connections first, then the jobs, then what is written last; twice the time for a busy machine.
+    assert 2 * (_CONNECTIONS_S + Settings(scenes=[]).shutdown_s) <= min(given)
