@@ -302,6 +302,25 @@ class TestCheckpoint:
         assert np.allclose(scene.means, GSPLY["means"] + 1)
         assert np.allclose(scene.sh[:, 1:], GSPLY["shN"])
 
+    def test_parameters_as_they_were_trained(self, tmp_path, in_this_process):
+        trained = {name: torch.nn.Parameter(value) for name, value in tensors().items()}
+        scene = load_scene(gsplat_checkpoint(tmp_path / "a.pt", **trained | {"sh0": trained["sh0"][:, None]}))
+        assert np.array_equal(scene.means, load_scene(gsplat_checkpoint(tmp_path / "b.pt")).means)
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            lambda means: means.to_sparse(),
+            lambda means: means.to("meta"),
+            lambda means: means.int(),
+            lambda means: torch.quantize_per_tensor(means, 0.1, 0, torch.qint8),
+        ],
+    )
+    @pytest.mark.filterwarnings("ignore")  # PyTorch's, of what is new or old in it
+    def test_other_tensors_are_named(self, change, tmp_path, in_this_process):
+        with pytest.raises(CorruptScene, match=r"'means' (is no plain tensor|has the shape)"):
+            load_scene(gsplat_checkpoint(tmp_path / "a.pt", means=change(tensors()["means"])))
+
     def test_code_in_a_pickle_is_not_run(self, tmp_path, in_this_process):
         class Hostile:
             def __reduce__(self):
@@ -311,6 +330,17 @@ class TestCheckpoint:
         with pytest.raises(CorruptScene, match="can't be loaded"):
             load_scene(tmp_path / "a.pt")
         assert not (tmp_path / "ran").exists()
+
+    @pytest.mark.parametrize("left", [0, 1, 40, -2])
+    def test_a_pickle_that_ends_too_soon(self, left, tmp_path, in_this_process):
+        whole = gsplat_checkpoint(tmp_path / "a.pt")
+        with zipfile.ZipFile(whole) as opened:
+            parts = {name: opened.read(name) for name in opened.namelist()}
+        with zipfile.ZipFile(tmp_path / "b.pt", "w") as cut:
+            for name, data in parts.items():
+                cut.writestr(name, data[:left] if name.endswith("data.pkl") else data)
+        with pytest.raises(CorruptScene, match=r"the checkpoint can't be loaded: [\w ]+\.$"):
+            load_scene(tmp_path / "b.pt")
 
     def test_what_is_no_scene(self, tmp_path, in_this_process):
         torch.save({"pipeline": {"_model.field": torch.zeros(3)}}, tmp_path / "nerf.ckpt")

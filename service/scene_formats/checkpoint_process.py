@@ -41,15 +41,21 @@ def extracted(path: Path, folder: Path, most: int) -> dict[str, object]:
         # Not memory-mapped, so that the limit of memory holds.
         data = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a broken or hostile file raises almost anything
-        return {"error": f"the checkpoint can't be loaded: {str(error).splitlines()[0][:200]}"}
+        # The first sentence: PyTorch goes on with how to load it in spite of all, and some errors have no text.
+        said = str(error).strip().split("\n")[0].split(". ")[0][:200] or type(error).__name__
+        return {"error": f"the checkpoint can't be loaded: {said.rstrip('.')}."}
     tensors, names = _tensors(data)
     missing = [names[name] for name in _GSPLAT if name != "shN" and name not in tensors]
     if missing:
         return {"unsupported": f"a checkpoint of another method: it has no {', '.join(missing[:3])}."}
     for name, tensor in tensors.items():
-        if len(tensor) > most or tensor.numel() > most * 75 or not tensor.is_floating_point():
-            return {"error": f"'{names[name]}' has the shape {tuple(tensor.shape)} of {tensor.dtype}."}
-        np.save(folder / f"{name}.npy", tensor.float().contiguous().numpy(), allow_pickle=False)
+        # Sparse, nested and quantized tensors, and those without values (meta), are of no trainer of Gaussians.
+        if tensor.layout != torch.strided or tensor.is_nested or tensor.is_meta or not tensor.is_floating_point():
+            return {"error": f"'{names[name]}' is no plain tensor of floats, but {tensor.dtype}, {tensor.layout}."}
+        if len(tensor) > most or tensor.numel() > most * 75:
+            return {"error": f"'{names[name]}' has the shape {tuple(tensor.shape)}."}
+        # Detached: parameters may be saved as they were trained.
+        np.save(folder / f"{name}.npy", tensor.detach().float().contiguous().numpy(), allow_pickle=False)
     flat = "shN" not in tensors or 0 in tensors["shN"].shape
     return {"rgb_logits": names is _NERFSTUDIO and flat}
 
