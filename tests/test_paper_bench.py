@@ -64,7 +64,11 @@ def keys(lines) -> list[tuple]:
 def test_every_query_is_one_line(scene, monkeypatch):
     asked = fake_answers(monkeypatch.setattr)
     shown = []
+    wall, cpu = time.perf_counter(), time.process_time()
     lines = runs.run(asked_for(scene), lambda progress: shown.append((sum(progress.done.values()), progress.eta_s)))
+    # The queries' times are parts of the whole run's.
+    assert 0 < sum(line["latency_ms"] for line in lines) <= 1e3 * (time.perf_counter() - wall)
+    assert 0 <= sum(line["cpu_ms"] for line in lines) <= 1e3 * (time.process_time() - cpu)
     stored = [json.loads(line) for line in (scene.parent / "out" / "results.jsonl").read_text().splitlines()]
     assert stored == json.loads(json.dumps(lines))
     # 2 starts x (6 + 6 + 2) and, without a start, each of the two photos once by two methods
