@@ -33,6 +33,7 @@ from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.features.untold_background import WHITE, has_white_border, shows_background
+from service.pose.retrieval.floaters import without_floaters
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.gate import VERIFICATION, downgraded, verify
 from service.render import RASTERIZERS
@@ -62,7 +63,9 @@ class LoadedScene:
     """A scene in memory with the tools bound to it. Shared by all jobs on it; safe from several threads."""
 
     scene: GaussianScene
+    """As its file has it."""
     rasterizer: Rasterizer
+    """Of the scene that photos are localized in: without floaters that veil it."""
     matcher: Matcher
     """The gate's, too; beside an `image_matcher` it is the default one."""
     image_matcher: ImageMatcher | None = None
@@ -72,7 +75,10 @@ class LoadedScene:
     """Why the rasterizer isn't an earlier one of RASTERIZER_ORDER."""
     warnings: tuple[str, ...] = ()
     """For every result."""
+    without_floaters: GaussianScene | None = None
+    """The scene that photos are localized in; None: it is all of `scene`."""
     _prepared: dict[str, Any] = field(default_factory=dict)
+    _whole: Rasterizer | None = None
     _over_white: LoadedScene | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -111,13 +117,30 @@ class LoadedScene:
         else:
             # It extracts features, which every method can use.
             images = None
-        renderer, skipped_rasterizers, warnings = _renderer(scene, rasterizer)
-        return cls(scene, renderer, features, images, cache_dir, skipped_rasterizers, warnings)
+        searched = without_floaters(scene)
+        renderer, skipped_rasterizers, warnings = _renderer(searched, rasterizer)
+        part = None if searched is scene else searched
+        return cls(scene, renderer, features, images, cache_dir, skipped_rasterizers, warnings, part)
+
+    @property
+    def searched(self) -> GaussianScene:
+        """The scene that photos are localized in."""
+        return self.without_floaters or self.scene
 
     @property
     def nbytes(self) -> int:
         """Memory of the scene and its renderer; a mapped scene's is the kernel's to take back."""
-        return self.scene.nbytes + self.rasterizer.nbytes
+        whole = 0 if self._whole is None else self._whole.nbytes
+        return self.scene.nbytes + self.rasterizer.nbytes + whole
+
+    def for_display(self) -> Rasterizer:
+        """Return a rasterizer of the whole scene, floaters included, made when it is first needed."""
+        if self.without_floaters is None:
+            return self.rasterizer
+        with self._lock:
+            if self._whole is None:
+                self._whole = self.rasterizer.of(self.scene)
+            return self._whole
 
     def prepare(self, estimator: str) -> Any:
         """Return what the estimator prepares for this scene (e.g. its view index), made once."""
@@ -127,7 +150,7 @@ class LoadedScene:
         with self._lock:
             if estimator not in self._prepared:
                 # A seed of its own: what a scene has prepared must not depend on the photo that came first.
-                tools = Tools(self.scene, self.rasterizer, self.matcher, np.random.default_rng(0), None)
+                tools = Tools(self.searched, self.rasterizer, self.matcher, np.random.default_rng(0), None)
                 self._prepared[estimator] = make(tools, self.cache_dir)
                 # It was read through for the index; from now on the renderer's copy is used.
                 release(self.scene)
@@ -153,11 +176,13 @@ class LoadedScene:
 
     def _over(self, background_rgb: tuple[float, float, float]) -> LoadedScene:
         """Return the scene over an assumed background, in the same memory."""
-        scene = replace(self.scene, info=replace(self.scene.info, background_rgb=background_rgb))
+        info = replace(self.scene.info, background_rgb=background_rgb)
         said = (*self.warnings, WHITE_ASSUMED)
         return replace(
-            self, scene=scene, rasterizer=self.rasterizer.over(background_rgb), warnings=said,
-            _prepared={}, _over_white=None, _lock=threading.Lock(),
+            self, scene=replace(self.scene, info=info),
+            without_floaters=self.without_floaters and replace(self.without_floaters, info=info),
+            rasterizer=self.rasterizer.over(background_rgb), warnings=said,
+            _prepared={}, _whole=None, _over_white=None, _lock=threading.Lock(),
         )  # fmt: skip
 
 
@@ -242,7 +267,7 @@ def localize_in_scene(
     options = request.options if request.options is not None else plugin.Options()
     tally = RenderTally()
     tools = Tools(
-        loaded.scene,
+        loaded.searched,
         Counted(rasterizer_for(query, loaded), tally),
         loaded.matcher,
         np.random.default_rng(request.seed),

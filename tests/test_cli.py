@@ -176,7 +176,8 @@ def test_scenes_are_listed_and_inspected(splatfix, room):
     assert (code, bare["training_cameras"], bare["training_size"]["px"]) == (0, 0, None)
     assert bare["index"]["interior"]
     assert bare["index"]["coverage"] > 0.9
-    assert bare["floaters"] < 0.01
+    assert bare["floaters"] == {"found": 0, "veil": 0.0, "left_out": False}
+    assert facts["floaters"] == "none"
     assert "training size is unknown" in " ".join(bare["warnings"])
 
 

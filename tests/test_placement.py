@@ -20,7 +20,6 @@ from service.pose.retrieval.view_placement import (
     _Views,
     coverage,
     find_views,
-    floaters,
     search_camera,
     shows_single_surface,
 )
@@ -176,27 +175,6 @@ def test_no_view_is_inside_a_cloud_of_floaters() -> None:
 def test_the_same_seed_finds_the_same() -> None:
     room = synthetic_room(2000)
     assert np.array_equal(places(room, 3)[0], places(room, 3)[0])
-
-
-def test_floaters_are_counted() -> None:
-    rng = np.random.default_rng(0)
-    walls = blobs(np.concatenate([rng.uniform(-3, 3, (3800, 2)), np.zeros((3800, 1))], 1), 0.02)
-    assert floaters(walls) < 0.01
-    haze = blobs(rng.uniform((-3, -3, 3), (3, 3, 9), (200, 3)), 0.02)
-    assert floaters(joined(walls, haze)) == pytest.approx(0.05, abs=0.01)
-
-
-@pytest.mark.parametrize(("spacing", "share"), [(0.8, 0.0), (1.5, 1.0)])
-def test_a_surface_has_more_than_eight_gaussians_in_three_twentieths_of_the_typical_distance(
-    spacing: float, share: float
-) -> None:
-    """A lattice in a plane, spaced in twentieths of the distance: 3 x 3 cells have 9 of its points or more, or 4."""
-    at = np.arange(0, 40, spacing) / 20 + 0.001
-    lattice = np.stack([*map(np.ravel, np.meshgrid(at, at)), np.full(at.size**2, 0.5)], 1)
-    # Seen from 1 unit, where 1.2 px of a focal length of 1000 px are 0.0012 units.
-    scene = blobs(lattice, 0.0012)
-    assert free_space_of(scene).distance == pytest.approx(1)
-    assert floaters(scene) == pytest.approx(share, abs=0.2)  # its rim has fewer
 
 
 def test_coverage_is_the_share_that_is_seen() -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from service.localize import ASSUMED_TRAINING_PX, choose_rasterizer
-from service.pose.retrieval.view_placement import coverage, find_views, floaters
+from service.pose.retrieval.floaters import find_floaters, without_floaters
+from service.pose.retrieval.view_placement import coverage, find_views
 from service.pose.retrieval.viewpoints import index_cameras
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
@@ -22,8 +23,8 @@ def scene_facts(path: Path) -> dict[str, Any]:
     Returns values that JSON can hold. Raises SceneError.
     """
     scene = load_scene(path)
-    rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(scene)
-    info = scene.info
+    rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(without_floaters(scene))
+    info, floaters = scene.info, find_floaters(scene)
     # Quantiles: a few stray Gaussians would make the bounds meaningless.
     low, high = np.quantile(scene.means, [0.01, 0.99], axis=0) + info.origin_in_world
     facts: dict[str, Any] = {
@@ -38,14 +39,14 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "bounds": [(end + np.array(info.origin_in_world)).tolist() for end in (scene.means.min(0), scene.means.max(0))],
         "middle_98_percent": [low.tolist(), high.tolist()],
         "extent": float(np.linalg.norm(high - low)),
-        "floaters": floaters(scene),
+        "floaters": {"found": int(floaters.found.sum()), "veil": floaters.veil, "left_out": floaters.left_out},
         "up": list(info.up_in_world) if info.up_in_world else None,
         "metres_per_unit": info.metres_per_unit,
         "background": list(info.background_rgb),
         "on_earth": info.geo_anchor is not None,
         "training_cameras": len(scene.cameras),
         "training_size": _training_size(path, scene),
-        "index": _index(scene, rasterizer),
+        "index": _index(without_floaters(scene), rasterizer),
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
     if not info.up_in_world:
@@ -104,7 +105,7 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "memory": f"{memory['scene'] / 1e6:.0f} MB, and {memory['renderer'] / 1e6:.0f} MB for the renderer",
         "bounds": " to ".join(_point(p) for p in facts["bounds"]),
         "middle 98 %": " to ".join(_point(p) for p in facts["middle_98_percent"]) + f"; diagonal {facts['extent']:.3g}",
-        "floaters": f"{facts['floaters']:.1%} of the opaque Gaussians",
+        "floaters": _floaters(facts),
         "up": _point(facts["up"]) if facts["up"] else "unknown",
         "metres per unit": str(facts["metres_per_unit"] or "unknown"),
         "geo anchor": "yes" if facts["on_earth"] else "no",
@@ -115,6 +116,14 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "sha256": facts["sha256"],
     }
     return lines | {f"warning {i}": text for i, text in enumerate(facts["warnings"], 1)}
+
+
+def _floaters(facts: dict[str, Any]) -> str:
+    found, veil, left_out = (facts["floaters"][name] for name in ("found", "veil", "left_out"))
+    if not facts["training_cameras"]:
+        return "not looked for without training cameras"
+    consequence = "left out when photos are localized" if left_out else "too thin a veil to be left out"
+    return f"{found:,}, of optical depth {veil:.2f} before the content: {consequence}" if found else "none"
 
 
 def _point(values: list[float]) -> str:

@@ -23,13 +23,13 @@ THUMBNAIL_PX = 480
 
 def thumbnail(loaded: LoadedScene) -> bytes:
     """Return a small JPEG of the scene."""
-    return encode_image(loaded.rasterizer.render([overview(loaded, THUMBNAIL_PX)])[0].rgb)
+    return encode_image(loaded.for_display().render([overview(loaded, THUMBNAIL_PX)])[0].rgb)
 
 
 def picture(loaded: LoadedScene, wanted: PictureSpec) -> bytes:
     """Render to a file. Raises InvalidIntrinsics."""
     pose = shifted(wanted.pose, -np.array(loaded.scene.info.origin_in_world))
-    frame = loaded.rasterizer.render([Camera(_intrinsics(loaded, wanted.intrinsics), pose)])[0]
+    frame = loaded.for_display().render([Camera(_intrinsics(loaded, wanted.intrinsics), pose)])[0]
     if wanted.format == "depth":
         file = io.BytesIO()
         # Little-endian whatever the machine: the file goes to others.

@@ -22,6 +22,7 @@ from service.interfaces import Features, Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
+from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_space import SPACE
 from service.pose.retrieval.free_views import FreeViews
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
@@ -93,9 +94,10 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
 def _key(tools: Tools[None], viewpoints: ViewpointConfig) -> str:
     """Return a hash of what the index depends on: code, scene, matcher, rasterizer, and all values of the configs."""
     # The scene's digest covers the training cameras, but photos may be left out; the background may be assumed.
-    scene = (tools.scene.info.sha256, len(tools.scene.cameras), tools.scene.info.background_rgb)
+    visible = int(np.count_nonzero(tools.scene.opacities))  # floaters are left out
+    scene = (tools.scene.info.sha256, visible, len(tools.scene.cameras), tools.scene.info.background_rgb)
     # Dataclasses of numbers: their repr names each value.
-    configs = (viewpoints, SPACE, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
+    configs = (viewpoints, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
     parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 

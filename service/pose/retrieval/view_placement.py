@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
-from service.pose.retrieval.free_space import SPACE, Space, fibonacci_directions, free_space_of
+from service.pose.retrieval.free_space import Space, fibonacci_directions, free_space_of
 from service.pose.retrieval.lod_proxy import lod_proxy
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
@@ -80,9 +80,6 @@ class PlacementConfig:
     max_views: int = 1000
     covered_share: float = 0.93
     """The choice ends with `max_views`, or once it has `min_views` and shows this share of what all good views show."""
-    floater_reach: float = 0.05
-    floater_neighbours: int = 8
-    """A surface has more Gaussians than these in 3 x 3 x 3 cells, each a share of the typical distance wide."""
     tolerated_roll_deg: float = 30.0
     """Rolls that features tolerate: of views that another up direction turns by more, both are kept."""
     repeat_weight: float = 0.25
@@ -169,24 +166,6 @@ def coverage(scene: GaussianScene, rasterizer: Rasterizer, cameras: Sequence[Cam
 def _covered(seen: Int64[np.ndarray, "n"]) -> float:
     """Return the share of the points that are seen at all."""
     return float((seen > 0).mean())
-
-
-def floaters(scene: GaussianScene) -> float:
-    """Return the share of the opaque Gaussians that have hardly any others around: no surface, but haze."""
-    space = free_space_of(scene)
-    size = PLACEMENT.floater_reach * space.distance
-    cells, counts = np.unique(np.floor(space.points / size).astype(np.int64), axis=0, return_counts=True)
-    ids = cell_ids(cells)
-    order = np.argsort(ids)
-    around = np.zeros(len(cells), int)
-    for step in np.ndindex(3, 3, 3):
-        wanted = cell_ids(cells + np.array(step) - 1)
-        at = order[np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)]
-        around += np.where(ids[at] == wanted, counts[at], 0)
-    # The space has a sample of the points; neighbours become fewer in proportion.
-    opaque = max(int((scene.opacities > SPACE.min_opacity).sum()), len(space.points))
-    alone = around <= max(1.0, PLACEMENT.floater_neighbours * len(space.points) / opaque)
-    return float(counts[alone].sum() / counts.sum())
 
 
 def shows_single_surface(
