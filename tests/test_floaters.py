@@ -91,6 +91,11 @@ def test_the_veil_is_the_optical_depth_in_front_of_the_content(room: GaussianSce
     assert measured == pytest.approx(expected, rel=0.1)  # seen: 0.03; chance: 1 / sqrt of a few thousand in view
 
 
+def test_gaussians_at_one_place_are_examined(room: GaussianScene) -> None:
+    one = replace(room, **{name: getattr(room, name)[[0, 0]] for name in NAMES})
+    assert find_floaters(one).left_out is False
+
+
 def test_areas_around_are_those_of_a_sum_over_all_pairs() -> None:
     rng = np.random.default_rng(1)
     means, areas, largest = rng.normal(size=(400, 3)), rng.uniform(size=400), rng.uniform(0, 2, 400)

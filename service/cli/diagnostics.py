@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
@@ -27,10 +27,11 @@ from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
 from service.pose.absolute_pose.unknown_lens import linearize_reprojection
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import pose_uncertainty
+from service.pose.retrieval.floaters import find_floaters
 from service.pose.retrieval.free_space import free_space_of
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
-from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, SceneInfo
+from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, NamedCamera, SceneInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +76,7 @@ def compile_kernels() -> None:
     points = room.means[:8].astype(np.float64)
     linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
     free_space_of(room).enclosures(points)
+    find_floaters(replace(room, cameras=(NamedCamera("warm", camera),)))
 
 
 def processor() -> str:

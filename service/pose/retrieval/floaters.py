@@ -139,7 +139,7 @@ def _supports(
     scene: GaussianScene, space: Space, among: Int64[np.ndarray, "k"], config: FloaterConfig
 ) -> Float64[np.ndarray, "k"]:
     """Return the supports of these Gaussians; where one reaches `min_support`, it may be larger than is returned."""
-    base = config.reach * space.distance
+    base = max(config.reach * space.distance, 1e-9)  # 0: all Gaussians at one place
     means = scene.means.astype(np.float64) - space.middle
     sizes = np.sort(scene.scales.astype(np.float64), axis=1)
     areas = scene.opacities * _areas(sizes)
