@@ -153,7 +153,7 @@ def test_scenes_are_named_by_their_stems() -> None:
         "chair": (Path("b/chair"), Path("data/x")),
         "fox": (Path("fox"), None),
     }
-    with pytest.raises(InvalidRequest, match="two scenes 'studio'"):
+    with pytest.raises(InvalidRequest, match="'studio'"):
         terminal.scene_arguments(["a/studio.ply", "b/studio=d"])
     both = ["s=day", "s=night", "s"]
     assert list(terminal.scene_arguments(both, named_by_photos=True)) == ["s-day", "s-night", "s"]
@@ -237,7 +237,8 @@ def facts(**changes: Any) -> dict[str, Any]:
     return {
         "name": "Room", "id": "room", "format": "ply", "render_mode": "default", "gaussians": 1234567, "sh_degree": 3,
         "memory_bytes": {"scene": 2.5e8, "renderer": 4.6e7}, "bounds": [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.14159]],
-        "middle_98_percent": [[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], "extent": 5.0, "floaters": 0.0123, "up": [0, 0, 1.0],
+        "middle_98_percent": [[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], "extent": 5.0,
+        "floaters": {"found": 0, "veil": 0.0, "left_out": False}, "up": [0, 0, 1.0],
         "metres_per_unit": 0.5, "on_earth": True, "training_cameras": 12,
         "training_size": {"px": 800, "source": "manifest"}, "index": index | searched, "sha256": "0" * 64,
         "warnings": ["first", "second"], "background": [0, 0, 0],
@@ -252,7 +253,7 @@ def test_facts_are_told_with_units() -> None:
     assert lines["memory"] == "250 MB, and 46 MB for the renderer"
     assert lines["bounds"] == "(-1, -2, -3) to (1, 2, 3.142)"
     assert lines["middle 98 %"] == "(0, 0, 0) to (3, 4, 0); diagonal 5"
-    assert lines["floaters"].startswith("1.2%")
+    assert lines["floaters"] == "none"
     assert lines["up"] == "(0, 0, 1)"
     assert lines["metres per unit"] == "0.5"
     assert lines["geo anchor"] == "yes"
@@ -261,6 +262,20 @@ def test_facts_are_told_with_units() -> None:
     assert lines["index"] == placed
     assert lines["coverage"].startswith("87.5%")
     assert (lines["warning 1"], lines["warning 2"]) == ("first", "second")
+
+
+@pytest.mark.parametrize(
+    ("found", "left_out", "cameras", "told"),
+    [
+        (1234, True, 12, "1,234, of optical depth 0.75 before the content: left out when photos are localized"),
+        (1234, False, 12, "too thin a veil"),
+        (1234, True, 0, "not looked for without training cameras"),
+        (0, False, 12, "none"),
+    ],
+)
+def test_floaters_are_told_with_what_becomes_of_them(found: int, left_out: bool, cameras: int, told: str) -> None:
+    changes = {"floaters": {"found": found, "veil": 0.75, "left_out": left_out}, "training_cameras": cameras}
+    assert told in scene_facts.as_lines(facts(**changes))["floaters"]
 
 
 def test_what_is_unknown_is_told_as_such() -> None:

@@ -227,7 +227,7 @@ def test_an_archive_unpacks_to_so_many_bytes_in_all(most: int, fits: bool, tmp_p
     if fits:
         assert unpacked(tmp_path, *names, data=bytes(10), most=most) == set(names)
     else:
-        with pytest.raises(CorruptScene, match="more than the service takes"):
+        with pytest.raises(CorruptScene, match="archive"):
             unpacked(tmp_path, *names, data=bytes(10), most=most)
 
 

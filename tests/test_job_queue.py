@@ -80,7 +80,7 @@ def test_there_is_a_place_for_each_idle_worker_and_those_that_wait(make: Callabl
     submitted(queue, "c").go_on.set()
     assert queue.waiting() == 1
     assert queue.full()
-    with pytest.raises(QueueFull, match="1 jobs are waiting"):
+    with pytest.raises(QueueFull, match="1 jobs"):
         queue.reserve()
     first.go_on.set()
     until(lambda: queue.waiting() == 0, "the third job")
@@ -128,6 +128,7 @@ def test_closing_does_not_wait_for_idle_workers_and_what_waits_is_not_begun(make
     began = time.monotonic()
     queue.close(0.1)  # the job goes on
     assert time.monotonic() - began < 15
+    assert queue.waiting() == 0
     running.go_on.set()
     assert running.done.wait(20)
     assert not waiting.begun.wait(0.05)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -14,7 +15,7 @@ from fake_service import PHOTO, orbit, records
 
 from service.client import ServiceError
 from service.results import MatchVectors
-from service.types import Camera
+from service.types import Camera, IntrinsicsCorrection
 from viewer import browser_camera
 from viewer.browser_camera import BrowserCamera
 from viewer.browser_session import BrowserSession
@@ -135,7 +136,7 @@ def test_a_composed_image_is_kept_for_four_steps_and_made_anew_for_another_choic
     found, controls = panel("blend")
     stream: Any = Stream()
     for step in (0, 1, 2, 3, 0, 1, 4, 1, 0):  # at 4, 0 was composed first
-        found.show_comparison(stream, SimpleNamespace(index=step), None)  # type: ignore[arg-type]
+        found.show_comparison(stream, replace(RECORD, index=step), None)
     assert [index for index, _ in stream.rendered] == [0, 1, 2, 3, 4, 0]
     before = len(stream.rendered)
     changes = [
@@ -148,7 +149,7 @@ def test_a_composed_image_is_kept_for_four_steps_and_made_anew_for_another_choic
     for count, change in enumerate(changes, 1):
         change()
         for _ in range(2):
-            found.show_comparison(stream, SimpleNamespace(index=0), None)  # type: ignore[arg-type]
+            found.show_comparison(stream, replace(RECORD, index=0), None)
         assert len(stream.rendered) == before + count
 
 
@@ -173,9 +174,19 @@ def test_without_its_photo_a_step_shows_the_render_alone(photo: bool, photo_step
 
 def test_the_photo_of_a_sequence_belongs_to_one_step() -> None:
     stream: Any = Stream(photo_step=3)
-    assert photo_of(stream, SimpleNamespace(index=3)) is RED  # type: ignore[arg-type]
-    stream.job = None  # not known yet
-    assert photo_of(stream, SimpleNamespace(index=0)) is RED  # type: ignore[arg-type]
+    assert photo_of(stream, replace(RECORD, index=3)) is RED
+    assert photo_of(stream, replace(RECORD, index=2)) is None
+    stream.job = None  # not known yet: whose photo it is neither
+    assert photo_of(stream, replace(RECORD, index=3)) is None
+
+
+def test_a_photo_is_shown_as_a_pinhole_with_the_steps_intrinsics_would_have_taken_it() -> None:
+    stream: Any = Stream()
+    bent = photo_of(stream, replace(RECORD, correction=IntrinsicsCorrection(k1=-0.3)))
+    assert bent is not None
+    assert bent.shape == RED.shape
+    # Barrel distortion: what a pinhole would show in its corners is not all in the photo, its middle is.
+    assert np.array_equal(bent[PHOTO.height // 2, PHOTO.width // 2], RED[0, 0])
 
 
 def test_match_vectors_are_drawn_over_the_photo_where_there_are_matches() -> None:
@@ -222,12 +233,13 @@ def test_a_scene_is_shown_once_and_rendered_by_the_service_until_its_splats_are_
 
 @pytest.mark.parametrize(("visible", "pending"), [*itertools.product((True, False), repeat=2)])
 def test_without_splats_in_the_browser_the_service_renders(visible: bool, pending: bool) -> None:
-    display, parts = scene_display(splats_shown=visible)
+    display, parts = scene_display(splats_shown=not visible)
     display.set_layer_visible("splats", visible)
     parts.background.set_without_splats.assert_not_called()  # there is no scene yet
     display.show("room", None)
     parts.background.set_without_splats.reset_mock()
     parts.scene.splats.pending = pending
+    parts.controls.layers["splats"].value = visible
     display.set_layer_visible("splats", visible)
     parts.background.set_without_splats.assert_called_once_with(not visible or pending)
     assert ("drawn by the service" in parts.controls.scene.content) is not visible
@@ -312,7 +324,8 @@ def test_a_flight_starts_here_ends_there_and_is_smooth(monkeypatch: pytest.Monke
 
     camera = Recording(position=0 * x, look_at=z, up_direction=z, aspect=2.0)
     camera.fov = 1.0
-    canvas: Any = SimpleNamespace(camera=camera, atomic=nullcontext, flush=lambda: None)
+    flushed: list[float] = []
+    canvas: Any = SimpleNamespace(camera=camera, atomic=nullcontext, flush=lambda: flushed.append(now[0] - 50.0))
     seen.clear()
     BrowserCamera(canvas).fly_to(Viewpoint(10 * x, 5 * z, z, 0.5))
     assert np.allclose(camera.position, 10 * x)
@@ -321,7 +334,8 @@ def test_a_flight_starts_here_ends_there_and_is_smooth(monkeypatch: pytest.Monke
     times, places = np.array(seen).T
     # Its docstring says 0.8 s; a picture every thirtieth of a second looks continuous.
     assert 0.75 <= times[-1] <= 0.9
-    assert np.diff(times).max() < 1 / 25
+    assert 1 / 45 < np.diff(times).min() <= np.diff(times).max() < 1 / 25
+    assert flushed == times.tolist()  # each is drawn before the next one
     steps = np.diff(places)
     assert (steps >= 0).all()
     assert steps[0] < 0.2 * steps.max() > steps[-1]  # it speeds up and brakes

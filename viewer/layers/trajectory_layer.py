@@ -66,7 +66,7 @@ class TrajectoryLayer(Layer):
             return
         depth = self.extent.frustum_depth
         position = pose.position_in_world + depth * pose.axis_in_world + 0.6 * depth * self.extent.up
-        self._nodes["label"] = self._canvas.scene.add_label(self._path("label"), text, position=position)
+        self._draw_label("label", text, position)
 
     def clear(self) -> None:
         """Remove all nodes."""
