@@ -393,6 +393,7 @@ def estimate_of(
         + _assumptions(query, loaded)
         + _cautions(query, verdict),
         records=tuple(records),
+        frames=info.frames,
     )
 
 

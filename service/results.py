@@ -12,7 +12,16 @@ from enum import StrEnum
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
-from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, IntrinsicsSource, Pose, frozen
+from service.types import (
+    NO_CORRECTION,
+    Camera,
+    Intrinsics,
+    IntrinsicsCorrection,
+    IntrinsicsSource,
+    Pose,
+    SceneFrame,
+    frozen,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,6 +253,8 @@ class PoseEstimate:
     timings: tuple[StageTiming, ...]
     warnings: tuple[str, ...]
     records: tuple[IterationRecord, ...]
+    frames: tuple[SceneFrame, ...] = ()
+    """Of the scene: other frames than the pose's."""
     scene_ranking: tuple[tuple[str, int], ...] = ()
     """Where several scenes were searched: each one's id, and how many matches agreed, best first."""
     advice: tuple[str, ...] = ()

@@ -223,6 +223,23 @@ class GeoAnchor:
 
 
 @dataclass(frozen=True, slots=True)
+class SceneFrame:
+    """A frame that a scene's user knows, beside the world."""
+
+    name: str
+    """`file`: the scene file's. `cameras`: that of the camera file."""
+    frame_from_world: Float64[np.ndarray, "4 4"]
+    """A similarity."""
+    decided_by: str
+    """In words: what the transform follows from."""
+    verified: bool
+    """Photos or geometry exclude other transforms."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "frame_from_world", frozen(self.frame_from_world, np.float64))
+
+
+@dataclass(frozen=True, slots=True)
 class SceneInfo:
     """What is known of a scene besides its Gaussians."""
 
@@ -249,6 +266,10 @@ class SceneInfo:
     """What positions inside of the scene are relative to; see `service/scene_origin.py`."""
     near_plane: float = 0.01
     """Units: nothing nearer to a camera is drawn."""
+    frames: tuple[SceneFrame, ...] = ()
+    """Other frames that poses are given in."""
+    cameras_doubtful: bool = False
+    """Too little evidence says that the training cameras are in this frame: views don't rely on them alone."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from small_room import write_room
 from test_estimators import photo_at, unseen_pose
-from test_reasons import BEFORE_A_WALL, FAR_OUTSIDE, middle_of_a_wall, with_any_lens, with_swapped_colours
+from test_reasons import BEFORE_A_WALL, FAR_OUTSIDE, middle_of_a_wall, with_any_lens
 
 from service.geometry import look_at, moved
 from service.interfaces import Frame, Rasterizer
@@ -104,21 +104,6 @@ def test_the_lens_is_asked_for_where_it_is_what_leaves_the_position_open(room: L
     assert "intrinsics" not in advice(room, query, BEFORE_A_WALL)
 
 
-@pytest.mark.parametrize("name", ["upper left", "lower right"])
-def test_the_quarter_that_has_changed_is_told(room: LoadedScene, name: str) -> None:
-    query = photo_at(room, TRUTH)
-    rgb, (height, width) = query.rgb.copy(), query.rgb.shape[:2]
-    part = np.s_[: height // 2, : width // 2] if name == "upper left" else np.s_[height // 2 :, width // 2 :]
-    rgb[part] = np.random.default_rng(0).integers(0, 256, rgb[part].shape, np.uint8)
-    assert f"The {name} of the photo" in advice(room, replace(query, rgb=rgb), TRUTH)
-
-
-def test_another_light_is_told_from_other_things(room: LoadedScene) -> None:
-    query = photo_at(room, TRUTH)
-    assert "in the light of" in advice(room, with_swapped_colours(query), TRUTH)
-    assert "light" not in advice(room, query, TRUTH)
-
-
 def test_a_prior_is_told_how_far_off_it_is(room: LoadedScene) -> None:
     corner = TRUTH.position_in_world + np.array([0.3, 0.4, 0.0])
     box = BoxPrior(corner, corner + 1.0)
@@ -164,13 +149,6 @@ def test_blur_grows_with_blur_whatever_the_light() -> None:
 def test_a_photo_of_something_else_is_to_be_taken_elsewhere(room: LoadedScene) -> None:
     other = replace(photo_at(room, TRUTH), rgb=np.random.default_rng(2).integers(0, 256, (240, 320, 3), np.uint8))
     assert "second photo" in advice(room, other, TRUTH)
-    # At a wrong place a few matches agree by chance: nothing that is seen there is told.
-    assert "Nothing of the scene" in advice(room, photo_at(room, TRUTH), unseen_pose(4))
-
-
-@pytest.mark.parametrize("pose", [TRUTH, BEFORE_A_WALL, FAR_OUTSIDE, unseen_pose(4)])
-def test_there_is_always_some_advice(room: LoadedScene, pose: Pose) -> None:
-    assert advice(room, photo_at(room, TRUTH), pose)
 
 
 # ------------------------------------------------------------------ places that look alike

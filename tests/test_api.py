@@ -11,7 +11,6 @@ import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 
 import service.estimators
 from service.localize import LoadedScene
-from service.types import Camera, GaussianScene, Intrinsics, IntrinsicsCorrection, NamedCamera, Pose, SceneInfo
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web import hints
 from service.web.schemas import resources
 from service.web.schemas.job_spec import job_spec, read_fields
@@ -273,29 +272,6 @@ def test_a_failing_estimator_fails_its_job_only(shared, fail, code, caplog):
     assert "secret" not in json.dumps(job)
     assert f"job {job['id']} failed" in caplog.text
     assert post(shared).json()["state"] == "succeeded"
-
-
-def test_the_photo_comes_without_the_distortion_that_the_last_record_estimates(stepping, monkeypatch):
-    app = create_app(settings(), {"room": make_scene()})
-    with serving(app) as client:
-        job = post(client, keep_photo="true").json()
-        path, jobs = f"{job['links']['photo']}?undistorted=true", app.state.app_state.jobs
-        plain = client.get(job["links"]["photo"]).content
-        assert client.get(path).content == plain
-        last = jobs.records(jobs.get(job["id"]))[-1]
-        bent = replace(last, step=replace(last.step, correction=IntrinsicsCorrection(k1=0.3)))
-        monkeypatch.setattr(jobs, "records", lambda _: [bent])
-        straight = client.get(path).content
-        assert straight != plain
-        assert [Image.open(io.BytesIO(jpeg)).size for jpeg in (straight, plain)] == [(96, 64)] * 2
-
-
-def test_an_ended_job_is_deleted_on_demand(shared):
-    job = post(shared).json()
-    deleted = shared.delete(f"{job['links']['self']}?purge=true").json()
-    assert deleted["id"] == job["id"]
-    assert_problem(shared.get(job["links"]["self"]), 404, "job_not_found")
-    assert_problem(shared.get(job["links"]["photo"]), 404, "job_not_found")
 
 
 def test_old_finished_jobs_are_forgotten(stepping):

@@ -17,7 +17,8 @@ from test_images import COLMAP_PARAMETERS
 from service.errors import CorruptScene, SceneError, SceneNotFound, UnsupportedFormat
 from service.geometry import look_at, quat_from_rotation, se3_exp, so3_exp
 from service.scene_formats import SCENE_FORMATS, load_scene
-from service.scene_formats.folder import same_photo
+from service.scene_formats.manifest import Manifest
+from service.scene_formats.training_files import read_training, same_photo
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 DATA = Path(__file__).parent / "data"
@@ -642,7 +643,8 @@ class TestColmap:
         head = struct.pack("<Q", len(known)) if kind == "bin" else b""
         (folder / f"cameras.{kind}").write_bytes(head + cameras)
         (folder / f"images.{kind}").write_bytes(head + images)
-        assert [named.camera.intrinsics for named in load_scene(tmp_path).cameras] == known
+        read = read_training(tmp_path, Manifest()).file.cameras
+        assert [named.camera.intrinsics for named in read] == known
 
     def test_transforms_win(self, tmp_path):
         folder = colmap_folder(tmp_path, "bin")

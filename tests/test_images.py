@@ -499,16 +499,3 @@ def test_an_approximate_focal_length_leaves_room_for_its_estimate():
     with pytest.raises(InvalidIntrinsics, match="at most 1e") as refused:
         intrinsics_from({**sizes, "fx": 9e6, "fy": 9e6, "trust": "approximate"})
     assert refused.value.where == "fx"
-
-
-@pytest.mark.parametrize("k1", [-0.15, 0.2])
-def test_a_jpeg_of_ours_becomes_that_of_a_pinhole(k1):
-    lens = Intrinsics(320, 240, 250.0, 250.0, 150.0, 125.0, "SIMPLE_RADIAL", (k1,))
-    x, y = 0.3, -0.25
-    bent = 1 + k1 * (x * x + y * y)  # COLMAP's SIMPLE_RADIAL
-    rows, columns = np.indices((240, 320)) + 0.5
-    dot = np.hypot(columns - 250 * x * bent - 150, rows - 250 * y * bent - 125) < 4
-    jpeg = images.encode_image(np.repeat(255 * dot.astype(np.uint8)[..., None], 3, 2))
-    straight = np.asarray(Image.open(BytesIO(images.undistorted_jpeg(jpeg, lens))))
-    place = np.argwhere(straight[..., 0] > 128).mean(0)[::-1] + 0.5
-    np.testing.assert_allclose(place, [250 * x + 150, 250 * y + 125], atol=0.5)

@@ -15,7 +15,8 @@ import pytest
 
 from service import operating_system
 from service.operating_system import limited_command, locked
-from service.scene_formats.folder import load_scene, same_photo
+from service.scene_formats.folder import load_scene
+from service.scene_formats.training_files import same_photo
 
 ROOT = Path(__file__).parents[1]
 STUDIO = ROOT / "scenes" / "studio"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from service.errors import BadInput
 from service.photos.images import read_query
-from service.scene_formats.folder import same_photo
+from service.scene_formats.training_files import same_photo
 from service.types import NamedCamera
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".webp", ".heic")

@@ -46,6 +46,15 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "on_earth": info.geo_anchor is not None,
         "training_cameras": len(scene.cameras),
         "training_size": _training_size(path, scene),
+        "frames": [
+            {
+                "name": frame.name,
+                "frame_from_world": frame.frame_from_world.tolist(),
+                "decided_by": frame.decided_by,
+                "verified": frame.verified,
+            }
+            for frame in info.frames
+        ],
         "index": _index(without_floaters(scene), rasterizer),
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
@@ -111,6 +120,10 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "geo anchor": "yes" if facts["on_earth"] else "no",
         "training cameras": str(facts["training_cameras"]),
         "training size": f"{size['px']} px (from the {size['source']})" if size["px"] else size["source"],
+        **{
+            f"frame '{frame['name']}'": f"{frame['decided_by']}{'' if frame['verified'] else ' (unverified)'}"
+            for frame in facts["frames"]
+        },
         "index": placed,
         "coverage": f"{index['coverage']:.1%} of the opaque Gaussians are seen by these views",
         "sha256": facts["sha256"],

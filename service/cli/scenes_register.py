@@ -169,7 +169,7 @@ def _beside(known: KnownPlaces, places: Path) -> list[tuple[KnownPlace, Path]]:
 
 
 def _place_of(photo: Path, known: KnownPlaces, places: Path) -> KnownPlace:
-    from service.scene_formats.folder import same_photo
+    from service.scene_formats.training_files import same_photo
 
     named = [place for place in known.places if same_photo(place.name, photo.as_posix())]
     if len(named) != 1:

@@ -9,24 +9,32 @@ are written by `numpy.save` and opened without pickle; a damaged or outdated ent
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import mmap
 import os
 import shutil
-from dataclasses import asdict, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from service.codec import decode, encode
 from service.scene_formats.folder import load_scene
 from service.scene_formats.layouts import files_of
-from service.types import Camera, GaussianScene, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
+from service.types import GaussianScene, NamedCamera, SceneInfo
 
 _VERSION = 3
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    """All of a scene but its arrays."""
+
+    info: SceneInfo
+    cameras: tuple[NamedCamera, ...]
 
 
 def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
@@ -68,10 +76,9 @@ def _key(path: Path) -> str:
 
 
 def _opened(folder: Path) -> GaussianScene:
-    facts = json.loads((folder / "scene.json").read_text("utf-8"))
+    facts = decode(_Facts, (folder / "scene.json").read_text("utf-8"))
     arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
-    cameras = tuple(_camera(camera) for camera in facts["cameras"])
-    scene = GaussianScene(**arrays, info=_info(facts["info"]), cameras=cameras)
+    scene = GaussianScene(**arrays, info=facts.info, cameras=facts.cameras)
     if len({len(array) for array in arrays.values()}) != 1:
         raise ValueError("arrays of different lengths")
     return scene
@@ -85,34 +92,7 @@ def _write(folder: Path, scene: GaussianScene) -> None:
     try:
         for name in _ARRAYS:
             np.save(draft / f"{name}.npy", getattr(scene, name), allow_pickle=False)
-        # The anchor holds an array, which `asdict` would copy but JSON can't write.
-        info = asdict(replace(scene.info, geo_anchor=None))
-        anchor = scene.info.geo_anchor
-        info["geo_anchor"] = anchor and asdict(anchor) | {"enu_from_world": anchor.enu_from_world.tolist()}
-        cameras = [
-            {
-                "name": named.name,
-                "intrinsics": asdict(named.camera.intrinsics),
-                "world_from_camera": named.camera.pose.world_from_camera.tolist(),
-            }
-            for named in scene.cameras
-        ]
-        (draft / "scene.json").write_text(json.dumps({"info": info, "cameras": cameras}), "utf-8")
+        (draft / "scene.json").write_text(encode(_Facts(scene.info, scene.cameras)), "utf-8")
         draft.replace(folder)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
-
-
-def _camera(facts: dict[str, Any]) -> NamedCamera:
-    intrinsics = facts["intrinsics"] | {"distortion": tuple(facts["intrinsics"]["distortion"])}
-    pose = Pose(np.array(facts["world_from_camera"], np.float64))
-    return NamedCamera(facts["name"], Camera(Intrinsics(**intrinsics), pose))
-
-
-def _info(facts: dict[str, Any]) -> SceneInfo:
-    for name in ("background_rgb", "up_in_world", "warnings", "origin_in_world"):
-        facts[name] = facts[name] if facts[name] is None else tuple(facts[name])
-    anchor = facts["geo_anchor"]
-    if anchor:
-        facts["geo_anchor"] = GeoAnchor(**anchor | {"enu_from_world": np.array(anchor["enu_from_world"])})
-    return SceneInfo(**facts)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
 from service.errors import CorruptScene, InvalidIntrinsics, InvalidPrior
 from service.geometry import rotation_from_quat
@@ -114,6 +115,30 @@ def _text_images(path: Path) -> list[_Image]:
         if len(next(lines, "").split()) % 3:
             raise ValueError(f"no line of points (x y id ..., or empty) follows '{words[9].strip()}' in {path.name}")
     return result
+
+
+def read_points(folder: Path) -> Float64[np.ndarray, "p 3"] | None:
+    """Return the positions in points3D; None where there is no such file, or it can't be read."""
+    binary, text = folder / "points3D.bin", folder / "points3D.txt"
+    try:
+        if binary.is_file() and binary.stat().st_size <= MAX_FILE_BYTES:
+            return _binary_points(binary.read_bytes())
+        if text.is_file() and text.stat().st_size <= MAX_FILE_BYTES:
+            rows = [line.split(maxsplit=4)[1:4] for line in _lines(text) if line.strip()]
+            return np.array(rows, np.float64).reshape(-1, 3)
+    except (struct.error, ValueError, CorruptScene):
+        pass
+    return None
+
+
+def _binary_points(data: bytes) -> Float64[np.ndarray, "p 3"]:
+    """Each point is 51 bytes (id, x y z, colour, error, length of its track), then 8 for each image that sees it."""
+    found, at = [], 8  # behind the count
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        *position, track = struct.unpack_from("<3d11xQ", data, at + 8)
+        found.append(position)
+        at += 51 + 8 * track
+    return np.array(found, np.float64).reshape(-1, 3)
 
 
 def _lines(path: Path) -> list[str]:

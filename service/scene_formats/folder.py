@@ -5,27 +5,24 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 from types import ModuleType
 
 import numpy as np
 
 from service.errors import SceneNotFound
-from service.scene_formats.colmap import read_cameras as read_colmap_cameras
+from service.scene_formats.camera_fit import CameraFit, fitted
+from service.scene_formats.frame_candidates import CameraFile
 from service.scene_formats.gaussians import checked
-from service.scene_formats.inria import ARGUMENTS, CAMERAS, background_of
-from service.scene_formats.inria import read_cameras as read_inria_cameras
-from service.scene_formats.layouts import COLMAP_FOLDER, scene_file
+from service.scene_formats.layouts import scene_file
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
-from service.scene_formats.nerfstudio import TransformsFile, transforms_path
 from service.scene_formats.recentring import extent_of, near_plane_for, origin_for, recentred
 from service.scene_formats.similarity import moved_gaussians, moved_pose
+from service.scene_formats.training_files import TrainingFiles, photos_beside, read_training
 from service.scene_origin import shifted_camera
-from service.types import GaussianScene, NamedCamera, SceneInfo
+from service.types import GaussianScene, NamedCamera, SceneFrame, SceneInfo
 
-_ELSEWHERE = (".", "sparse", "sparse/*", "colmap/sparse/*", "dense/sparse", "dense/sparse/*", "distorted/sparse/*")
-"""Where other programs put COLMAP models."""
 log = logging.getLogger(__name__)
 
 
@@ -51,10 +48,16 @@ def load_scene(
     mode = require_render_mode(manifest.render_mode or raw.render_mode or "default", file.name)
     # A bare file has neither manifest nor cameras: what lies beside it may belong to another scene.
     given = training is not None or path.is_file()
-    found = _Training(tuple(training or ())) if given else _training(path, manifest, without_photos)
-    size = manifest.training_size or _median_size(found.cameras)
-    used = found.cameras if cameras else ()
-    focal_px = _training_focal_px(used, manifest.training_size)
+    found = TrainingFiles(CameraFile(tuple(training or ()))) if given else read_training(path, manifest, without_photos)
+    size = manifest.training_size or _median_size(found.file.cameras)
+    background = manifest.background or found.background
+    fit = None
+    if cameras and not given and found.file.cameras:
+        fit = fitted(raw, found.file, photos_beside(path, background), background)
+    used = () if not cameras else fit.cameras if fit else found.file.cameras
+    focal_px = _training_focal_px(found.file.cameras if cameras else (), manifest.training_size)
+    frames = _frames(manifest, fit)
+    doubts = ("cameras unverified",) if fit and fit.is_doubtful else ()
     if manifest.world_from_scene is not None:
         raw = moved_gaussians(raw, manifest.world_from_scene)
         used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
@@ -62,22 +65,26 @@ def load_scene(
     origin = origin_for(extent)
     raw, back = recentred(raw, origin), -np.array(origin)
     used = tuple(shifted_camera(camera, back) for camera in used) if any(origin) else used
+    # Cameras that were left out count, too: by their file, since another one may fit.
+    told = used if used or not cameras else found.file.cameras
     info = SceneInfo(
         id=_scene_id(path),
         name=manifest.name or _scene_id(path),
-        sha256=_digest([file, *_parts_of(reader, file)], path, used, (found.background, size, focal_px)),
+        sha256=_digest([file, *_parts_of(reader, file)], path, told, (found.background, size, focal_px, *doubts)),
         format=reader.__name__.rsplit(".", 1)[-1],
-        background_rgb=manifest.background or found.background or (0.0, 0.0, 0.0),
-        background_is_known=bool(manifest.background or found.background),
+        background_rgb=background or (0.0, 0.0, 0.0),
+        background_is_known=bool(background),
         up_in_world=manifest.up or _up(raw.up, manifest),
         metres_per_unit=manifest.metres_per_unit,
         render_mode=mode,
         training_focal_px=focal_px,
         training_long_side_px=max(size) if size else None,
         geo_anchor=manifest.geo_anchor,
-        warnings=(*raw.warnings, *found.warnings),
+        warnings=(*raw.warnings, *found.warnings, *(fit.warnings if fit else ())),
         origin_in_world=origin,
         near_plane=near_plane_for(extent),
+        frames=frames,
+        cameras_doubtful=bool(doubts),
     )
     log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)
@@ -87,56 +94,14 @@ def _scene_id(path: Path) -> str:
     return path.resolve().name if path.is_dir() else path.stem  # resolved, since "." has no name
 
 
-def same_photo(a: str, b: str) -> bool:
-    """Whether two names may mean the same photo: one path is the tail of the other, suffixes apart.
-
-    "0001.png", "images/0001" and "./data/images/0001.jpg" are the same; "train/r_0" and "test/r_0" are not.
-    """
-    # Camera files name photos by different roots, and with or without a suffix.
-    parts = [_parts(name) for name in (a, b)]
-    shared = min(len(p) for p in parts)
-    return shared > 0 and parts[0][-shared:] == parts[1][-shared:]
-
-
-def _parts(name: str) -> tuple[str, ...]:
-    path = PurePosixPath(name.replace("\\", "/"))
-    return (*path.parts[:-1], path.stem) if path.name else path.parts
-
-
-@dataclass(frozen=True, slots=True)
-class _Training:
-    """Cameras and background of a folder's camera files, in the scene file's frame."""
-
-    cameras: tuple[NamedCamera, ...] = ()
-    background: tuple[float, float, float] | None = None
-    warnings: tuple[str, ...] = ()
-
-
-def _training(folder: Path, manifest: Manifest, without_photos: Collection[str]) -> _Training:
-    """Read the training cameras: transforms*.json, else sparse/0, of which it is made, else Inria's cameras.json."""
-
-    def keep(name: str) -> bool:
-        return not any(same_photo(name, photo) for photo in without_photos)
-
-    arguments = folder / ARGUMENTS
-    background = background_of(arguments) if arguments.is_file() else None
-    transforms = transforms_path(folder)
-    if transforms is not None:
-        file = TransformsFile.open(transforms)
-        photos = [photo for photo in file.training_photos() if keep(photo)]
-        return _Training(tuple(file.camera(photo, manifest) for photo in photos), file.background() or background)
-    if any((folder / COLMAP_FOLDER / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
-        return _Training(read_colmap_cameras(folder / COLMAP_FOLDER, keep), background)
-    if (folder / CAMERAS).is_file():
-        return _Training(read_inria_cameras(folder / CAMERAS, keep), background)
-    return _Training(background=background, warnings=_models_elsewhere(folder))
-
-
-def _models_elsewhere(folder: Path) -> tuple[str, ...]:
-    """Return a warning for each COLMAP model in a place where it is not looked for."""
-    files = [file for place in _ELSEWHERE for file in sorted(folder.glob(f"{place}/images.*"))]
-    places = dict.fromkeys(f.parent.relative_to(folder).as_posix() for f in files if f.suffix in (".bin", ".txt"))
-    return tuple(f"A COLMAP model in '{place}' is not read: move it to sparse/0." for place in places)
+def _frames(manifest: Manifest, fit: CameraFit | None) -> tuple[SceneFrame, ...]:
+    """Return the scene file's frame, and the camera file's where its cameras fit."""
+    file_from_world = np.eye(4) if manifest.world_from_scene is None else np.linalg.inv(manifest.world_from_scene)
+    frames = [SceneFrame("file", file_from_world, "the scene file", True)]
+    if fit and fit.cameras:
+        cameras_from_world = np.linalg.inv(fit.file_from_cameras) @ file_from_world
+        frames.append(SceneFrame("cameras", cameras_from_world, fit.decided_by, fit.verified))
+    return tuple(frames)
 
 
 def _parts_of(reader: ModuleType, file: Path) -> list[Path]:

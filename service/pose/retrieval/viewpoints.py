@@ -40,17 +40,21 @@ def index_cameras(
 ) -> list[Camera]:
     """Return the cameras that the view index is rendered with.
 
-    They are a spread choice of the training cameras, or, without any, places found in the scene (`view_placement`).
+    They are a spread choice of the training cameras, or, without any, places found in the scene (`view_placement`);
+    both where the cameras' frame is in doubt.
     """
-    if not scene.cameras:
+    placed = []
+    if not scene.cameras or scene.info.cameras_doubtful:
         found = find_views(scene, rasterizer, rng, config.placement)
-        return [Camera(sized(camera.intrinsics, config.render_px), camera.pose) for camera in found.cameras]
+        placed = [Camera(sized(camera.intrinsics, config.render_px), camera.pose) for camera in found.cameras]
+    if not scene.cameras:
+        return placed
     cameras = [named.camera for named in scene.cameras]
     # Rendering all of many cameras would take longer than the index itself.
     depths = [centre_depth(rasterizer, camera) for camera in cameras[:: -(-len(cameras) // config.depth_cameras)]]
     seen = [depth for depth in depths if depth > 0]
     chosen = choose_spread_poses([camera.pose for camera in cameras], float(np.median(seen)) if seen else 1.0, config)
-    return [Camera(sized(cameras[i].intrinsics, config.render_px), cameras[i].pose) for i in chosen]
+    return [Camera(sized(cameras[i].intrinsics, config.render_px), cameras[i].pose) for i in chosen] + placed
 
 
 def choose_spread_poses(

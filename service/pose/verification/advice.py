@@ -8,9 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Bool, Float, Float64
 
 from service.geometry import reprojection_error_px
 from service.interfaces import Rasterizer
@@ -30,9 +29,7 @@ class AdviceConfig:
     """From when on something is said. Shares are of the photo, or of the matches that agree with the pose."""
 
     min_inliers: int = 20
-    min_inlier_share: float = 0.25
-    """Matches that agree with the pose, and their share of all, from which on what is seen there counts as seen: where
-    12 to 30 agree by chance, that is a share of 0.04 to 0.05 (`SearchConfig.min_inlier_share`)."""
+    """Matches from which on the pose counts as the right place, and what is seen there as seen."""
     min_features: int = 30
     side_share: float = 0.85
     """Of the scene's pixels, or of the matches, in one half of the photo, that make it the only half..."""
@@ -41,7 +38,7 @@ class AdviceConfig:
     small_coverage: float = 0.25
     max_flatness: float = 0.02
     """Deviation of the recognised points from their plane, relative to the distance, up to which they are flat: a wall
-    of the tests' room is, a corner isn't."""
+    has less than 0.01."""
     near_share: float = 0.25
     """Distance to what is seen, relative to the scene's extent, below which the camera is near..."""
     near_coverage: float = 0.95
@@ -55,11 +52,6 @@ class AdviceConfig:
     wide_px: int = 192
     min_difference: float = 0.02
     """Mean difference of colours (0..1) beside the photo, from which on the places differ."""
-    min_gradients: float = 0.75
-    max_colours: float = 0.8
-    """Correlations of photo and render, between which it is the light that differs."""
-    min_contrast: float = 0.15
-    """By how much the quarter of the photo that is least like the render correlates less with it than the likest."""
     most: int = 3
     """Sentences."""
 
@@ -85,7 +77,6 @@ class _Seen:
     inliers_px: Float[np.ndarray, "n 2"]
     """Matches that agree with the pose, relative to the photo's width and height: 0..1."""
     points_in_camera: Float64[np.ndarray, "n 3"]
-    matches: int
     features: int
     distance: float
 
@@ -114,9 +105,8 @@ def advice_for(
         said += _about_prior(images, pose)
     if alternatives:
         said += _what_tells_apart(images, pose, alternatives[0], rasterizer, config)
-    if len(seen.inliers_px) >= max(config.min_inliers, config.min_inlier_share * seen.matches):
+    if len(seen.inliers_px) >= config.min_inliers:
         said += _about_view(seen, config) + _about_position(seen, verdict, scene_extent, config)
-        said = said or _about_differences(images, rendered, verdict, config)
     elif not said:
         said.append("Nothing of the scene was recognised here: take a second photo from where the scene was captured.")
     elif not images.query.prior:
@@ -144,7 +134,6 @@ def _seen(images: QueryImages, pose: Pose, rendered: RenderedView) -> _Seen:
         rendered.frame.alpha > SIGNALS.min_alpha,
         found.photo_px[inlier] / size,
         found.points_in_world[inlier] @ from_world[:3, :3].T + from_world[:3, 3],
-        len(found.photo_px),
         len(features.scores),
         typical_depth(rendered.frame),
     )
@@ -218,38 +207,6 @@ def _flatness(seen: _Seen) -> float:
     centred = points - np.median(points, axis=0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     return 1.4826 * float(np.median(np.abs(centred @ axes[-1]))) / seen.distance
-
-
-def _about_differences(
-    images: QueryImages, rendered: RenderedView, verdict: Verdict, config: AdviceConfig
-) -> list[str]:
-    """Return what about the picture is unlike the scene: its light, or one of its quarters."""
-    gradients, colours = (verdict.signals.get(name, 1.0) for name in ("gradients", "colours"))
-    if gradients > config.min_gradients and colours < config.max_colours:
-        return ["Edges agree with the scene, colours don't: take the photo in the light of the scene's photos."]
-    photo = images.resized(rendered.camera.intrinsics).astype(np.float32) / np.float32(255)
-    one, two = _edges(photo), _edges(rendered.frame.rgb)
-    y, x = (side // 2 for side in one.shape)
-    quarters = {
-        "upper left": np.s_[:y, :x],
-        "upper right": np.s_[:y, x:],
-        "lower left": np.s_[y:, :x],
-        "lower right": np.s_[y:, x:],
-    }
-    likeness = {name: float(np.corrcoef(one[part].ravel(), two[part].ravel())[0, 1]) for name, part in quarters.items()}
-    # A quarter without any edges has no correlation.
-    known = {name: value for name, value in likeness.items() if np.isfinite(value)}
-    if known and max(known.values()) - min(known.values()) > config.min_contrast:
-        worst = min(known, key=lambda name: known[name])
-        return [f"The {worst} of the photo is the least like the scene: keep what moves or has changed out of it."]
-    return ["No part of the photo is much unlike the scene: take a second photo from a few steps away."]
-
-
-def _edges(rgb: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w"]:
-    """Return the magnitude of the gradients of the brightness, smoothed so that small shifts don't matter."""
-    grey = np.asarray(cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (0, 0), 1.5))
-    across, down = (cv2.Sobel(grey, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
-    return np.asarray(np.hypot(across, down), np.float32)
 
 
 def _about_prior(images: QueryImages, pose: Pose) -> list[str]:

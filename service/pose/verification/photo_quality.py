@@ -17,7 +17,7 @@ class PhotoQualityConfig:
     long_side_px: int = 640
     """At which blur is measured, at most."""
     max_blur: float = 0.65
-    """Blur effect (0..1): 25 photos of eight scenes, some at night, have 0.23 to 0.58, blurred by 4 px of 800 0.6 to
+    """Blur effect (0..1): photos of ten scenes, some at night, have 0.23 to 0.58, blurred by 4 px of 800 0.6 to
     0.82."""
     dark: float = 0.25
     """The grey value that nine in ten pixels of a dark photo are below."""

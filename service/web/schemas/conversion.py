@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 
@@ -14,7 +15,8 @@ from service.lenses.lens_memory import RecalledLens
 from service.lenses.lens_store import StoredLens
 from service.registration.registration import Registration
 from service.results import HINTS, IterationRecord, StageTiming
-from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion
+from service.scene_formats.similarity import moved_pose
+from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion, SceneFrame
 from service.web.schemas.job_results import (
     Alternative,
     AskedOut,
@@ -40,8 +42,11 @@ from service.web.schemas.poses import (
     IntrinsicsOut,
     Matrix,
     NamedCameraOut,
+    PoseInFrame,
     PoseOut,
     RegionOut,
+    ResultPose,
+    SceneFrameOut,
     Transform,
 )
 from service.web.schemas.registrations import RegisteredOut
@@ -76,6 +81,25 @@ def pose_out(pose: Pose) -> PoseOut:
             camera_from_world=transform_out(opengl.camera_from_world),
         ),
     )
+
+
+def scene_frame_out(frame: SceneFrame) -> SceneFrameOut:
+    """Convert a frame of a scene."""
+    return SceneFrameOut(
+        name=frame.name,
+        frame_from_world=frame.frame_from_world.tolist(),
+        decided_by=frame.decided_by,
+        verified=frame.verified,
+    )
+
+
+def result_pose_out(pose: Pose, frames: Sequence[SceneFrame]) -> ResultPose:
+    """Convert a result's pose, in the world and in each frame."""
+    found = []
+    for frame in frames:
+        moved = pose_out(moved_pose(pose, frame.frame_from_world))
+        found.append(PoseInFrame(**dict(moved), frame=scene_frame_out(frame)))
+    return ResultPose(**dict(pose_out(pose)), frames=found)
 
 
 def geopose_out(anchor: GeoAnchor, pose: Pose) -> GeoPose:
@@ -261,7 +285,7 @@ def result_out(result: JobResult) -> Result:
         right_place=verdict.right_place,
         precise=verdict.precise,
         asked=verdict.asked and AskedOut(deg=verdict.asked[0], units=verdict.asked[1]),
-        pose=pose_out(estimate.pose),
+        pose=result_pose_out(estimate.pose, estimate.frames),
         alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),
         registered=result.registration and registered_out(result.registration, estimate.pose, verdict.covariance),

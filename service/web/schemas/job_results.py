@@ -15,6 +15,7 @@ from service.web.schemas.poses import (
     IntrinsicsOut,
     Matrix,
     PoseOut,
+    ResultPose,
     Transform,
 )
 from service.web.schemas.registrations import RegisteredOut
@@ -155,7 +156,7 @@ class Result(Model):
     """Probability, 0..1, that a pose in the right place is within the bounds asked for, by its covariance. `localized`
     needs 0.91."""
     asked: AskedOut | None = None
-    pose: PoseOut
+    pose: ResultPose
     """Best pose found. Use it only if `status` is `localized`."""
     alternatives: list[Alternative] = Field(default_factory=list)
     """Other poses that explain the photo, most probable first. If one of them is nearly as probable as `pose`, the

@@ -46,6 +46,32 @@ class PoseOut(Axes):
     """The same pose with OpenGL's camera axes (+y up, +z backwards), as Blender and nerfstudio use."""
 
 
+class SceneFrameOut(Model):
+    """Another frame than the world, that the scene's user knows."""
+
+    name: str
+    """`file`: the scene file's. `cameras`: that of the camera file (`transforms.json`, `sparse/0`, `cameras.json`)."""
+    frame_from_world: Matrix
+    """4x4: rotation, translation and one scale."""
+    decided_by: str
+    """In words: what the transform follows from."""
+    verified: bool
+    """Whether photos or geometry exclude other transforms; else take it as a guess."""
+
+
+class PoseInFrame(PoseOut):
+    """The same camera pose in another frame: its world axes, origin and unit."""
+
+    frame: SceneFrameOut
+
+
+class ResultPose(PoseOut):
+    """The result's camera pose, in the world and in each of the scene's other frames."""
+
+    frames: list[PoseInFrame] = Field(default_factory=list)
+    """A photo that the scene was trained with has, in the frame `cameras`, the pose that its own file has."""
+
+
 class IntrinsicsOut(Model):
     """A camera model of the upright image, in pixels."""
 

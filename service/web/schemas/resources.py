@@ -23,6 +23,7 @@ from service.web.schemas.conversion import (
     record_out,
     region_out,
     result_out,
+    scene_frame_out,
 )
 from service.web.schemas.job_spec import needs_prior, options_adapter
 from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
@@ -123,6 +124,7 @@ def scene_out(scene: SceneStatus, contents: SceneContents | None, root: str) -> 
         metres_per_unit=info and info.metres_per_unit,
         render_mode=info and info.render_mode,
         bounds_in_world=None if bounds is None else bounds.tolist(),
+        frames=[scene_frame_out(frame) for frame in info.frames] if info else [],
         warnings=list(info.warnings) if info else [],
         training_cameras=[named_camera_out(c) for c in contents.cameras] if contents else [],
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from service.scene_manager.status import SceneState
 from service.web.api_model import Model
 from service.web.problems import Problem
-from service.web.schemas.poses import NamedCameraOut
+from service.web.schemas.poses import NamedCameraOut, SceneFrameOut
 
 
 class SceneLinks(Model):
@@ -54,6 +54,8 @@ class SceneOut(SceneSummary):
     render_mode: str | None
     bounds_in_world: list[list[float]] | None
     """Lower and upper corner of an axis-aligned box: the 1 % and 99 % quantiles of the Gaussians' centres."""
+    frames: list[SceneFrameOut]
+    """Other frames that results are given in, beside the world."""
     warnings: list[str]
     training_cameras: list[NamedCameraOut]
 
