@@ -81,14 +81,17 @@ def send(photo: Photo, query: FieldQuery, seed: int) -> Sent:
 
     The randomness depends on seed, photo and number only: the rows of a photo have the same noise.
     """
+    # A checksum instead of `hash`, which differs from process to process.
     rng = np.random.default_rng([seed, zlib.crc32(query.photo.name.encode()), query.number])
     modified, told = modify(photo, query.row.modify, rng), query.row.told
+    # JPEG has no transparency.
     if modified.mask is not None:
         data = encode_image(modified.pixels(), "png")
     else:
         data = encode_image(modified.rgb, quality=JPEG_QUALITY)
         if told == "exif":
             focal = modified.sent_focal_factor * modified.focal_of_whole
+            # EXIF has whole millimetres, as cameras write them.
             data = with_focal_35mm(data, max(1, round(MM_OF_LONG_SIDE * focal)))
     return Sent(data, _sent_intrinsics(modified, told), Camera(modified.intrinsics, modified.pose))
 
@@ -110,6 +113,7 @@ def _sent_intrinsics(photo: Photo, told: Told) -> Intrinsics | None:
 def answer(one: BenchScene, photo: Photo, query: FieldQuery, seed: int, request: Request) -> dict[str, Any]:
     """Localize a query; return its line of the result file."""
     sent = send(photo, query, seed)
+    # Decoding counts: whoever sends a photo waits for it.
     wall, cpu = time.perf_counter(), time.process_time()
     read = read_query(sent.data, intrinsics=sent.intrinsics, background_rgb=one.background_rgb)
     estimate = localize(read, one.loaded, request)

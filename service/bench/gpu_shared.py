@@ -141,6 +141,7 @@ def machine(shared: Shared) -> Iterator[Row]:
 
 def every(items: Sequence[Any], count: int) -> list[Any]:
     """Return `count` items, evenly spaced over all; all of them if there are fewer."""
+    # Evenly, since neighbouring cameras of a capture see nearly the same.
     chosen = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return [items[i] for i in chosen]
 

@@ -100,6 +100,7 @@ def _by_photos(
     matcher: str,
     options: GatherOptions,
 ) -> Registration:
+    # Points that are picked by hand need no view index, which takes the longest.
     loaded = loaded_scene(scene, "view_index" if chosen else None, matcher)
     localized, missed = _localized(chosen, loaded)
     found = _registered(loaded, known, localized, picked, options)

@@ -74,6 +74,7 @@ class _File:
             raise CorruptScene(f"its JSON chunk is damaged: {str(error)[:100]}.", where=path.name) from None
         if not isinstance(tree, dict):
             raise CorruptScene("its JSON chunk must be an object.", where=path.name)
+        # The second chunk has a header of 8 bytes, too; its length is checked by each view.
         return cls(path.name, tree, data[20 + length + 8 :])
 
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
@@ -111,6 +112,7 @@ class _File:
             scale = numbers(node.get("scale", [1, 1, 1]), (3,), where)
             if abs(np.linalg.norm([x, y, z, w]) - 1) > 1e-3:
                 raise CorruptScene("its rotation is not a unit quaternion.", where=where)
+            # Columns are scaled: glTF applies the scale before the rotation.
             matrix[:3, :3] = rotation_from_quat(np.array([w, x, y, z])) * scale
             matrix[:3, 3] = numbers(node.get("translation", [0, 0, 0]), (3,), where)
         gram = matrix[:3, :3] @ matrix[:3, :3].T
@@ -150,6 +152,7 @@ class _File:
         columns = []
         for degree in range(5):
             names = [f"SH_DEGREE_{degree}_COEF_{k}" for k in range(2 * degree + 1)]
+            # Degrees come in order: after a missing one there are no others.
             if names[0] not in attribute:
                 break
             columns += [self._accessor(attribute, name, 3) for name in names]
@@ -187,6 +190,7 @@ class _File:
             or stride < dtype.itemsize * width
         ):
             raise CorruptScene("reaches beyond its buffer view.", where=where)
+        # Attributes may be interleaved; the range was checked above.
         rows = np.lib.stride_tricks.as_strided(view[offset:], (count, width * dtype.itemsize), (stride, 1))
         values = np.ascontiguousarray(rows).view(dtype).astype(np.float32)
         return values if dtype.kind == "f" else np.maximum(values / np.iinfo(dtype).max, -1).astype(np.float32)

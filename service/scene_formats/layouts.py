@@ -62,6 +62,7 @@ def newest_step(folder: Path) -> Path | None:
     for pattern in STEPS:
         inside = [p for p in folder.glob(pattern) if p.is_file() and p.parent.resolve().is_relative_to(root)]
         if inside:
+            # As numbers: step 9000 is before step 30000.
             return max(inside, key=lambda p: [int(n) for n in re.findall(r"\d+", str(p.relative_to(folder)))])
     return None
 
@@ -76,6 +77,7 @@ def files_of(path: Path) -> Iterator[Path]:
     """Yield all files that reading the scene may depend on, in no order; folders of photos are left out."""
     if path.is_file():
         yield path
+        # Such a file is one of several: the others lie beside it.
         if path.name in readable_names():
             yield from (p for p in path.parent.iterdir() if p.is_file())
         return
@@ -88,6 +90,7 @@ def _likely(folder: Path) -> list[Path]:
     """Return the files that may be the folder's scene: what only looks like one is left out where there is another."""
     named = sorted(p for p in folder.iterdir() if p.is_file() and is_scene_file(p))
     good = [p for p in named if _holds_gaussians(p)]
+    # An export beside its checkpoint is the same scene, without a pickle to be loaded.
     plain = [p for p in good if not getattr(_reader(p), "UNPICKLES", False)]
     step = newest_step(folder)
     return plain or good or ([step] if step else named)
@@ -98,6 +101,7 @@ def _holds_gaussians(path: Path) -> bool:
     with path.open("rb") as file:
         head = file.read(_PLY_HEAD_BYTES)
     if head.startswith(b"ply"):
+        # Without the data, in which any bytes may occur.
         header = head.split(b"end_header", 1)[0]
         return b"scale_0" in header or b"element chunk " in header or b"\nelement vertex" not in header
     return bool(head) and reader_for(head[:_HEAD_BYTES], suffix_of(path)) is not None

@@ -171,6 +171,7 @@ class Scenes:
         """Return a scene in memory. Raises SceneError: also why it failed to load."""
         entry = self.entry(scene_id)
         with self._lock:
+            # Also while it is loading: who is waited for is not the next to be dropped.
             entry.used = time.monotonic()
             # Not loaded again by each request: a broken file would be read again and again.
             if entry.error:
@@ -197,6 +198,7 @@ class Scenes:
             return ready
         if asked is None or isinstance(asked, str):
             return [self.entry(asked).id]
+        # A scene that is named twice is searched once.
         return list(dict.fromkeys(self.entry(scene_id).id for scene_id in asked))
 
     def acquire(self, ids: Sequence[str]) -> tuple[LoadedScene, ...]:

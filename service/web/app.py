@@ -123,6 +123,7 @@ async def _start(
 ) -> AppState:
     """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
     folder = stack.enter_context(data_folder(settings.data_dir))
+    # On disk, so that browsers stay signed in after a restart.
     keys.keep_sessions(folder / "sessions.key")
     scene_store = FolderSceneStore(
         named, folder / "scenes", settings.max_scene_bytes, allow_checkpoints=settings.upload_checkpoints
@@ -133,6 +134,7 @@ async def _start(
     store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
     lenses = SqliteLensStore(folder / "lenses.sqlite", settings.keep_lenses)
     stack.callback(lenses.close)
+    # The store is opened in any case: with none to keep it deletes what it had.
     memory = LensMemory(lenses) if settings.keep_lenses else None
     jobs = Jobs(settings.jobs, engine, store, photos, metrics, memory)
     stack.push_async_callback(to_thread.run_sync, engine.close)

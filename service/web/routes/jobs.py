@@ -131,6 +131,7 @@ class _EventStream:
     @classmethod
     def after(cls, last_event_id: str) -> _EventStream:
         """Return the state of a client whose last event had that id; an unknown id starts from the beginning."""
+        # The header is the client's: nine digits, so that no number of any length is parsed.
         found = re.fullmatch(r"(\d{1,9})\.(\d{1,9})", last_event_id)
         return cls(int(found[1]), int(found[2]) + 1) if found else cls()
 
@@ -205,6 +206,7 @@ async def job_render(
     """Render the scene from the camera of a record."""
     record = await to_thread.run_sync(app_state.jobs.record, job, None if index == "last" else index)
     seen_by = record_camera(record.step, job.photo.intrinsics, of_matches=camera == "matches")
+    # Rendered when it is asked for: few of a job's records are ever looked at.
     wanted = PictureSpec(seen_by.pose, seen_by.intrinsics)
     render = partial(app_state.engine.render, job.scene, wanted)
     return Response(await app_state.render_in_thread(job.scene, render), media_type="image/jpeg")

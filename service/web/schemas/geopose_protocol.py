@@ -138,6 +138,7 @@ def _intrinsics(reading: CameraReading) -> dict[str, Any] | None:
     where = "cameraReadings.0.params"
     if params.model not in DISTORTION_COUNTS:
         raise InvalidIntrinsics(f"unknown camera model {str(params.model)[:40]!r}.", where=f"{where}.model")
+    # COLMAP's models have one focal length or two, by their name.
     focals = 1 if params.model in ONE_FOCAL else 2
     expected = focals + 2 + DISTORTION_COUNTS[params.model]
     if len(params.modelParams) != expected or len(reading.size) != 2:
