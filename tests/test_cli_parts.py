@@ -239,7 +239,7 @@ def facts(**changes: Any) -> dict[str, Any]:
         "memory_bytes": {"scene": 2.5e8, "renderer": 4.6e7}, "bounds": [[-1.0, -2.0, -3.0], [1.0, 2.0, 3.14159]],
         "middle_98_percent": [[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]], "extent": 5.0,
         "floaters": {"found": 0, "veil": 0.0, "left_out": False}, "up": [0, 0, 1.0],
-        "metres_per_unit": 0.5, "on_earth": True, "training_cameras": 12,
+        "metres_per_unit": 0.5, "on_earth": True, "registration": 3, "training_cameras": 12,
         "training_size": {"px": 800, "source": "manifest"}, "index": index | searched, "sha256": "0" * 64,
         "warnings": ["first", "second"], "background": [0, 0, 0],
     } | changes  # fmt: skip
@@ -256,7 +256,7 @@ def test_facts_are_told_with_units() -> None:
     assert lines["floaters"] == "none"
     assert lines["up"] == "(0, 0, 1)"
     assert lines["metres per unit"] == "0.5"
-    assert lines["geo anchor"] == "yes"
+    assert (lines["geo anchor"], lines["registration"]) == ("yes", "revision 3")
     assert lines["training size"] == "800 px (from the manifest)"
     placed = "40 views, placed by the scene itself (an interior; 90 good ones of 300 tried; typical distance 2.35)"
     assert lines["index"] == placed
@@ -280,11 +280,18 @@ def test_floaters_are_told_with_what_becomes_of_them(found: int, left_out: bool,
 
 def test_what_is_unknown_is_told_as_such() -> None:
     by_cameras = {"placed_by": "training cameras", "views": 12, "coverage": 0.5}
-    changes = {"up": None, "metres_per_unit": None, "on_earth": False, "render_mode": "antialiased", "warnings": []}
+    changes = {
+        "up": None,
+        "metres_per_unit": None,
+        "on_earth": False,
+        "registration": None,
+        "render_mode": "antialiased",
+        "warnings": [],
+    }
     size = {"px": None, "source": "unknown: each photo's own, within 640 to 960"}
     lines = scene_facts.as_lines(facts(**changes, index=by_cameras, training_size=size))
     assert lines["up"] == lines["metres per unit"] == "unknown"
-    assert lines["geo anchor"] == "no"
+    assert (lines["geo anchor"], lines["registration"]) == ("no", "none")
     assert lines["format"] == "ply, antialiased"
     assert lines["training size"] == size["source"]
     assert lines["index"] == "12 views, placed by training cameras"

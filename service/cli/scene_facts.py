@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from service.cli.terminal import registrations_folder
 from service.localize import ASSUMED_TRAINING_PX, choose_rasterizer
 from service.pose.retrieval.floaters import find_floaters, without_floaters
 from service.pose.retrieval.view_placement import coverage, find_views
@@ -14,6 +15,7 @@ from service.pose.retrieval.viewpoints import index_cameras
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
+from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
 from service.types import GaussianScene
 
 
@@ -25,6 +27,8 @@ def scene_facts(path: Path) -> dict[str, Any]:
     scene = load_scene(path)
     rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(without_floaters(scene))
     info, floaters = scene.info, find_floaters(scene)
+    registration = SceneRegistrations(registrations_folder()).of(path, info)
+    told = registered_info(info, registration)
     # Quantiles: a few stray Gaussians would make the bounds meaningless.
     low, high = np.quantile(scene.means, [0.01, 0.99], axis=0) + info.origin_in_world
     facts: dict[str, Any] = {
@@ -40,10 +44,11 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "middle_98_percent": [low.tolist(), high.tolist()],
         "extent": float(np.linalg.norm(high - low)),
         "floaters": {"found": int(floaters.found.sum()), "veil": floaters.veil, "left_out": floaters.left_out},
-        "up": list(info.up_in_world) if info.up_in_world else None,
-        "metres_per_unit": info.metres_per_unit,
+        "up": list(told.up_in_world) if told.up_in_world else None,
+        "metres_per_unit": told.metres_per_unit,
         "background": list(info.background_rgb),
-        "on_earth": info.geo_anchor is not None,
+        "on_earth": told.geo_anchor is not None,
+        "registration": registration and registration.revision,
         "training_cameras": len(scene.cameras),
         "training_size": _training_size(path, scene),
         "frames": [
@@ -118,6 +123,7 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         "up": _point(facts["up"]) if facts["up"] else "unknown",
         "metres per unit": str(facts["metres_per_unit"] or "unknown"),
         "geo anchor": "yes" if facts["on_earth"] else "no",
+        "registration": f"revision {facts['registration']}" if facts["registration"] else "none",
         "training cameras": str(facts["training_cameras"]),
         "training size": f"{size['px']} px (from the {size['source']})" if size["px"] else size["source"],
         **{
