@@ -115,10 +115,16 @@ def _variance(fit: Fit) -> float:
 
 
 def _outliers(fit: Fit, evidence: Evidence, used: Sequence[int], config: ConsensusConfig) -> list[int]:
-    """Return the observations that the others contradict: externally studentized residuals, by kind."""
+    """Return the observations that the others contradict: externally studentized residuals, by kind.
+
+    Of correlated residuals, too: the test of a shift of one observation's mean (Baarda 1968).
+    """
     observations = [evidence.observations[i] for i in used]
     owners = np.concatenate([np.full(len(row.residual), row.owner) for row in fit.rows])
     shares = {(row.owner, row.kind): row.localized_share for row in fit.rows}
+    inverse = np.linalg.inv(fit.lower)
+    alone, weighted = inverse.T @ inverse, inverse.T @ fit.whitened
+    weight = inverse.T @ (np.eye(len(fit.hat)) - fit.hat) @ inverse
     found = []
     for kind in KINDS:
         mine = fit.of_kind(kind)
@@ -129,12 +135,11 @@ def _outliers(fit: Fit, evidence: Evidence, used: Sequence[int], config: Consens
             freedom = redundancy - size
             if not size or freedom < 0.9:
                 continue
-            residual = fit.whitened[block]
-            # The residual that the others' fit would leave is (I - H)^-1 r, of covariance (I - H)^-1.
-            kept = np.eye(size) - fit.hat[np.ix_(block, block)]
-            if np.linalg.eigvalsh(kept).min() < 1e-9:
+            # What the sum of squares loses if this observation may be anywhere.
+            kept = weight[np.ix_(block, block)]
+            if np.linalg.eigvalsh(kept).min() < 1e-9 * np.trace(alone[np.ix_(block, block)]):
                 continue
-            explained = float(residual @ np.linalg.solve(kept, residual))
+            explained = float(weighted[block] @ np.linalg.solve(kept, weighted[block]))
             variance = max(square - explained, 0.0) / freedom
             limit = f_quantile(1 - config.false_rejection / len(used), size, freedom)
             # Noise that is stated, in the target or by localization, is there even where the others agree better.

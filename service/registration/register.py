@@ -124,7 +124,8 @@ def _small_sample_factor(fit: Fit, evidence: Evidence, used: Sequence[int]) -> f
     if not unsure:
         return 1.0
     unknowns = free_parameters(evidence)
-    freedom = max(sum(fit.redundancy(kind) for kind in unsure), 1.0)
+    # Each kind's variance is estimated by itself: the one that is known worst counts.
+    freedom = max(min(fit.redundancy(kind) for kind in unsure), 1.0)
     return unknowns * f_quantile(_REGION, unknowns, freedom) / chi_square_quantile(_REGION, unknowns)
 
 

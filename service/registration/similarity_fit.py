@@ -102,6 +102,8 @@ class Fit:
     """Residuals over their standard deviations, uncorrelated if the model holds; block by block as `rows`."""
     jacobian: Float64[np.ndarray, "m 7"]
     """Whitened likewise."""
+    lower: Float64[np.ndarray, "m m"]
+    """Cholesky factor of the residuals' covariance, which whitens them."""
     hat: Float64[np.ndarray, "h h"]
     """Projection onto the columns of `jacobian`; empty before the minimum is reached."""
 
@@ -206,7 +208,7 @@ def _evaluated(evidence: Evidence, used: Sequence[int], similarity: Similarity, 
         at = end
     lower = np.linalg.cholesky(covariance) if size else covariance
     whitened, white_jacobian = np.linalg.solve(lower, residual), np.linalg.solve(lower, jacobian)
-    return Fit(similarity, noise, tuple(rows), whitened, white_jacobian, _NO_HAT)
+    return Fit(similarity, noise, tuple(rows), whitened, white_jacobian, lower, _NO_HAT)
 
 
 def _rows(evidence: Evidence, used: Sequence[int], similarity: Similarity, noise: Noise):
