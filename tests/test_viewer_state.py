@@ -51,7 +51,7 @@ def display(count: int | None, *, shown: bool = False) -> JobDisplay:
     if count is not None:
         job = Mock(outcome=None, truth=None, scene="ball", photo_step=None, photo=None)
         job.camera = lambda record: record
-        stream = SimpleNamespace(id="j", attempt=1, records=records(count), job=job, error="")
+        stream = SimpleNamespace(id="j", attempt=1, records=records(count), job=job, error="", photo=lambda: None)
     found = JobDisplay(controls, scene, scene_display, Mock(), Mock())
     found.stream = stream  # type: ignore[assignment]
     found.step = Mock(empty=not shown)
@@ -117,6 +117,7 @@ def test_what_needs_a_record_does_nothing_without_one(clock: Clock, count: int |
     there = bool(count)
     assert bool(job._scene.fly_to.called) is there
     assert bool(job._scene.look_through.called) is there
+    assert [call.args[0] for call in job._scene_display.show_photo.call_args_list] == [None] * (2 if there else 0)
     assert bool(job.step.redraw.called) is there
     assert bool(job.step.show.called) is there
     if there:
