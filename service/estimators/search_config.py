@@ -74,6 +74,17 @@ class SearchConfig:
     """Doubts that don't speak against a fisheye's answer."""
     ambiguity_photo_px: int = 256
     """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
+    max_rival_ratio: float = 0.9
+    """Dissimilarity of photo and render at a pose that only colours speak against, relative to that at its mirror image
+    and at places that look like it: with less it is accepted. Of photos of a scene by another trainer right poses have
+    0.45 to 0.86, their mirror images 1.16 and more."""
+    rival_views: int = 5
+    min_mirror_inliers: int = 30
+    """Views that a render's mirror image is matched with to find its place, and inliers from which on that is a rival:
+    a mirrored photo whose wrong pose a hundred matches support has more at the right one."""
+    min_rival_gradients: float = 0.8
+    """Correlation of the gradients of the better half from which on another pose is a rival: less shows something
+    else."""
     max_ambiguous_loss_ratio: float = 3.0
     """Times the answer's mean residual, after one refinement: beyond it an ambiguous hypothesis is none."""
 

@@ -35,7 +35,7 @@ from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
 from service.pose.verification.ambiguity import explains_whole_photo, rank_answers
 from service.pose.verification.appearance import appearance
-from service.pose.verification.gate import verify
+from service.pose.verification.gate import VerificationConfig, verify
 from service.pose.verification.mirror_images import dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import IntrinsicsCorrection, Query
@@ -120,11 +120,16 @@ class SearchState:
         return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
 
     def verify(
-        self, found: RefinedPose, pixels_may_decide: bool = False, refinement_config: RefinementConfig | None = None
+        self,
+        found: RefinedPose,
+        pixels_may_decide: bool = False,
+        refinement_config: RefinementConfig | None = None,
+        is_unique: bool = False,
     ) -> Verdict:
         """Return the gate's verdict on a pose, from the render that refinement ended with if it is near enough.
 
-        `refinement_config`: that of the refinement that led to the pose, if it isn't the usual one.
+        `refinement_config`: that of the refinement that led to the pose, if it isn't the usual one. `is_unique`: no
+        other place is like this one, though the scene may repeat itself.
         """
         config = self.config.verification
         if refinement_config:
@@ -132,8 +137,15 @@ class SearchState:
         images = self.images.corrected(found.correction)
         rendered, refinement = found.view_at_pose(images, self.renderer)
         # A pose refined from a prior has no matches behind it.
-        matches, unique = found.num_inliers or 0, not self.tools.prepared.repeats_itself
+        matches, unique = found.num_inliers or 0, is_unique or not self.tools.prepared.repeats_itself
         return verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
+
+    def appearance_at(self, found: RefinedPose) -> dict[str, float]:
+        """Return how alike photo and render are at a pose."""
+        images = self.images.corrected(found.correction)
+        rendered, _ = found.view_at_pose(images, self.renderer)
+        size = rendered.camera.intrinsics
+        return appearance(images.resized(size), rendered.frame, images.valid_mask(size))
 
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""
@@ -180,10 +192,21 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     if state.best is None or verdict.rank > state.best.verdict.rank:
         state.best = VerifiedPose(found, verdict, stage.variant)
     # Poses are verified in one size, whatever led to them; refinement from few matches may not have arrived.
-    conclusive = verdict.reason in CONCLUSIVE_DOUBTS and outcome.unmatched is None
-    state.finished = verdict.status is Status.LOCALIZED or conclusive
+    conclusive = verdict.reason in CONCLUSIVE_DOUBTS or only_colours_doubt(verdict, state.config.verification)
+    state.finished = verdict.status is Status.LOCALIZED or (conclusive and outcome.unmatched is None)
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))
+
+
+def only_colours_doubt(verdict: Verdict, config: VerificationConfig) -> bool:
+    """Return whether matches and gradients support a refused pose, so that another search would find the same.
+
+    That is a pose which is accepted where the light may be another; in a scene that repeats itself colours are needed.
+    """
+    signals, model = verdict.signals, config.model
+    if verdict.status is Status.LOCALIZED or verdict.reason is not Reason.RENDER_MISMATCH:
+        return False
+    return model.probability(signals) >= config.min_localized and not model.below_floor(signals, light_may_differ=True)
 
 
 def _may_be_in_other_light(state: SearchState, verdict: Verdict) -> bool:
@@ -237,9 +260,7 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
         return False
     if not state.tools.prepared.like_its_mirror_image or not may_be_mirrored(best.verdict.signals, config.mirror):
         return False
-    # The intrinsics that were estimated hold for the mirror image, too.
-    query = mirrored_query(state.images.query.corrected(best.refined.correction))
-    mirrored = SearchState.of(replace(query, prior=None, region=None), state.tools, config)
+    mirrored = mirror_image_of(state, best)
     # Mirroring turns a rotation into its opposite.
     variant = replace(best.variant, roll_steps_45deg=-best.variant.roll_steps_45deg % 8)
     search = _search_mirrored(mirrored, variant, config.mirror.max_loss_ratio * best.loss)
@@ -251,13 +272,16 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     # Both may be wrong: a poor answer is no evidence for the mirror image.
     if not state.finished and mirrored.verify(found).status is not Status.LOCALIZED:
         return False
-    images = mirrored.images.corrected(found.correction)
-    rendered, _ = found.view_at_pose(images, mirrored.renderer)
-    size = rendered.camera.intrinsics
-    signals = appearance(images.resized(size), rendered.frame, images.valid_mask(size))
-    is_mirrored = dissimilarity(signals) < dissimilarity(best.verdict.signals)
+    is_mirrored = dissimilarity(mirrored.appearance_at(found)) < dissimilarity(best.verdict.signals)
     yield replace(best.record("check_mirror"), mirrored=is_mirrored)
     return is_mirrored
+
+
+def mirror_image_of(state: SearchState, answer: VerifiedPose) -> SearchState:
+    """Return the state of a search for the photo's mirror image, through the lens that the answer has."""
+    # The intrinsics that were estimated hold for the mirror image, too.
+    query = mirrored_query(state.images.query.corrected(answer.refined.correction))
+    return SearchState.of(replace(query, prior=None, region=None), state.tools, state.config)
 
 
 def _search_mirrored(
@@ -285,15 +309,13 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
     if whole and not state.tools.prepared.repeats_itself:
         return
     images = state.images.corrected(answer.refined.correction)
-    frame = state.renderer.at(images.query, answer.refined.pose).frame
-    # The distance that decides whether two poses count as different; the background has none.
-    distance = float(np.median(frame.median_depth[frame.alpha > VIEWS.min_alpha]))
+    seen = seen_from(state, answer)
     answers = [answer]
-    for other in _ambiguous_hypotheses(state, images, PoseAtDistance(answer.refined.pose, distance), whole):
-        found = yield from _refine_ambiguous(state, other, answer)
+    for other in hypotheses_of_photo(state, images, seen, whole):
+        found = yield from refine_ambiguous(state, other, answer)
         ambiguity = state.config.ambiguity
         if found is None or not all(
-            PoseAtDistance(found.pose, distance).differs_from(known.refined.pose, ambiguity) for known in answers
+            replace(seen, pose=found.pose).differs_from(known.refined.pose, ambiguity) for known in answers
         ):
             continue
         verdict = state.verify(found)
@@ -303,7 +325,15 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
         yield _ranked(state, answers)
 
 
-def _ambiguous_hypotheses(
+def seen_from(state: SearchState, answer: VerifiedPose) -> PoseAtDistance:
+    """Return the answer's pose with the median distance to what it sees, which decides whether two poses differ."""
+    images = state.images.corrected(answer.refined.correction)
+    frame = state.renderer.at(images.query, answer.refined.pose).frame
+    # The background has no distance.
+    return PoseAtDistance(answer.refined.pose, float(np.median(frame.median_depth[frame.alpha > VIEWS.min_alpha])))
+
+
+def hypotheses_of_photo(
     state: SearchState, images: QueryImages, answer: PoseAtDistance, whole: bool
 ) -> Generator[AbsolutePose, None, None]:
     """Yield poses that many matches agree on which the answer doesn't explain."""
@@ -322,7 +352,7 @@ def _ambiguous_hypotheses(
     )
 
 
-def _refine_ambiguous(
+def refine_ambiguous(
     state: SearchState, other: AbsolutePose, answer: VerifiedPose
 ) -> Generator[IterationRecord, None, RefinedPose | None]:
     """Refine an ambiguous hypothesis, unless its residual on a first render is much greater than the answer's."""

@@ -25,6 +25,7 @@ import numpy as np
 
 from service.errors import InvalidOptions
 from service.estimators.lens_check import check_lens
+from service.estimators.rivals import check_rivals
 from service.estimators.search_config import SEARCH, SearchConfig
 from service.estimators.search_state import (
     SearchState,
@@ -102,7 +103,10 @@ def run(
 def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
     """Look for reasons to doubt the answer of a search."""
     mirrored = yield from check_mirror(state)
-    if state.finished and not mirrored:
+    if not state.finished or mirrored:
+        return
+    is_unique = yield from check_rivals(state)
+    if not is_unique:
         yield from check_ambiguity(state)
 
 
