@@ -10,16 +10,18 @@ import pytest
 from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
+from service.estimators.search_config import SEARCH
 from service.geometry import moved, pose_distance, project, transformed
 from service.interfaces import Features, Matcher
 from service.jobs.model import JobResult
 from service.localize import LoadedScene, Request, localize
+from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.rendered_views import View
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
 from service.pose.verification.ambiguity import rank_answers
-from service.results import Reason, StageTiming, Status
+from service.results import PoseEstimate, Reason, StageTiming, Status
 from service.tracking import Tracker
-from service.types import Camera, Intrinsics, Pose
+from service.types import Camera, Intrinsics, Pose, Query
 from service.web.schemas.conversion import result_out
 
 
@@ -79,6 +81,55 @@ def test_answers_are_ranked_by_what_they_leave_unexplained() -> None:
     assert [number for number, _ in ranked] == [1, 0]
     assert [probability for _, probability in ranked] == pytest.approx([0.619, 0.380], abs=0.001)
     assert [number for number, _ in rank_answers([0.02, 0.04])] == [0]
+
+
+# ------------------------------------------------------------------ a pose that only colours speak against
+
+
+@pytest.fixture(scope="module")
+def symmetric(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    """A room that is nearly its own mirror image, taken to repeat itself: colours decide."""
+    folder = tmp_path_factory.mktemp("symmetric")
+    loaded = LoadedScene.load(write_room(folder / "room", symmetric=True), cache_dir=folder / "cache")
+    loaded._prepared["view_index"] = replace(loaded.prepare("view_index"), repeats_itself=True)
+    return loaded
+
+
+def recoloured(photo: Query) -> Query:
+    """Each channel has much of the next one's light."""
+    mixed = photo.rgb @ np.array([[0.55, 0.45, 0], [0, 0.55, 0.45], [0.45, 0, 0.55]]).T
+    return replace(photo, rgb=np.clip(mixed, 0, 255).astype(np.uint8))
+
+
+def stages(found: PoseEstimate) -> set[str]:
+    return {record.stage for record in found.records}
+
+
+def test_other_colours_are_accepted_where_the_mirror_image_fits_less(symmetric: LoadedScene) -> None:
+    truth = unseen_pose()
+    photo = recoloured(photo_at(symmetric, truth))
+    found = localize(photo, symmetric)
+    assert found.verdict.signals["local_colour_correlation"] < 0.935  # the floor; seen: 0.927
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+    assert "check_rivals" in stages(found)
+    # Another search would find the same pose.
+    assert not stages(found) & {"retrieve_full_size", "retrieve_more_views", "retrieve_free_views", "sample_poses"}
+
+    other = localize(mirrored_query(photo), symmetric)
+    assert (other.verdict.status, other.verdict.reason) == (Status.UNCERTAIN, Reason.MIRRORED)
+
+
+def test_other_colours_are_refused_where_the_mirror_image_fits_nearly_as_well(symmetric: LoadedScene) -> None:
+    config = replace(SEARCH, max_rival_ratio=0.5)
+    photo = recoloured(photo_at(symmetric, unseen_pose()))
+    verdict = localize(photo, symmetric, Request(config=config)).verdict
+    assert (verdict.status, verdict.reason) == (Status.UNCERTAIN, Reason.RENDER_MISMATCH)
+
+
+def test_other_colours_are_refused_where_another_place_fits_as_well(repeated: LoadedScene) -> None:
+    photo = recoloured(photo_at(repeated, unseen_pose()))
+    assert localize(photo, repeated).verdict.status is Status.UNCERTAIN
 
 
 # ------------------------------------------------------------------ which hypotheses are looked for
