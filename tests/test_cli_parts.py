@@ -241,7 +241,7 @@ def facts(**changes: Any) -> dict[str, Any]:
         "floaters": {"found": 0, "veil": 0.0, "left_out": False}, "up": [0, 0, 1.0],
         "metres_per_unit": 0.5, "on_earth": True, "registration": 3, "training_cameras": 12,
         "training_size": {"px": 800, "source": "manifest"}, "index": index | searched, "sha256": "0" * 64,
-        "warnings": ["first", "second"], "background": [0, 0, 0],
+        "warnings": ["first", "second"], "background": [0, 0, 0], "frames": [],
     } | changes  # fmt: skip
 
 
@@ -257,6 +257,9 @@ def test_facts_are_told_with_units() -> None:
     assert lines["up"] == "(0, 0, 1)"
     assert lines["metres per unit"] == "0.5"
     assert (lines["geo anchor"], lines["registration"]) == ("yes", "revision 3")
+    frames = [{"name": name, "decided_by": "transforms.json", "verified": name == "a"} for name in "ab"]
+    named = scene_facts.as_lines(facts(frames=frames))
+    assert (named["frame 'a'"], named["frame 'b'"]) == ("transforms.json", "transforms.json (unverified)")
     assert lines["training size"] == "800 px (from the manifest)"
     placed = "40 views, placed by the scene itself (an interior; 90 good ones of 300 tried; typical distance 2.35)"
     assert lines["index"] == placed
