@@ -183,7 +183,7 @@ def test_a_renderer_that_cannot_run_is_an_error(room, capsys, monkeypatch):
 
 
 def test_unknown_part(room):
-    with pytest.raises(UnknownName, match="no part 'speed'"):
+    with pytest.raises(UnknownName, match="unknown part 'speed'"):
         gpu.run(room, names=["speed"])
 
 

@@ -189,7 +189,7 @@ def test_truth_moves_with_the_scene(tmp_path: Path) -> None:
 
 
 def test_what_is_no_data_set_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(UnknownName, match=f"no layout 'tum'; known: auto, {', '.join(LAYOUTS)}"):
+    with pytest.raises(UnknownName, match=f"unknown layout 'tum'; known: auto, {', '.join(LAYOUTS)}"):
         read_data_set(tmp_path, "tum")
     with pytest.raises(SceneNotFound, match="known: nerf_synthetic, llff"):
         read_data_set(tmp_path)

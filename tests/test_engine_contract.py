@@ -245,7 +245,7 @@ def test_errors_keep_their_kind(engine, held):
     with pytest.raises(RuntimeError):
         engine.localize(task(held, "y", fail="bug"), nothing)
     engine.release(held.token)
-    with pytest.raises(SceneNotReady, match="not in memory"):
+    with pytest.raises(SceneNotReady, match="were unloaded"):
         engine.localize(task(held, "z"), nothing)
 
 

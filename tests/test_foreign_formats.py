@@ -230,7 +230,7 @@ class TestSog:
         (folder / "huge.webp").write_bytes(b"RIFF0000WEBPVP8L0000\x2f" + size + bytes(40))
         (folder / "outside.webp").symlink_to(FILES.parent / "rotated.heic")
         for old, new, says in [
-            ('"means_l.webp"', '"../means_l.webp"', "no image"),
+            ('"means_l.webp"', '"../means_l.webp"', "not found beside it"),
             ('"means_l.webp"', '"outside.webp"', "link out of"),
             ('"means_l.webp"', '"huge.webp"', "9000 x 9000 pixels"),
             ('"version":2', '"version":3', "SOG version 3"),
