@@ -286,12 +286,14 @@ def localize_in_scene(
     # Before verification: its renders are not the estimator's.
     renders, last = tally.count, trace.records[-1]
     # The intrinsics belong to the pose, in the result and in its verification.
-    query = taken_through(query, last.lens) if last.lens else query.corrected(last.correction)
-    verdict = (
-        answer.verdict if answer else render_and_verify(QueryImages(query, loaded.matcher), last.pose, tools.rasterizer)
-    )
+    if last.lens:
+        images = QueryImages(taken_through(query, last.lens), loaded.matcher)
+    else:
+        images = QueryImages(query, loaded.matcher).corrected(last.correction)
+    query = images.query
+    verdict = answer.verdict if answer else render_and_verify(images, last.pose, tools.rasterizer)
     verdict = _qualified(verdict, last, trace.exhausted)
-    advice = _advice(query, loaded, verdict, last, tools.rasterizer)
+    advice = _advice(images, loaded, verdict, last, tools.rasterizer)
     timings = _timings(trace.records, clock)
     found = estimate_of(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
@@ -300,14 +302,14 @@ def localize_in_scene(
 
 
 def _advice(
-    query: Query, loaded: LoadedScene, verdict: Verdict, last: IterationRecord, rasterizer: Rasterizer
+    images: QueryImages, loaded: LoadedScene, verdict: Verdict, last: IterationRecord, rasterizer: Rasterizer
 ) -> tuple[str, ...]:
     """Return what would help a photo that isn't localized; for one that is, nothing is measured."""
     if verdict.status is Status.LOCALIZED:
         return ()
     others = () if last.alternatives is None else tuple(map(Pose, last.alternatives.world_from_camera))
     extent = content_extent(loaded.scene.means)
-    return advice_for(QueryImages(query, loaded.matcher), last.pose, rasterizer, verdict, others, extent)
+    return advice_for(images, last.pose, rasterizer, verdict, others, extent)
 
 
 def asked_of(query: Query, loaded: LoadedScene, request: Request) -> Query:

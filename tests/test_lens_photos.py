@@ -13,14 +13,17 @@ import pytest
 from api_server import ROOT
 from PIL import Image
 
+import service.localize
+from service.accuracy import Accuracy
 from service.estimators.search_config import SEARCH
 from service.geometry import pose_distance, se3_log
 from service.localize import LoadedScene, Request, localize
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose import lens_prior
+from service.pose.features.query_images import QueryImages
 from service.results import PoseEstimate, Reason, Status
-from service.types import Intrinsics, Pose
+from service.types import Camera, Intrinsics, Pose
 
 STUDIO = ROOT / "scenes" / "studio"
 TRUTH = {entry["photo"]: entry for entry in json.loads((STUDIO / "truth.json").read_text())}
@@ -102,6 +105,18 @@ def test_an_untold_distortion_is_estimated_with_the_pose(studio: LoadedScene, na
         assert found.intrinsics.model == "SIMPLE_RADIAL"
         assert found.intrinsics.distortion[0] == pytest.approx(k1, abs=0.015)
         assert found.intrinsics.fx == pytest.approx(taken.fx, rel=0.01)
+
+
+def test_advice_looks_at_the_photo_without_its_distortion(studio: LoadedScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[QueryImages] = []
+    monkeypatch.setattr(service.localize, "advice_for", lambda images, *_: seen.append(images) or ())
+    query = read_query(jpeg(through_lens(NAMES[0], -0.08)[0]))
+    found = localize(query, studio, Request(accuracy=Accuracy(units=1e-6)))
+    assert found.verdict.reason in (Reason.POSITION_UNCERTAIN, Reason.FOCAL_UNCERTAIN)
+    size = seen[0].query.intrinsics
+    render = studio.rasterizer.render([Camera(size, found.pose)])[0].rgb
+    straight, sent = (np.abs(rgb / 255 - render).mean() for rgb in (seen[0].resized(size), query.rgb))
+    assert straight < 0.6 * sent  # 0.43 was seen
 
 
 @pytest.mark.parametrize("factor", [0.6, 1.67])
