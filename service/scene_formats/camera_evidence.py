@@ -68,7 +68,7 @@ class Evidence:
     geometry: float
     """0..1: share of the points that some camera sees, less where little is covered or sizes are unlikely."""
     correlation: float | None
-    """Median over the photos, -1..1; None without photos."""
+    """Mean over the photos, -1..1; None without photos. A median would be too rough to rank what hardly differs."""
     surrounded: bool = False
     """The scene fills the images, and each camera sees a part of it only."""
 
@@ -114,7 +114,7 @@ def evidence(
     covered = min(1.0, float(np.quantile(coverage, config.least_covering)) / config.full_coverage)
     geometry = float(seen.mean()) * covered * _likelihood(float(np.median(sizes_px)), config)
     surrounded = float(np.median(coverage)) >= config.filled and float(np.median(shares)) <= config.part
-    return Evidence(geometry, float(np.median(correlations)) if correlations else None, surrounded)
+    return Evidence(geometry, float(np.mean(correlations)) if correlations else None, surrounded)
 
 
 def _likelihood(size_px: float, config: EvidenceConfig) -> float:

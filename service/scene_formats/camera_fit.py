@@ -36,11 +36,12 @@ class FitConfig:
     alike: float = 0.03
     """Correlations that differ by less are compared again, more finely."""
     same: float = 1e-4
-    """Of those the likelier candidate is taken where they differ by less."""
+    simple: float = 0.015
+    """Of those the likelier candidate is taken where they differ by less: of normalizations, and of what is simpler."""
     clear_correlation: float = 0.33
-    """Of the cameras as they are, coarsely: nothing else is tried."""
+    """Of the cameras as they are, coarsely: nothing else is tried; and what anything else needs."""
     tie: float = 0.015
-    """Of correlations as coarse as the first ones."""
+    """Of correlations as coarse as those; of right cameras' disturbances the best was 0.009 better (fox)."""
     plausible: float = 0.3
     """Geometry of cameras without photos that see a scene; wrong ones have 0 to 0.25 in rooms."""
     alike_share: float = 0.9
@@ -113,9 +114,13 @@ def _by_photos(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config: 
     best = max(found.score for found, _ in finer)
     alike = [(trial.evidence(c, config.finest), c) for found, c in finer if found.score >= best - config.alike]
     most = max(found.score for found, _ in alike)
-    chosen = next(c for found, c in alike if found.score >= most - config.same)
+    # Normalizations are many: one of them may be better by chance than what is simple and right.
+    chosen = next(
+        c for found, c in alike if found.score >= most - (config.same if c.is_normalization else config.simple)
+    )
     fine = next(found for found, c in finer if c is chosen)
-    if trial.is_peak(chosen, fine, config.fine):
+    is_clear = not chosen.name or fine.score >= config.clear_correlation
+    if is_clear and trial.is_peak(chosen, fine, config.fine, config.tie):
         return trial.fit(chosen, fine, verified=True)
     first = finer[0][0]
     if first.geometry >= config.plausible and first.score >= best - config.alike:

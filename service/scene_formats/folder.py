@@ -14,10 +14,10 @@ import numpy as np
 from service.errors import SceneNotFound
 from service.scene_formats.camera_fit import CameraFit, fitted
 from service.scene_formats.frame_candidates import CameraFile
-from service.scene_formats.gaussians import checked
+from service.scene_formats.gaussians import RawGaussians, checked
 from service.scene_formats.layouts import scene_file
 from service.scene_formats.manifest import MANIFEST, Manifest, read_manifest, require_render_mode
-from service.scene_formats.recentring import extent_of, near_plane_for, origin_for, recentred
+from service.scene_formats.recentring import Extent, extent_of, near_plane_for, origin_for, recentred
 from service.scene_formats.similarity import moved_gaussians, moved_pose
 from service.scene_formats.training_files import TrainingFiles, photos_beside, read_training
 from service.scene_origin import shifted_camera
@@ -49,42 +49,32 @@ def load_scene(
     # A bare file has neither manifest nor cameras: what lies beside it may belong to another scene.
     given = training is not None or path.is_file()
     found = TrainingFiles(CameraFile(tuple(training or ()))) if given else read_training(path, manifest, without_photos)
+    listed = found.file.cameras if cameras else ()
     size = manifest.training_size or _median_size(found.file.cameras)
     background = manifest.background or found.background
-    fit = None
-    if cameras and not given and found.file.cameras:
-        fit = fitted(raw, found.file, photos_beside(path, background), background)
-    used = () if not cameras else fit.cameras if fit else found.file.cameras
-    focal_px = _training_focal_px(found.file.cameras if cameras else (), manifest.training_size)
-    frames = _frames(manifest, fit)
-    doubts = ("cameras unverified",) if fit and fit.is_doubtful else ()
-    if manifest.world_from_scene is not None:
-        raw = moved_gaussians(raw, manifest.world_from_scene)
-        used = tuple(_moved(camera, manifest.world_from_scene) for camera in used)
-    extent = extent_of(raw)
-    origin = origin_for(extent)
-    raw, back = recentred(raw, origin), -np.array(origin)
-    used = tuple(shifted_camera(camera, back) for camera in used) if any(origin) else used
-    # Cameras that were left out count, too: by their file, since another one may fit.
-    told = used if used or not cameras else found.file.cameras
+    fit = None if given or not listed else fitted(raw, found.file, photos_beside(path, background), background)
+    # Cameras that were left out count in the digest, too: by their file, since another one may fit.
+    raw, used, extent, origin = _in_world(raw, fit.cameras if fit else listed, manifest)
+    facts = (found.background, size, _training_focal_px(listed, manifest.training_size))
+    facts += ("cameras unverified",) if fit and fit.is_doubtful else ()
     info = SceneInfo(
         id=_scene_id(path),
         name=manifest.name or _scene_id(path),
-        sha256=_digest([file, *_parts_of(reader, file)], path, told, (found.background, size, focal_px, *doubts)),
+        sha256=_digest([file, *_parts_of(reader, file)], path, used or listed, facts),
         format=reader.__name__.rsplit(".", 1)[-1],
         background_rgb=background or (0.0, 0.0, 0.0),
         background_is_known=bool(background),
         up_in_world=manifest.up or _up(raw.up, manifest),
         metres_per_unit=manifest.metres_per_unit,
         render_mode=mode,
-        training_focal_px=focal_px,
+        training_focal_px=facts[2],
         training_long_side_px=max(size) if size else None,
         geo_anchor=manifest.geo_anchor,
         warnings=(*raw.warnings, *found.warnings, *(fit.warnings if fit else ())),
         origin_in_world=origin,
         near_plane=near_plane_for(extent),
-        frames=frames,
-        cameras_doubtful=bool(doubts),
+        frames=_frames(manifest, fit),
+        cameras_doubtful=bool(fit and fit.is_doubtful),
     )
     log.info("loaded %s: %d Gaussians, %d training cameras", file.name, len(raw.means), len(used))
     return GaussianScene(raw.means, raw.quats, raw.scales, raw.opacities, raw.sh, info, used)
@@ -92,6 +82,20 @@ def load_scene(
 
 def _scene_id(path: Path) -> str:
     return path.resolve().name if path.is_dir() else path.stem  # resolved, since "." has no name
+
+
+def _in_world(
+    raw: RawGaussians, cameras: tuple[NamedCamera, ...], manifest: Manifest
+) -> tuple[RawGaussians, tuple[NamedCamera, ...], Extent, tuple[float, float, float]]:
+    """Return Gaussians and cameras in the world, less an origin; the Gaussians' extent before that; the origin."""
+    if manifest.world_from_scene is not None:
+        raw = moved_gaussians(raw, manifest.world_from_scene)
+        cameras = tuple(_moved(camera, manifest.world_from_scene) for camera in cameras)
+    extent = extent_of(raw)
+    origin = origin_for(extent)
+    if any(origin):
+        cameras = tuple(shifted_camera(camera, -np.array(origin)) for camera in cameras)
+    return recentred(raw, origin), cameras, extent, origin
 
 
 def _frames(manifest: Manifest, fit: CameraFit | None) -> tuple[SceneFrame, ...]:

@@ -93,6 +93,8 @@ class Candidate:
     file_from_cameras: Float64[np.ndarray, "4 4"] | None = None
     """None: the camera file has the scene file's frame."""
     is_model_frame: bool = False
+    is_normalization: bool = False
+    """It follows from the cameras; several that hardly differ from each other, or from no change, do."""
 
     def then(self, moved_from_file: Float64[np.ndarray, "4 4"]) -> Candidate:
         """Return the same with its cameras moved by a similarity."""
@@ -142,7 +144,7 @@ def candidates(file: CameraFile) -> Iterator[Candidate]:
     for axes in ("given", "flipped"):
         poses = corrected(file.all_poses, axes, file.stored_from_opencv)
         for name, similarity in _normalizations(poses, file):
-            yield Candidate(_both(PLAIN[axes], name), axes, similarity)
+            yield Candidate(_both(PLAIN[axes], name), axes, similarity, is_normalization=True)
 
 
 def _normalizations(

@@ -122,8 +122,9 @@ def _depths_in_view(points: Float64[np.ndarray, "n 3"], camera: Camera) -> Float
     """Return the z-depths of the points in a camera's image; infinite for the others."""
     x, y, z = transformed(camera.pose.camera_from_world, points).T
     lens = camera.intrinsics
-    # Behind the camera neither condition is asked.
-    column, row = (lens.fx * x / np.abs(z) + lens.cx), (lens.fy * y / np.abs(z) + lens.cy)
+    # Behind the camera, and beside it, neither condition is asked.
+    away = np.where(z == 0, 1.0, np.abs(z))
+    column, row = (lens.fx * x / away + lens.cx), (lens.fy * y / away + lens.cy)
     inside = (z > 0) & (column > 0) & (column < lens.width) & (row > 0) & (row < lens.height)
     return np.where(inside, z, np.inf)
 
