@@ -175,7 +175,7 @@ def _area_around(
     """
     keys = _keys(np.floor(means[asked] / (side / 3)).astype(np.int64))
     cells, cell_of = np.unique(keys, return_inverse=True)
-    steps = _keys(np.stack(np.indices((3, 3, 3)), -1).reshape(-1, 3)) - _keys(np.ones((1, 3), np.int64))
+    steps = _keys(np.indices((3, 3, 3)).reshape(3, -1).T.astype(np.int64)) - _keys(np.ones((1, 3), np.int64))
     near = np.unique(cells[:, None] + steps)
     # At most a quarter full, so that looking up takes a step or two.
     table = np.full(1 << int(np.ceil(np.log2(4 * len(near)))), -1, np.int64)
