@@ -34,8 +34,10 @@ from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.features.untold_background import WHITE, has_white_border, shows_background
 from service.pose.retrieval.floaters import without_floaters
+from service.pose.retrieval.index import ViewIndex
 from service.pose.verification.advice import advice_for, content_extent
-from service.pose.verification.gate import VERIFICATION, downgraded, verify
+from service.pose.verification.captured_volume import is_outside
+from service.pose.verification.gate import VERIFICATION, doubted, downgraded, verify
 from service.render import RASTERIZERS
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
@@ -293,12 +295,28 @@ def localize_in_scene(
     query = images.query
     verdict = answer.verdict if answer else render_and_verify(images, last.pose, tools.rasterizer)
     verdict = _qualified(verdict, last, trace.exhausted)
+    verdict = _if_captured(verdict, query, last.pose, tools)
     advice = _advice(images, loaded, verdict, last, tools.rasterizer)
     timings = _timings(trace.records, clock)
     found = estimate_of(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
     )
     return replace(found, advice=advice)
+
+
+def _if_captured(verdict: Verdict, query: Query, pose: Pose, tools: Tools[Any]) -> Verdict:
+    """Return a verdict for a pose outside of what the index's views saw as `uncertain` for that reason; others as
+    they are, also where another reason than that the evidence is poor decided."""
+    by_evidence = verdict.status is Status.LOCALIZED or verdict.reason in _REASONS_OF_EVIDENCE
+    views = tools.prepared.views if isinstance(tools.prepared, ViewIndex) else ()
+    if verdict.status is Status.NOT_LOCALIZED or not by_evidence:
+        return verdict
+    if not is_outside(query.intrinsics, pose, tools.rasterizer, views):
+        return verdict
+    return doubted(verdict, Reason.OUTSIDE_CAPTURED_VOLUME)
+
+
+_REASONS_OF_EVIDENCE = (Reason.FEW_INLIERS, Reason.RENDER_MISMATCH, Reason.LOW_COVERAGE, Reason.POSITION_UNCERTAIN)
 
 
 def _advice(

@@ -118,6 +118,7 @@ class Reason(StrEnum):
     INTRINSICS_CONTRADICTED = "intrinsics_contradicted"
     LENS_UNMODELLED = "lens_unmodelled"
     POSITION_UNCERTAIN = "position_uncertain"
+    OUTSIDE_CAPTURED_VOLUME = "outside_captured_volume"
     OUTSIDE_PRIOR = "outside_prior"
     AMBIGUOUS = "ambiguous"
     MIRRORED = "mirrored"
@@ -149,6 +150,10 @@ HINTS: dict[Reason, str] = {
     ),
     Reason.POSITION_UNCERTAIN: (
         "The photo fits the scene, but hardly determines the camera position: show more of the scene, or nearer things."
+    ),
+    Reason.OUTSIDE_CAPTURED_VOLUME: (
+        "The best pose sees the scene from where it was not captured, so that nothing supports it: take the photo from "
+        "nearer to where the scene's photos were taken, or have the scene captured from here, too."
     ),
     Reason.OUTSIDE_PRIOR: (
         "The photo fits the scene, but at a place that the prior's Gaussian or box excludes: check it, or send a wider "

@@ -1,0 +1,72 @@
+"""Poses from where a scene was captured, and from where it was not, in a small room with its cameras in the middle."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
+
+from service.geometry import look_at, pose_distance
+from service.localize import LoadedScene, localize
+from service.pose.verification.captured_volume import captured_share, is_outside
+from service.results import Reason, Status
+from service.types import Camera, Intrinsics, Pose, Query
+
+LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
+UP = np.array([0.0, 0.0, 1.0])
+INSIDE = pose_at(0.4, 0.1)
+BEHIND_A_WALL = look_at(np.array([4.5, 0.3, 0.2]), np.zeros(3), UP)
+"""2.5 units outside of the wall at x = 2, of which it sees the back."""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("captured") / "room"))
+
+
+def photo_from(room: LoadedScene, pose: Pose) -> np.ndarray:
+    (frame,) = room.rasterizer.render([Camera(LENS, pose)])
+    return np.rint(np.clip(frame.rgb, 0, 1) * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("pose", "expected"),
+    [
+        (INSIDE, 1.0),
+        (BEHIND_A_WALL, 0.0),
+        # At half the distance, and at a fifth: from -0.6 the wall at 2 is 2.6 away.
+        (look_at(np.array([0.7, 0, 0]), np.array([2.0, 0, 0]), UP), 1.0),
+        (look_at(np.array([1.5, 0, 0]), np.array([2.0, 0, 0]), UP), 0.0),
+    ],
+)
+def test_what_views_see_from_a_like_direction_and_distance_is_captured(
+    room: LoadedScene, pose: Pose, expected: float
+) -> None:
+    camera = Camera(LENS.with_long_side(128), pose)
+    views = [named.camera for named in room.scene.cameras]
+    share = captured_share(room.rasterizer.render([camera])[0], camera, views)
+    assert share == pytest.approx(expected, abs=0.05)
+
+
+def test_no_evidence_says_nothing(room: LoadedScene) -> None:
+    away = look_at(np.array([9.0, 0, 0]), np.array([19.0, 0, 0]), UP)
+    camera = Camera(LENS, away)
+    views = room.prepare("view_index").views
+    assert captured_share(room.rasterizer.render([camera])[0], camera, [v.camera for v in views]) is None
+    assert not is_outside(LENS, away, room.rasterizer, views)
+    assert not is_outside(LENS, BEHIND_A_WALL, room.rasterizer, ())
+    assert is_outside(LENS, BEHIND_A_WALL, room.rasterizer, views)
+
+
+def test_a_photo_of_the_back_of_a_wall_is_uncertain_for_that_reason(room: LoadedScene) -> None:
+    """The prior is the truth, and the render there the photo: only where the pose is speaks against it."""
+    query = Query(photo_from(room, BEHIND_A_WALL), LENS, "given", LENS, prior=BEHIND_A_WALL)
+    found = localize(query, room)
+    assert pose_distance(found.pose, BEHIND_A_WALL)[1] < 0.05
+    assert (found.verdict.status, found.verdict.reason) == (Status.UNCERTAIN, Reason.OUTSIDE_CAPTURED_VOLUME)
+    assert found.verdict.score <= 0.5
+
+
+def test_a_photo_from_inside_is_localized(room: LoadedScene) -> None:
+    found = localize(Query(photo_from(room, INSIDE), LENS, "given", LENS), room)
+    assert found.verdict.status is Status.LOCALIZED
