@@ -58,9 +58,9 @@ PROVOKED: dict[Reason, Callable[[LoadedScene, Rooms], Verdict]] = {
     Reason.RENDER_MISMATCH: lambda room, _: judged(room, with_swapped_colours(photo_at(room, TRUTH))),
     Reason.FEW_INLIERS: lambda room, _: judged(room, blurred(photo_at(room, TRUTH), 10.0)),
     Reason.LOW_COVERAGE: lambda room, _: judged(room, photo_at(room, FAR_OUTSIDE), FAR_OUTSIDE),
-    Reason.OUTSIDE_CAPTURED_VOLUME: lambda room, _: localize(
-        replace(photo_at(room, BEHIND_A_WALL), prior=BEHIND_A_WALL), room, FAST
-    ).verdict,
+    Reason.OUTSIDE_CAPTURED_VOLUME: lambda room, _: (
+        localize(replace(photo_at(room, BEHIND_A_WALL), prior=BEHIND_A_WALL), room, FAST).verdict
+    ),
     Reason.FOCAL_UNCERTAIN: lambda room, _: judged(room, with_any_lens(middle_of_a_wall(room, 0.1)), BEFORE_A_WALL),
     Reason.INTRINSICS_CONTRADICTED: lambda room, _: judged(room, *with_a_wrong_lens(room)),
     Reason.LENS_UNMODELLED: lambda room, _: (
