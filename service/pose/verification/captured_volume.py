@@ -40,7 +40,7 @@ class CaptureConfig:
 
 
 CAPTURE = CaptureConfig()
-"""Of 60 right poses in four scenes, holes cut into them or not, all have a share of 0.9 or more."""
+"""Eleven right poses in two scenes, a box cut out or not, have a share of 1.00; lost ones 0.37 to 0.99."""
 
 
 def is_outside(
