@@ -27,7 +27,7 @@ def registered(known: Evidence) -> Registration:
 
 @pytest.mark.parametrize(
     ("kind", "what", "count"),
-    [("around", "positions", 8), ("around", "poses", 8), ("walk", "drift", 12), ("walk", "gps", 12)],
+    [("around", "positions", 8), ("around", "poses", 8), ("around", "drift", 8), ("walk", "gps", 12)],
 )
 def test_an_outlier_is_found_and_costs_nothing(kind, what, count):
     """tests/register_run.py has 50 seeds; docs/registration.md their figures."""
