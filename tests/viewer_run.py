@@ -132,7 +132,7 @@ def one_round(page: Page, url: str, angle: float) -> None:
     file = {"name": "photo.jpg", "mimeType": "image/jpeg", "buffer": photo(url, angle)}
     page.set_input_files("#photo", file)
     page.locator(".verdict .badge").wait_for()
-    page.get_by_role("link", name="See how it was found").click()
+    page.get_by_role("link", name="Open in viewer").click()
     page.get_by_text("agree").first.wait_for()
     for key in "ppnnp":
         page.keyboard.press(key)
