@@ -9,7 +9,7 @@ STUDIO_BIN := scenes/studio/.venv/bin
 # Files are shared out among the cores; a file's tests share their servers.
 PYTEST := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
 
-.PHONY: setup demo test coverage newest lint check studio another-day clean
+.PHONY: setup demo test coverage newest lint check release-check studio another-day clean
 
 setup: .venv/ready
 
@@ -39,6 +39,11 @@ coverage: check
 # Some of the tests with the newest versions that the ranges allow.
 newest: setup
 	.ci/newest
+
+# A dry run of a release: what would be uploaded is in dist/ afterwards.
+release-check: setup
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,release]"
+	$(BIN)/python tests/release_run.py
 
 lint: setup
 	$(BIN)/ruff check --fix .

@@ -311,16 +311,22 @@ def test_doctor_finds_the_parts_at_work(splatfix):
     assert "SPLATFIX_WORKERS" in told
 
 
-def test_serve_prints_a_line_that_works_and_ends_when_told(room, photo):
+def test_serve_prints_a_line_that_works_opens_the_browser_and_ends_when_told(room, photo, tmp_path):
     curl = shutil.which("curl")
     if not curl:
         pytest.skip("no curl here")
-    command = [sys.executable, "-m", "service", "serve", str(room), "--port", "0", "--no-viewer"]
-    with subprocess.Popen(command, cwd=ROOT, env=environment(), stdout=subprocess.PIPE, text=True) as server:
+    opened = tmp_path / "opened"
+    browser = tmp_path / "browser"
+    browser.write_text(f'#!/bin/sh\necho "$1" > "{opened}"\n', "utf-8")
+    browser.chmod(0o755)
+    command = [sys.executable, "-m", "service", "serve", str(room), "--port", "0", "--no-viewer", "--browser"]
+    env = environment() | {"BROWSER": f"{browser} %s"}
+    with subprocess.Popen(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True) as server:
         try:
             line = next(line for line in server.stdout or () if line.startswith("  curl "))
             done = subprocess.run([*shlex.split(line), "-s"], capture_output=True, text=True, check=True)
             job = json.loads(done.stdout)
+            assert opened.read_text("utf-8").strip() == line.split()[-1].removesuffix("localize")
             assert job["result"]["status"] == "localized"
             found = Pose(np.array(job["result"]["pose"]["world_from_camera"]["matrix"]))
             assert pose_distance(found, TRUTH)[0] < 0.2
@@ -330,6 +336,27 @@ def test_serve_prints_a_line_that_works_and_ends_when_told(room, photo):
             server.wait(20)
     assert time.monotonic() - began < 10
     assert server.returncode in (0, -signal.SIGTERM)
+
+
+def test_bench_device_tells_the_machine_and_what_it_measured(splatfix, room, photo, tmp_path):
+    folder = shutil.copytree(room, tmp_path / "with truth")
+    entry = {"photo": photo.name, "intrinsics": INTRINSICS, "world_from_camera": TRUTH.world_from_camera.tolist()}
+    (folder / "truth.json").write_text(json.dumps([entry]), "utf-8")
+    began = time.monotonic()
+    code, told, _ = splatfix("bench", "device", folder, "--limit-s", "1", "--emulated", "--json", tmp_path / "f.json")
+    elapsed_ms = 1e3 * (time.monotonic() - began)
+    assert code == 0
+    outcome = json.loads((tmp_path / "f.json").read_text("utf-8"))
+    assert (outcome["system"], outcome["machine"]) == (os.uname().sysname, os.uname().machine)
+    assert outcome["emulated"]
+    assert "EMULATED" in told
+    for kind, errors in (("given", (1.0, 0.05)), ("withheld", (5.0, 0.2))):
+        found = outcome["photos"][kind]
+        assert (found["queries"], found["localized"], found["false_localized"]) == (1, 1, 0)
+        assert found["median_rotation_deg"] < errors[0]
+        assert found["median_translation_units"] < errors[1]
+        assert 0 < sum(found["stages_ms_p50"].values()) <= found["latency_ms_p50"] < elapsed_ms
+        assert f"intrinsics {kind}: 1 of 1 localized, 0 wrongly" in told
 
 
 def test_bench_paper_hands_its_flags_on_and_refuses_unknown_names(splatfix, monkeypatch, tmp_path):

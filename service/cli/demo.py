@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import err, out, settings_of
+from service.cli.terminal import BrowserOption, err, out, settings_of
 from service.errors import SceneNotFound
 
 _PLACES = (Path("splatfix", "demo", "studio"), Path("scenes", "studio"))
@@ -16,11 +16,12 @@ _PLACES = (Path("splatfix", "demo", "studio"), Path("scenes", "studio"))
 
 def demo(
     port: Annotated[int, typer.Option("--port", help="Port to listen on; 0: any free one.")] = 8000,
+    browser: BrowserOption = False,
 ) -> None:
     """Serve the demo scene on this machine."""
     from service.cli.server import run
 
-    run(settings_of({"scenes": [demo_scene()], "host": "127.0.0.1", "port": port}), out, err)
+    run(settings_of({"scenes": [demo_scene()], "host": "127.0.0.1", "port": port}), out, err, browser)
 
 
 def demo_scene() -> Path:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import err, out, settings_of
+from service.cli.terminal import BrowserOption, err, out, settings_of
 
 
 def serve(
@@ -18,6 +18,7 @@ def serve(
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)] = None,
     viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
     open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
+    browser: BrowserOption = False,
 ) -> None:
     """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment, or a file.
 
@@ -27,4 +28,4 @@ def serve(
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
     # None stands for an option that was not given: the environment's or the file's value holds.
-    run(settings_of({name: value for name, value in given.items() if value is not None}), out, err)
+    run(settings_of({name: value for name, value in given.items() if value is not None}), out, err, browser)

@@ -7,6 +7,7 @@ import os
 import socket
 import threading
 import time
+import webbrowser
 
 import uvicorn
 from fastapi import FastAPI
@@ -24,8 +25,11 @@ _CONNECTIONS_S = 3
 """Time for open connections after SIGTERM, before the running jobs get their own."""
 
 
-def run(settings: Settings, out: Console, err: Console) -> None:
-    """Serve until SIGTERM or SIGINT. Raises InvalidRequest, StorageFailed and what `create_app` raises."""
+def run(settings: Settings, out: Console, err: Console, browser: bool = False) -> None:
+    """Serve until SIGTERM or SIGINT; with `browser`, open the start page once it is ready.
+
+    Raises InvalidRequest, StorageFailed and what `create_app` raises.
+    """
     if settings.log_json if settings.log_json is not None else not err.is_terminal:
         logging.getLogger().handlers = [json_handler()]
     if settings.data_dir is None and settings.port:  # a random port is never the same again
@@ -59,7 +63,7 @@ def run(settings: Settings, out: Console, err: Console) -> None:
         logging.getLogger("service").setLevel(logging.INFO)
         # A lasting key isn't known here, only its hash.
         shell_key = key or ("$SPLATFIX_KEY" if keys else "")
-        arguments = server, application, settings, (key, shell_key), out, err
+        arguments = server, application, settings, (key, shell_key), out, err, browser
         threading.Thread(target=_announce, args=arguments, daemon=True).start()
         server.run(sockets=[listener])
 
@@ -79,8 +83,9 @@ def _announce(
     keys: tuple[str, str],
     out: Console,
     err: Console,
+    browser: bool,
 ) -> None:
-    """Wait until the service is ready, then print its addresses and an example request.
+    """Wait until the service is ready, then print its addresses and an example request, and open the browser if asked.
 
     `keys` are the key that was made for this run, and what the example takes as a key; each empty if there is none.
     """
@@ -116,3 +121,5 @@ def _announce(
         hint = " (SPLATFIX_KEY: a key from `splatfix keys add NAME`)" if shell_key and not key else ""
         lines += [f"Try it{hint}:", f"  {example}"]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    if browser:
+        webbrowser.open(f"{url}/{query}")

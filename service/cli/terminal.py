@@ -25,6 +25,7 @@ IntrinsicsOption = Annotated[
     str,
     typer.Option("--intrinsics", help="JSON, or a file of it: width, height, fx, fy, cx, cy[, model, distortion]."),
 ]
+BrowserOption = Annotated[bool, typer.Option("--browser", help="Open the start page once it is ready.")]
 JsonFileOption = Annotated[Path | None, typer.Option("--json", help="Write the whole outcome.")]
 
 
