@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from service.errors import CorruptScene, UnsupportedFormat
 from service.scene_formats.gaussians import SH_CUT, RawGaussians, require_count
@@ -59,7 +59,9 @@ def _activated(path: Path, header: PlyHeader, count: int, degree: int, per_chann
     """Read and activate the Gaussians; `per_channel` coefficients of f_rest are stored."""
     names = set(_names(header))
     columns = _COLUMNS | ({"filter": [_FILTER]} if _FILTER in names else {})
-    values = {name: np.empty((count, len(listed)), np.float32) for name, listed in columns.items()}
+    values: dict[str, Float[np.ndarray, "_ _"]] = {
+        name: np.empty((count, len(listed)), np.float32) for name, listed in columns.items()
+    }
     if header.has_doubles("vertex", _COLUMNS["means"]):
         values["means"] = np.empty((count, 3), np.float64)
     sh = np.empty((count, (degree + 1) ** 2, 3), np.float32)
