@@ -349,6 +349,7 @@ class FakeService:
             metres_per_unit=None,
             render_mode="default",
             bounds_in_world=None,
+            frames=[],
             warnings=[],
             training_cameras=[named_camera_out(c) for c in self.scene.cameras],
         )

@@ -49,6 +49,8 @@ class FitConfig:
     distinct: float = 0.7
     """Candidates with a geometry of less than this share of the best are excluded by it."""
     least_cameras: int = 4
+    least_gaussians: int = 1000
+    """With fewer nothing is said about cameras: they stay as their file has them."""
     turn_deg: float = 5.0
     stretch: float = 1.15
     """Placements that differ by so much must fit less."""
@@ -90,7 +92,7 @@ def fitted(
     """
     trial = _Trial(raw, file, photo_of, background_rgb, config)
     as_is = Candidate("")
-    if len(file.cameras) < config.least_cameras:
+    if len(file.cameras) < config.least_cameras or len(raw.means) < config.least_gaussians:
         return CameraFit(file.cameras, np.eye(4), "as the camera file has them; too few to check", False)
     first = trial.evidence(as_is, EVIDENCE)
     _log.info("cameras as they are: %s", first)
