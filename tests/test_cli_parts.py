@@ -446,7 +446,8 @@ def announced(scenes: list[tuple[str, str]], key: str = "", shell_key: str = "",
     out, err = io.StringIO(), io.StringIO()
     settings = Settings(scenes=[], port=8123, host="127.0.0.1", **changes)
     started: Any = SimpleNamespace(started=True)
-    server._announce(started, application, settings, (key, shell_key), Console(file=out), Console(file=err), browser=False)
+    consoles = Console(file=out), Console(file=err)
+    server._announce(started, application, settings, (key, shell_key), *consoles, browser=False)
     return out.getvalue(), err.getvalue()
 
 
