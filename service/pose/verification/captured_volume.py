@@ -29,8 +29,10 @@ class CaptureConfig:
     """Of those points."""
     max_turn_deg: float = 60.0
     """Between the rays of pose and view to a point. A surface that is seen from its back turns by more than 90."""
-    max_distance_factor: float = 3.0
-    """Between the distances of pose and view from it; features match within 2."""
+    max_nearer: float = 8.0
+    """Distance of the view from it, relative to the pose's: nearer, the scene looks softer, but like itself..."""
+    max_farther: float = 3.0
+    """...and of the pose's, relative to the view's; features match within 2."""
     min_share: float = 0.5
     """Share of the points that are captured, below which the pose is outside."""
     near_share: float = 0.5
@@ -97,7 +99,7 @@ def captured_share(
         rays, distances = _rays(points, view.pose)
         ratio = distances / own_distances
         alike = (own_rays * rays).sum(1) > _cosine(config.max_turn_deg)
-        alike &= (ratio < config.max_distance_factor) & (ratio > 1 / config.max_distance_factor)
+        alike &= (ratio < config.max_nearer) & (ratio > 1 / config.max_farther)
         captured |= alike & _in_image(points, view)
     return float(captured.mean())
 
