@@ -206,6 +206,8 @@ def only_colours_doubt(verdict: Verdict, config: VerificationConfig) -> bool:
     signals, model = verdict.signals, config.model
     if verdict.status is Status.LOCALIZED or verdict.reason is not Reason.RENDER_MISMATCH:
         return False
+    if signals["local_colour_correlation"] < config.min_repeated_colour:
+        return False
     return model.probability(signals) >= config.min_localized and not model.below_floor(signals, light_may_differ=True)
 
 
