@@ -15,8 +15,9 @@ from service.geodesy import enu_from_geographic
 from service.geometry import look_at, quat_from_rotation, so3_exp
 from service.photos.images import open_photo
 from service.registration.gathering import GatherOptions, LocalizedPhoto, gathered
-from service.registration.known_places import exif_places, place_table, read_places, scene_points, trajectory_places
+from service.registration.known_places import exif_places, place_table, scene_points, trajectory_places
 from service.registration.known_places.known_place import KnownPlace, KnownPlaces, in_metres, observation_of
+from service.registration.known_places.reading import read_places
 from service.types import Pose, SceneInfo
 
 FLIP = np.diag([1.0, -1.0, -1.0])

@@ -132,8 +132,9 @@ def _known_photos(
 ) -> tuple[KnownPlaces, list[tuple[KnownPlace, Path]]]:
     """Return what is known of places, and the photos with theirs. Raises InvalidRequest for a photo without one."""
     from service.photos.images import open_photo
-    from service.registration.known_places import exif_places, read_places, trajectory_places
+    from service.registration.known_places import exif_places, trajectory_places
     from service.registration.known_places.known_place import KnownPlaces
+    from service.registration.known_places.reading import read_places
 
     if places is None:
         known = exif_places.read([(str(p), open_photo(read_file(p)).gps) for p in photos], geoid_m)

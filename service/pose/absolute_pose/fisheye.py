@@ -22,7 +22,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 
 from service.geometry import se3_exp, transformed
-from service.pose.absolute_pose.lens_prior import correction_vector, prior_cost, prior_precision, stepped
+from service.pose.absolute_pose.lens_prior import stepped
+from service.pose.absolute_pose.normal_equations import normal_equations
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.types import Intrinsics, IntrinsicsCorrection, LensPrior, Pose
 
@@ -241,18 +242,9 @@ class _Problem:
         jacobian[:, :, 6] = focal * seen
         jacobian[:, :, 7] = focal * unit * by_k[:, None]
         jacobian[:, 0, 8] = jacobian[:, 1, 9] = self.intrinsics.long_side
-        squared = (residual**2).sum(1) / self.noise_px**2
-        # Points behind the camera cost as much as an outlier at a hundred scales, and pull nowhere.
-        squared[~ahead] = (100.0 * scale) ** 2
-        weight = np.where(ahead, 1.0 / (1.0 + squared / scale**2), 0.0) / self.noise_px**2
-        rows = jacobian.reshape(-1, 10)
-        weighted = rows * np.repeat(weight, 2)[:, None]
-        hessian, rhs = weighted.T @ rows, weighted.T @ residual.reshape(-1)
-        precision = prior_precision(self.prior, correction)
-        hessian[range(6, 10), range(6, 10)] += precision
-        rhs[6:] -= precision * correction_vector(correction)
-        cost = scale**2 * float(np.log1p(squared / scale**2).sum()) + prior_cost(self.prior, correction)
-        return _Linearized(pose, correction, cost, hessian, rhs, jacobian, residual, weight, ahead, unit, radius)
+        found = normal_equations(jacobian, residual, ahead, self.noise_px, scale, self.prior, correction)
+        equations = found.cost, found.hessian, found.rhs
+        return _Linearized(pose, correction, *equations, jacobian, residual, found.weight, ahead, unit, radius)
 
 
 def _ray_by_twist(x: Radii, y: Radii, depth: Radii) -> Float64[np.ndarray, "m 2 6"]:

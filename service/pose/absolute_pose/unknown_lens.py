@@ -18,7 +18,8 @@ from jaxtyping import Float, Float64
 from service.geometry import se3_exp, se3_log
 from service.photos.intrinsics import undistorted_points
 from service.pose.absolute_pose.lens_kernels import linearize_projection
-from service.pose.absolute_pose.lens_prior import correction_vector, prior_cost, prior_precision, stepped
+from service.pose.absolute_pose.lens_prior import stepped
+from service.pose.absolute_pose.normal_equations import normal_equations
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.types import Intrinsics, IntrinsicsCorrection, LensPrior, Pose
 
@@ -216,19 +217,9 @@ class _Problem:
         jacobian, residual, ahead = linearize_reprojection(
             self.photo_px, self.points_in_world, self.intrinsics, pose, correction
         )
-        squared = (residual**2).sum(1) / self.noise_px**2
-        # Points behind the camera cost as much as an outlier at a hundred scales, and pull nowhere.
-        squared[~ahead] = (100.0 * scale) ** 2
-        weight = np.where(ahead, 1.0 / (1.0 + squared / scale**2), 0.0) / self.noise_px**2
-        rows = jacobian.reshape(-1, 10)
-        weighted = rows * np.repeat(weight, 2)[:, None]
-        hessian, rhs = weighted.T @ rows, weighted.T @ residual.reshape(-1)
-        precision = prior_precision(self.prior, correction)
-        hessian[range(6, 10), range(6, 10)] += precision
-        rhs[6:] -= precision * correction_vector(correction)
-        cost = scale**2 * float(np.log1p(squared / scale**2).sum()) + prior_cost(self.prior, correction)
-        error = np.where(ahead, np.sqrt(squared) * self.noise_px, np.inf)
-        return _Linearized(pose, correction, scale, error, cost, hessian, rhs)
+        found = normal_equations(jacobian, residual, ahead, self.noise_px, scale, self.prior, correction)
+        error_px = found.error * self.noise_px
+        return _Linearized(pose, correction, scale, error_px, found.cost, found.hessian, found.rhs)
 
 
 @dataclass(frozen=True, slots=True)
