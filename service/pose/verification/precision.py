@@ -60,11 +60,11 @@ def probability_within(covariance: Float64[np.ndarray, "6 6"], bound_deg: float,
     """
     variances, axes = np.linalg.eigh(covariance)
     to_twist = axes * np.sqrt(np.maximum(variances, 0.0))
-    squares = (_directions() @ to_twist.T) ** 2
+    squares = (to_twist @ _directions()) ** 2
     # A direction without uncertainty ends nowhere.
     with np.errstate(divide="ignore"):
         squared_radius = np.minimum(
-            np.radians(bound_deg) ** 2 / squares[:, :3].sum(1), bound_units**2 / squares[:, 3:].sum(1)
+            np.radians(bound_deg) ** 2 / squares[:3].sum(0), bound_units**2 / squares[3:].sum(0)
         )
     return float(_radius_within(squared_radius).mean())
 
@@ -81,8 +81,8 @@ def _radius_within(squared: Float64[np.ndarray, "n"]) -> Float64[np.ndarray, "n"
 
 
 @cache
-def _directions() -> Float64[np.ndarray, "n 6"]:
-    """Return unit vectors, spread evenly over the sphere in 6 dimensions; the same for every photo.
+def _directions() -> Float64[np.ndarray, "6 n"]:
+    """Return unit vectors as columns, spread evenly over the sphere in 6 dimensions; the same for every photo.
 
     An additive recurrence fills the unit cube evenly (Roberts, "The unreasonable effectiveness of quasirandom
     sequences", 2018); Box and Muller's transform makes normal variates of it, which have all directions alike.
@@ -93,4 +93,5 @@ def _directions() -> Float64[np.ndarray, "n 6"]:
     even = (0.5 + np.outer(np.arange(1, DIRECTIONS + 1), golden ** -np.arange(1.0, 7.0))) % 1.0
     radius, angle = np.sqrt(-2.0 * np.log(even[:, :3])), 2.0 * np.pi * even[:, 3:]
     normal = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)], 1)
-    return normal / np.linalg.norm(normal, axis=1)[:, None]
+    # Contiguous rows: their sums are a fourth of the time that sums over 6 columns take.
+    return np.ascontiguousarray((normal / np.linalg.norm(normal, axis=1)[:, None]).T)
