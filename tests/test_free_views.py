@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,8 @@ from service.interfaces import Features
 from service.localize import LoadedScene, Request, localize
 from service.pose.features.rendered_views import View, to_uint8
 from service.pose.matching.match_stages import MATCHING, match_candidates
-from service.pose.retrieval.free_views import FREE_VIEWS, free_view_cameras
+from service.pose.retrieval.free_views import FREE_VIEWS, FreeViews, free_view_cameras
+from service.pose.retrieval.view_files import read_views, write_views
 from service.results import Status
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -48,7 +50,9 @@ def test_they_stand_in_the_room_and_are_the_same_each_time(room: LoadedScene) ->
     assert all(camera.pose.world_from_camera[2, 1] < 0 for camera in cameras)
 
 
-def test_they_are_rendered_only_for_a_photo_that_needs_them_which_is_found(room: LoadedScene) -> None:
+def test_they_are_rendered_only_for_a_photo_that_needs_them_which_is_found(
+    room: LoadedScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     index = room.prepare("view_index")
     seen = localize(photo_at(room, pose_at(0.3, 0.1)), room)
     assert seen.verdict.status is Status.LOCALIZED
@@ -69,6 +73,38 @@ def test_they_are_rendered_only_for_a_photo_that_needs_them_which_is_found(room:
     made = index.free_views._views
     localize(close_up, room)
     assert index.free_views._views is made
+
+    # Whoever loads the scene again reads them: nothing is rendered for them.
+    monkeypatch.setattr("service.pose.retrieval.free_views.free_view_cameras", refuse)
+    loaded_again = LoadedScene(room.scene, room.rasterizer, room.matcher, cache_dir=room.cache_dir)
+    assert localize(close_up, loaded_again).pose.world_from_camera.tobytes() == found.pose.world_from_camera.tobytes()
+    read = loaded_again.prepare("view_index").free_views._views
+    assert read is not None
+    for own, other in zip(made, read, strict=True):
+        assert own.camera.pose.world_from_camera.tobytes() == other.camera.pose.world_from_camera.tobytes()
+        assert np.array_equal(own.features.descriptors, other.features.descriptors)
+
+
+def refuse(*_: object) -> None:
+    raise AssertionError("rendered, not read")
+
+
+def test_damaged_or_unwritable_files_cost_no_photo(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    view = View(
+        Camera(LENS, CLOSE_UP),
+        Features(*(np.ones(s, np.float32) for s in ((1, 2), 1, (1, 4)))),
+        np.ones((1, 3), np.float32),
+    )
+    path = tmp_path / "views.npz"
+    for damaged in (b"", b"not a zip"):
+        path.write_bytes(damaged)
+        assert read_views(path) is None
+    write_views(path, [view], {"more": np.array(3)})
+    views, stored = read_views(path) or ((), {})
+    assert (len(views), views[0].camera.intrinsics, stored["more"]) == (1, LENS, 3)
+    # A folder that is a file: nothing can be written there.
+    FreeViews()._store(path / "below.npz", [view])
+    assert "not stored" in caplog.text
 
 
 class ByRow:

@@ -379,6 +379,17 @@ def test_the_query_that_most_methods_answered_is_shown():
     assert _most_answered(often) == {}
 
 
+def test_pictures_are_of_queries_of_their_scene_from_the_hard_start(monkeypatch):
+    from service.bench.paper import illustrations
+
+    lines = [{"scene": scene, "protocol": start} for scene in "ab" for start in ("hard", "easy")]
+    considered: list[list[dict]] = []
+    # None answered: there is nothing to draw.
+    monkeypatch.setattr(illustrations, "_most_answered", lambda of_scene: considered.append(of_scene) or {})
+    assert illustrations.figures_2_and_3({"a": None, "b": None}, lines) is None
+    assert considered == [[lines[0]], [lines[2]]]
+
+
 def test_the_share_below_the_bound_by_step():
     from service.bench.paper.illustrations import _share_curve
 

@@ -13,6 +13,7 @@ from registration_layouts import UP, evidence, layout, planted
 
 from service.errors import CorruptScene, RegistrationFailed, RegistrationNotFound, StorageFailed
 from service.geometry import look_at, so3_exp
+from service.registration.consensus import CONSENSUS, _starts
 from service.registration.observations import Direction, Evidence, Height, Length, Observation
 from service.registration.quantiles import chi_square_quantile, f_quantile
 from service.registration.register import register
@@ -56,6 +57,23 @@ def test_exact_places_give_the_planted_similarity():
     assert found.metres_per_unit == pytest.approx(truth.scale, rel=1e-9)
     assert all(r.used and r.metres < 1e-6 for r in found.residuals)
     assert not found.warnings
+
+
+@pytest.mark.parametrize("told", ["a pose and a place", "two places and up", "three places"])
+def test_every_minimal_sample_of_exact_observations_gives_the_planted_similarity(told):
+    rng = np.random.default_rng(9)
+    truth = planted(rng)
+    inverse = np.linalg.inv(truth.matrix)
+    seen = [Observation(f"p{i}", (inverse @ [*p, 1.0])[:3], p) for i, p in enumerate(layout("around", 4, rng))]
+    up = [Direction(truth.rotation.T @ UP, UP, 0.01)] if told == "two places and up" else []
+    if told == "a pose and a place":
+        camera = look_at(seen[0].position_in_world, np.zeros(3), UP).world_from_camera[:3, :3]
+        seen[0] = replace(seen[0], world_from_camera=camera, target_from_camera=truth.rotation @ camera)
+    # The first start is that of all together.
+    _, *samples = _starts(Evidence(seen, directions=up), rng, CONSENSUS)
+    assert len(samples) >= 3
+    for sample in samples:
+        assert sample.matrix == pytest.approx(truth.matrix, rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("kind", ["line", "place"])

@@ -8,17 +8,20 @@ view of the index may be like such a photo.
     solid ones -> greedy set cover: the few that together show what the index doesn't
 
 Such cameras stand in the space that the index views look through: free, and inside of what was captured. Most photos
-don't need them, so they are rendered when the first photo does, and keep only what retrieval compares.
+don't need them, so they are rendered when the first photo does, and keep only what retrieval compares. They are stored
+beside the index: of a scene that was loaded before, they are read.
 """
 
 from __future__ import annotations
 
 import heapq
+import logging
 import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -29,8 +32,11 @@ from service.pose.features.image_sizes import sized
 from service.pose.features.rendered_views import View, view_from
 from service.pose.retrieval.lod_proxy import lod_proxy
 from service.pose.retrieval.scores import SCORES
+from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.view_placement import cell_ids, search_camera, shows_single_surface
 from service.types import Camera, GaussianScene, Pose
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +72,9 @@ FREE_VIEWS = FreeViewConfig()
 
 @dataclass(slots=True)
 class FreeViews:
-    """The views of one scene beside its index, rendered once, by whoever needs them first."""
+    """The views of one scene beside its index: rendered once, by whoever needs them first, and kept in a file."""
 
+    path: Path | None = None
     _views: tuple[View, ...] | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
@@ -77,8 +84,18 @@ class FreeViews:
         """Return the views, with their strongest features only."""
         with self._lock:
             if self._views is None:
-                self._views = _rendered(scene, rasterizer, matcher, index)
+                stored = read_views(self.path)
+                self._views = stored[0] if stored else _rendered(scene, rasterizer, matcher, index)
+                if self.path and self._views and not stored:
+                    self._store(self.path, self._views)
             return self._views
+
+    def _store(self, path: Path, views: Sequence[View]) -> None:
+        try:
+            write_views(path, views, {})
+        except OSError as error:
+            # The photo that needs the views can do without the file.
+            log.warning("the views beside the index are not stored: %s", error)
 
 
 def _rendered(

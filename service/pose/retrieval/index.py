@@ -9,27 +9,26 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import tempfile
-import zipfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from service.interfaces import Features, Tools
+from service.interfaces import Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
 from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_space import SPACE
-from service.pose.retrieval.free_views import FreeViews
+from service.pose.retrieval.free_views import FREE_VIEWS, FreeViews
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
 from service.pose.retrieval.scene_symmetries import SYMMETRY, like_its_mirror_image, repeats_itself
 from service.pose.retrieval.scores import SCORES
+from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
-from service.types import Camera, Intrinsics, Pose
+from service.types import Camera
 
 VERSION = 9
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
@@ -53,17 +52,15 @@ class ViewIndex:
 
 def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:
     """Read the scene's index from the cache, or build it and store it there."""
-    # The name is a hash of all that the index depends on, so one of other values is never read.
+    # The names are hashes of all that their content depends on, so one of other values is never read.
     path = cache_dir / f"view-index-{_key(tools, viewpoints)}.npz" if cache_dir else None
-    if path and path.exists():
-        try:
-            return _read(path)
-        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            log.warning("rebuilding the view index: %s can't be read (%s)", path.name, error)
+    free_views = FreeViews(cache_dir / f"free-views-{_key(tools, viewpoints, FREE_VIEWS)}.npz" if cache_dir else None)
+    if found := _read(path, free_views):
+        return found
     index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng, viewpoints), tools)
     if path:
         _write(index, path)
-    return index
+    return replace(index, free_views=free_views)
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = LOD) -> ViewIndex:
@@ -91,56 +88,34 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
     return ViewIndex(views, Corners.pooled([own for _, own in found if own]), mirrored, repeated)
 
 
-def _key(tools: Tools[None], viewpoints: ViewpointConfig) -> str:
-    """Return a hash of what the index depends on: code, scene, matcher, rasterizer, and all values of the configs."""
+def _key(tools: Tools[None], *more: object) -> str:
+    """Return a hash of what views depend on: code, scene, matcher, rasterizer, and all values of these configs."""
     # The scene's digest covers the training cameras, but photos may be left out; the background may be assumed.
     visible = int(np.count_nonzero(tools.scene.opacities))  # floaters are left out
     scene = (tools.scene.info.sha256, visible, len(tools.scene.cameras), tools.scene.info.background_rgb)
     # Dataclasses of numbers: their repr names each value.
-    configs = (viewpoints, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
+    configs = (*more, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
     parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
 
 def _write(index: ViewIndex, path: Path) -> None:
-    """Write to the side and rename, so that no reader sees half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    cameras = [view.camera for view in index.views]
-    arrays = {
+    others = {
         "like_its_mirror_image": np.array(index.like_its_mirror_image),
         "repeats_itself": np.array(index.repeats_itself),
         "corner_directions_deg": index.corners.directions_deg,
         "corner_descriptors": index.corners.descriptors,
-        "counts": np.array([len(view.points_in_world) for view in index.views]),
-        "sizes": np.array([(c.intrinsics.width, c.intrinsics.height) for c in cameras]),
-        "pinholes": np.array([(c.intrinsics.fx, c.intrinsics.fy, c.intrinsics.cx, c.intrinsics.cy) for c in cameras]),
-        "world_from_camera": np.stack([c.pose.world_from_camera for c in cameras]),
-        "points_px": np.concatenate([view.features.points_px for view in index.views]),
-        "scores": np.concatenate([view.features.scores for view in index.views]),
-        "descriptors": np.concatenate([view.features.descriptors for view in index.views]),
-        "points_in_world": np.concatenate([view.points_in_world for view in index.views]),
     }
-    # Two processes may build the same index at once.
-    handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+    write_views(path, index.views, others)
+
+
+def _read(path: Path | None, free_views: FreeViews) -> ViewIndex | None:
+    if not (found := read_views(path)):
+        return None
+    views, stored = found
     try:
-        with os.fdopen(handle, "wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def _read(path: Path) -> ViewIndex:
-    with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
-        stored = {name: file[name] for name in file.files}
-    # The views' features lie in one array, one after the other.
-    stops = np.cumsum(stored["counts"])
-    views = []
-    for i, (start, stop) in enumerate(zip(stops - stored["counts"], stops, strict=True)):
-        (width, height), (fx, fy, cx, cy) = stored["sizes"][i].tolist(), stored["pinholes"][i].tolist()
-        features = Features(*(stored[name][start:stop] for name in ("points_px", "scores", "descriptors")))
-        camera = Camera(Intrinsics(width, height, fx, fy, cx, cy), Pose(stored["world_from_camera"][i]))
-        views.append(View(camera, features, stored["points_in_world"][start:stop]))
-    pooled = Corners(stored["corner_directions_deg"], stored["corner_descriptors"])
-    return ViewIndex(tuple(views), pooled, bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"]))
+        pooled = Corners(stored["corner_directions_deg"], stored["corner_descriptors"])
+        mirrored, repeated = bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"])
+    except KeyError:  # a whole file with other arrays
+        return None
+    return ViewIndex(views, pooled, mirrored, repeated, free_views)
