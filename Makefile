@@ -7,7 +7,8 @@ BIN := .venv/bin
 STUDIO_BIN := scenes/studio/.venv/bin
 
 # Files are shared out among the cores; a file's tests share their servers.
-PYTEST := $(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile
+# Four on two cores, too: tests of servers mostly wait.
+PYTEST := $(BIN)/pytest -n 4 --dist loadfile
 
 .PHONY: setup demo test coverage newest lint check release-check studio another-day clean
 
@@ -30,9 +31,9 @@ check: setup
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 test: check
-	$(PYTEST)
+	$(PYTEST) -m "not browser and not ci"
 
-# The same, and which lines the tests run in their own process: some 30 % slower.
+# All tests, and which lines they run in their own process.
 coverage: check
 	COVERAGE_FILE="$$(mktemp -d)/coverage" $(PYTEST) --cov --cov-report=term:skip-covered --cov-fail-under=92
 

@@ -53,6 +53,8 @@ class _Loader(importlib.machinery.SourceFileLoader):
 
     def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> Any:
         tree = ast.parse(data)
+        if b"jaxtyping" not in data:
+            return compile(tree, path, "exec", dont_inherit=True, optimize=_optimize)
         arrays, compilers = _imported(tree, ("jaxtyping",)), _imported(tree, _COMPILERS)
         for node in ast.walk(tree) if arrays else ():
             names = {n.id for d in getattr(node, "decorator_list", ()) for n in ast.walk(d) if isinstance(n, ast.Name)}

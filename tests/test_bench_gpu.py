@@ -124,6 +124,7 @@ def room(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.ci
 @pytest.mark.timeout(240)
 def test_it_runs_to_its_end_with_the_stand_in(room, tmp_path, monkeypatch):
     pytest.importorskip("gsplat", reason="gsplat is not installed")

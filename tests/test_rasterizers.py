@@ -369,6 +369,7 @@ def test_a_small_render_is_the_downsampled_large_one(create):
     assert np.abs(scaled - pooled).mean() < 0.5 * np.abs(fixed - pooled).mean()  # seen: a fifth
 
 
+@pytest.mark.ci
 @pytest.mark.timeout(300)  # compiles the kernels a second time
 def test_kernels_are_right_without_avx512():
     """The same source compiled for AVX2, in a process of its own; the name alone would keep the host's features."""
