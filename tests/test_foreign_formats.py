@@ -105,6 +105,8 @@ class TestGltf:
             (lambda t: t["bufferViews"][0].update(byteLength=10**9), "beyond the file"),
             (lambda t: t["nodes"][0].update(children=[0]), "10000 nodes"),
             (lambda t: t["nodes"][0].update(scale=[1, 2, 1]), "shears"),
+            (lambda t: t["nodes"][0].update(scale=[-1, 1, 1]), "mirrors"),
+            (lambda t: t["nodes"][0].update(rotation=[0, 0, 0, 1.0015]), "unit quaternion"),
             (lambda t: t["nodes"].clear(), "no nodes"),
         ],
     )
