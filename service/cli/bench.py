@@ -6,6 +6,7 @@ import typer
 
 from service.cli.bench_ablation import bench_ablation
 from service.cli.bench_device import bench_device
+from service.cli.bench_evaluate import bench_evaluate
 from service.cli.bench_field import bench_field
 from service.cli.bench_gate import bench_gate
 from service.cli.bench_gpu import bench_gpu
@@ -26,3 +27,4 @@ bench_app.command("gpu")(bench_gpu)
 bench_app.command("scale")(bench_scale)
 bench_app.command("ablation")(bench_ablation)
 bench_app.command("field")(bench_field)
+bench_app.command("evaluate")(bench_evaluate)

@@ -62,6 +62,15 @@ def read_cameras(folder: Path, keep: Callable[[str], bool]) -> tuple[NamedCamera
     return tuple(sorted(cameras, key=lambda c: c.name))
 
 
+def read_poses(path: Path) -> list[tuple[str, Pose]]:
+    """Return names and poses of an images.bin or images.txt, which needs no cameras beside it. Raises CorruptScene."""
+    try:
+        images = _binary_images(path) if path.suffix == ".bin" else _text_images(path)
+        return [(image.name, _pose_of(image)) for image in images]
+    except (struct.error, ValueError, IndexError, InvalidPrior) as error:
+        raise CorruptScene(f"not COLMAP's images: {error}.", where=path.name) from None
+
+
 def _binary_cameras(path: Path) -> dict[int, Intrinsics]:
     data, at = path.read_bytes(), 8  # behind the count
     result = {}
@@ -158,6 +167,10 @@ def _intrinsics(model: str, width: int, height: int, parameters: list[float]) ->
 
 
 def _camera(image: _Image, intrinsics: Intrinsics) -> NamedCamera:
+    return NamedCamera(image.name, Camera(intrinsics, _pose_of(image)))
+
+
+def _pose_of(image: _Image) -> Pose:
     quat, translation = np.array(image.quat_translation[:4]), np.array(image.quat_translation[4:])
     if not np.linalg.norm(quat) > 1e-9:
         raise ValueError(f"the quaternion of '{image.name}' has length zero")
@@ -165,4 +178,4 @@ def _camera(image: _Image, intrinsics: Intrinsics) -> NamedCamera:
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = rotation_from_quat(quat).T
     world_from_camera[:3, 3] = -world_from_camera[:3, :3] @ translation
-    return NamedCamera(image.name, Camera(intrinsics, Pose(world_from_camera)))
+    return Pose(world_from_camera)
