@@ -19,8 +19,8 @@ from service.geometry import quat_from_rotation, so3_exp
 from service.types import Pose
 
 FILES = Path(__file__).parent / "data" / "hloc"
-"""24 poses by pycolmap 3.12 (names as 7-Scenes has them), and results by hloc's `write_poses` for 17 of its 20 test
-photos; the figures below are what hloc's `evaluate` prints for these (v1.5, 2025)."""
+"""24 poses by pycolmap 4.2.1 (names as 7-Scenes has them), and results by hloc's `write_poses` for 17 of its 20 test
+photos; the figures below are what hloc's `evaluate` prints for these (its commit c13273b)."""
 HLOC_MEDIANS = (0.191, 1.168)
 HLOC_SHARES = [5.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0]
 
