@@ -15,7 +15,7 @@ don't accumulate. The photos share one camera: approximate intrinsics become mor
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,7 +112,7 @@ class Tracker:
         """The request says how to localize where tracking fails; its budget is for all photos together."""
         self._loaded, self._request, self._config = loaded, request or Request(), config
         self._clock, self._renders, self._unverified = Clock(), 0, 0
-        self._intrinsics = _SharedIntrinsics(config)
+        self._intrinsics = SharedIntrinsics(config)
         self._past: deque[tuple[float, Pose]] = deque(maxlen=2)
         """When and where the camera was last; empty while it is lost."""
         self._rendered: RenderedView | None = None
@@ -146,7 +146,7 @@ class Tracker:
         shared, expected = self._intrinsics.applied_to(query), self._expected(time_s)
         estimate = self._followed(shared, expected) if expected else None
         # Tracking failed or is in doubt: the photo is localized like any other.
-        if estimate is None or not _is_placed(estimate.verdict):
+        if estimate is None or not is_placed(estimate.verdict):
             estimate = self._localized(shared, expected, estimate)
         self._renders += estimate.renders
         if estimate.verdict.status is Status.NOT_LOCALIZED or estimate.verdict.reason is Reason.AMBIGUOUS:
@@ -165,13 +165,7 @@ class Tracker:
 
     def _expected(self, time_s: float) -> Pose | None:
         """Return the pose extrapolated to this time; None while the camera is lost."""
-        if len(self._past) < 2:
-            return self._past[-1][1] if self._past else None
-        (before_s, before), (last_s, last) = self._past
-        intervals = (time_s - last_s) / max(last_s - before_s, 1e-9)
-        # In the camera's own frame, so that a steady turn stays one.
-        motion = se3_log(before.camera_from_world @ last.world_from_camera)
-        return moved(last, motion * float(np.clip(intervals, 0.0, self._config.max_intervals)))
+        return extrapolated(self._past, time_s, self._config.max_intervals)
 
     def _followed(self, query: Query, expected: Pose) -> PoseEstimate | None:
         """Refine from the expected pose and verify the result; None where the photo can't be refined."""
@@ -193,7 +187,7 @@ class Tracker:
         step_deg, step_units = pose_distance(self._past[-1][1], found.pose)
         correction = self._intrinsics.correction
         record = IterationRecord("track", found.pose, correction, found.loss, step_deg=step_deg, step_units=step_units)
-        if _is_placed(verdict):
+        if is_placed(verdict):
             self._intrinsics.update(images, found)
         return estimate_of(query, self._loaded, self._request, verdict, [record], timings=timings, renders=renders)
 
@@ -213,13 +207,27 @@ class Tracker:
         shared = self._intrinsics.correction
         records = tuple(replace(record, correction=shared.then(record.correction)) for record in found.records)
         # A fisheye's correction isn't one of the pinhole that the next photos are taken for.
-        if query.lens_prior and _is_placed(found.verdict) and records[-1].lens is None:
+        if query.lens_prior and is_placed(found.verdict) and records[-1].lens is None:
             prior = replace(query.lens_prior, log_focal_scale=found.verdict.focal_sigma)
             self._intrinsics.set(found.pose, records[-1].correction, prior)
         return replace(found, records=records)
 
 
-def _is_placed(verdict: Verdict) -> bool:
+def extrapolated(past: Sequence[tuple[float, Pose]], time_s: float, max_intervals: float) -> Pose | None:
+    """Return the last of some timed poses, moved on at the velocity between the last two; None without a pose.
+
+    The way is no longer than that of so many intervals between those two.
+    """
+    if len(past) < 2:
+        return past[-1][1] if past else None
+    (before_s, before), (last_s, last) = past[-2], past[-1]
+    intervals = (time_s - last_s) / max(last_s - before_s, 1e-9)
+    # In the camera's own frame, so that a steady turn stays one.
+    motion = se3_log(before.camera_from_world @ last.world_from_camera)
+    return moved(last, motion * float(np.clip(intervals, 0.0, max_intervals)))
+
+
+def is_placed(verdict: Verdict) -> bool:
     """Return whether there is no reason to search for the photo elsewhere."""
     return verdict.status is Status.LOCALIZED or verdict.reason in INTRINSICS_DOUBTS
 
@@ -284,11 +292,15 @@ def verify_tracked(
     images: QueryImages, found: TrackedPose, config: VerificationConfig = VERIFICATION
 ) -> Verdict | None:
     """Return the gate's verdict by the signals of the pixels alone; None where these don't suffice to accept."""
+    verdict = photometric_verdict(images, found, config)
+    return verdict if photometric_suffices(verdict.signals, config) else None
+
+
+def photometric_verdict(images: QueryImages, found: TrackedPose, config: VerificationConfig = VERIFICATION) -> Verdict:
+    """Return the gate's verdict by the signals of the pixels alone, also where these don't suffice to accept."""
     frame, size = found.rendered.frame, found.rendered.camera.intrinsics
     signals = appearance(images.resized(size), frame, images.valid_mask(size))
     signals |= geometry_signals(frame, size, found.uncertainty)
-    if not photometric_suffices(signals, config):
-        return None
     lens_prior = images.query.lens_prior
     # A shared focal length is not for one photo to doubt.
     focal_step = 0.0 if lens_prior else found.uncertainty.focal_step
@@ -298,7 +310,7 @@ def verify_tracked(
 
 
 @dataclass(slots=True)
-class _SharedIntrinsics:
+class SharedIntrinsics:
     """The intrinsics that the photos so far agree on; each that sees the scene from another place adds to them."""
 
     config: TrackingConfig

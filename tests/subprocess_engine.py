@@ -9,7 +9,9 @@ import multiprocessing
 import pickle
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -17,7 +19,8 @@ from typing import Any
 
 from service.errors import SceneNotReady
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
-from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, OnRecord
+from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
+from service.live.live_values import LiveTask
 from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
 from service.types import SceneInfo
 
@@ -33,8 +36,9 @@ def no_set_up(engine: EmbeddedEngine) -> None: ...
 class _Call:
     name: str
     arguments: tuple
+    number: int = 0
     messages: SimpleQueue = field(default_factory=SimpleQueue)
-    """("record", ...)..., then ("value", ...) or ("error", ...)."""
+    """("record", ...), ("frame?", None) or ("answer", ...), any number; then ("value", ...) or ("error", ...)."""
 
 
 class SubprocessEngine:
@@ -134,6 +138,25 @@ class SubprocessEngine:
     def cancel(self, task_id: str) -> None:
         self._ask("cancel", task_id)
 
+    def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
+        call = self._send(_Call("live", (task,)))
+        try:
+            while True:
+                kind, value = call.messages.get()
+                if kind == "frame?":
+                    self._give(call.number, next_frame())
+                elif kind == "answer":
+                    on_answer(value)
+                elif kind == "error":
+                    raise value
+                else:
+                    return
+        except _ChildGone as error:
+            raise EngineLost from error
+        except BaseException:
+            self._give(call.number, None)  # it may be a callback that failed: the session ends
+            raise
+
     def render(self, scene_id: str, picture: PictureSpec) -> bytes:
         return self._ask("render", scene_id, picture)
 
@@ -159,14 +182,20 @@ class SubprocessEngine:
     def _send(self, call: _Call) -> _Call:
         with self._lock:
             self._count += 1
-            self._calls[self._count] = call
+            call.number = self._count
+            self._calls[call.number] = call
             try:
                 assert self._pipe is not None
-                self._pipe.send((self._count, call.name, call.arguments))
+                self._pipe.send((call.number, call.name, call.arguments))
             except OSError:  # the child is gone; `_receive` ends all its calls
                 if self._closed:
                     call.messages.put(("error", _gone()))
         return call
+
+    def _give(self, number: int, frame: Any) -> None:
+        with self._lock, suppress(OSError):  # a child that is gone needs no frame
+            assert self._pipe is not None
+            self._pipe.send((number, "frame", (frame,)))
 
     def _receive(self, pipe: Connection) -> None:
         while True:
@@ -174,7 +203,7 @@ class SubprocessEngine:
                 number, kind, value = pipe.recv()
             except (EOFError, OSError):
                 break
-            if kind == "record":
+            if kind in ("record", "frame?", "answer"):
                 self._calls[number].messages.put((kind, value))
             else:
                 self._calls.pop(number).messages.put((kind, value))
@@ -202,10 +231,19 @@ def _run(pipe: Connection, config: EngineConfig, set_up: SetUp) -> None:
         with lock:
             pipe.send(message)
 
+    frames: dict[int, SimpleQueue] = {}
+
+    def next_frame(number: int) -> Any:
+        send(number, "frame?", None)
+        return frames[number].get()
+
     def answer(number: int, name: str, arguments: tuple) -> None:
         try:
             if name == "localize":
                 value = engine.localize(*arguments, lambda *record: send(number, "record", record))
+            elif name == "live":
+                on_answer = partial(send, number, "answer")
+                value = engine.live(*arguments, partial(next_frame, number), on_answer)
             elif name == "when_settled":
                 engine.when_settled(*arguments, lambda: send(number, "value", None))
                 return
@@ -224,9 +262,13 @@ def _run(pipe: Connection, config: EngineConfig, set_up: SetUp) -> None:
             break
         if call is None:
             break
-        if call[1] in ("add", "start", "cancel"):
+        if call[1] == "frame":
+            frames[call[0]].put(*call[2])
+        elif call[1] in ("add", "start", "cancel"):
             answer(*call)  # in their order
         else:
+            if call[1] == "live":
+                frames[call[0]] = SimpleQueue()
             threading.Thread(target=answer, args=call, daemon=True).start()
     engine.close()
 

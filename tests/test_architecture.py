@@ -29,7 +29,7 @@ FLOORS = {
         {"estimators", "registration"},
         {"localize"},
         {"tracking", "smoothing", "multi_scene"},
-        {"scene_manager"},
+        {"scene_manager", "live"},
         {"jobs"},
         {"web", "bench"},
         {"cli"},

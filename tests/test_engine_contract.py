@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import pickle
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -31,6 +32,7 @@ from service.errors import (
     BadInput,
     CorruptScene,
     EstimatorFault,
+    InvalidImage,
     InvalidIntrinsics,
     SceneInUse,
     SceneNotFound,
@@ -38,8 +40,9 @@ from service.errors import (
     SceneUnloaded,
 )
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
-from service.jobs.engine import Engine, HeldScenes, LocalizeTask, SequenceSource
+from service.jobs.engine import Engine, EngineLost, HeldScenes, LocalizeTask, SequenceSource
 from service.jobs.model import JobRecord
+from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.localize import Cancelled
 from service.photos.images import read_query
 from service.photos.sequence import SequenceOptions
@@ -249,6 +252,52 @@ def test_errors_keep_their_kind(engine, held):
         engine.localize(task(held, "z"), nothing)
 
 
+def live_frames(count: int, seen: list[LiveAnswer]) -> Callable[[], LiveFrame | None]:
+    """Frames of one camera, until so many are answered."""
+    numbers = iter(range(10_000))
+
+    def next_frame() -> LiveFrame | None:
+        if len(seen) >= count:
+            return None
+        time.sleep(0.005)
+        number = next(numbers)
+        return LiveFrame(number, number / 30, test_api.photo())
+
+    return next_frame
+
+
+def test_a_live_session_answers_each_frame_it_asks_for(engine, held):
+    seen: list[LiveAnswer] = []
+
+    def until_lost() -> LiveFrame | None:
+        assert len(seen) < 4000, "the search never ended"
+        return None if seen and seen[-1].mode == "lost" else give()
+
+    give = live_frames(10_000, seen)
+    engine.live(LiveTask(held.token, "stepping"), until_lost, seen.append)
+    # The scene is grey and the photo noise: searches end without an answer, and that is told.
+    assert [answer.id for answer in seen] == list(range(len(seen)))
+    assert {answer.mode for answer in seen} == {"relocalizing", "lost"}
+    assert {(answer.size, answer.pose, answer.verdict) for answer in seen} == {((96, 64), None, None)}
+    assert [answer.time_s for answer in seen] == [number / 30 for number in range(len(seen))]
+
+
+def test_a_live_session_ends_with_an_error_of_its_own(engine, held):
+    task, seen = LiveTask(held.token, "stepping"), []
+    frames = iter([LiveFrame(0, 0.0, test_api.photo()), LiveFrame(1, 0.1, b"GIF89a")])
+    with pytest.raises(InvalidImage, match="JPEG"):
+        engine.live(task, lambda: next(frames), seen.append)
+    assert [answer.id for answer in seen] == [0]
+
+    def fail(answer: LiveAnswer) -> None:
+        raise KeyError("enough")
+
+    with pytest.raises(KeyError, match="enough"):
+        engine.live(task, live_frames(1, []), fail)
+    with pytest.raises(SceneNotReady, match="was unloaded"):
+        engine.live(LiveTask("none", "stepping"), live_frames(1, []), seen.append)
+
+
 def test_several_attempts_run_at_once(engine, held):
     GO_ON.clear()
     done: list[str] = []
@@ -366,6 +415,13 @@ def test_a_job_that_kills_its_engine_is_given_up(stepping):
         until_ready(client)
         path = post(client, prefer="", options=SLOW).headers["location"]
         until(lambda: client.get(path).json()["records"] == 2)
-        app.state.app_state.engine.child.kill()
+        engine, seen = app.state.app_state.engine, []
+
+        def kill(answer: LiveAnswer) -> None:
+            seen.append(answer)
+            engine.child.kill()
+
+        with pytest.raises(EngineLost):  # a live session is told
+            engine.live(LiveTask(engine.hold("room").token, "stepping"), live_frames(100, seen), kill)
         job = finished(client, path)
         assert (job["state"], job["attempt"], job["error"]["code"]) == ("interrupted", 1, "interrupted")

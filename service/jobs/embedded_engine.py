@@ -11,9 +11,11 @@ from pathlib import Path
 
 from service.errors import SceneNotReady
 from service.estimators import ESTIMATORS
-from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask, OnRecord, SequenceSource
+from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord, SequenceSource
 from service.jobs.model import JobRecord, JobResult
 from service.jobs.trajectory import Trajectory
+from service.live.live_tracker import LiveTracker
+from service.live.live_values import LiveTask
 from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene, Request, localize
 from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import read_sequence
@@ -153,6 +155,15 @@ class EmbeddedEngine:
     def cancel(self, task_id: str) -> None:
         if cancel := self._cancels.get(task_id):
             cancel.set()
+
+    def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
+        held = self._held.get(task.held)
+        if held is None:
+            raise SceneNotReady("the session's scene was unloaded.", where="scene")
+        # Closed also after an error: a search in the background uses the scene.
+        with closing(LiveTracker(task, held.scenes[0])) as tracker:
+            while (frame := next_frame()) is not None:
+                on_answer(tracker.use(frame))
 
     def render(self, scene_id: str, picture: PictureSpec) -> bytes:
         return scene_images.picture(self._manager.get(scene_id), picture)

@@ -2,7 +2,8 @@
 
 Arguments and results are plain values that can be pickled, so an engine may be threads of this process
 (`embedded_engine`), another process, or another machine. Records come through a callback while `localize` blocks its
-caller; a session, in which photos and poses go both ways, fits beside it as another method of the same kind.
+caller. In a live session frames and poses go both ways: `live` blocks its caller, asks for each frame by one callback,
+and gives its answer to another.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.jobs.model import JobRecord, JobResult
+from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.photos.sequence import SequenceOptions
 from service.results import StageTiming
 from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
@@ -72,6 +74,11 @@ class EngineAnswer:
 
 OnRecord = Callable[[JobRecord, Query | None], None]
 """Takes a record; of a sequence with the photo that the result would show if it ended here, if that is another now."""
+
+NextFrame = Callable[[], LiveFrame | None]
+"""Waits for the frame to use next and returns it; None: the session has ended."""
+OnAnswer = Callable[[LiveAnswer], None]
+"""Takes the answer to the frame that was asked for last."""
 
 
 @runtime_checkable
@@ -147,6 +154,15 @@ class Engine(Protocol):
 
     def cancel(self, task_id: str) -> None:
         """End an attempt at its next record; without effect if it doesn't run."""
+        ...
+
+    def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
+        """Follow a camera: ask for a frame, answer it, and so on; return once there is none any more.
+
+        Both callbacks are called by turns, on the calling thread. Raises SceneNotReady for a token that isn't known,
+        InvalidImage, InvalidIntrinsics for a frame that can't be used, InvalidAccuracy, EngineLost, and what the
+        callbacks raise; the session is over then.
+        """
         ...
 
     def render(self, scene_id: str, picture: PictureSpec) -> bytes:

@@ -1,0 +1,8 @@
+"""A live session: frames of a moving camera go in, a pose for each frame that was used comes out.
+
+    newest frame (`mailbox`) -> decode -> extrapolated pose -> refine on one small render -> the gate by the pixels
+    beside it, on a thread of lower priority: the whole gate every second; a search where tracking is lost
+
+`live_values` has what goes in and out, `live_tracker` the method, `background` the thread beside it, `pace` what the
+client is advised to send.
+"""
