@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import typer
 
 
-def openapi() -> None:
+def openapi(
+    live: Annotated[
+        bool, typer.Option("--live", help="The JSON Schema of live sessions, docs/live.schema.json.")
+    ] = False,
+) -> None:
     """Print the API's description, as openapi.yaml has it."""
     from service.web.app import openapi_yaml
+    from service.web.schemas.live import live_schema
 
-    typer.echo(openapi_yaml(), nl=False)
+    typer.echo(live_schema() if live else openapi_yaml(), nl=False)

@@ -144,7 +144,9 @@ async def _start(
     await to_thread.run_sync(jobs.start)
     limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
     _add_gauges(metrics, engine, jobs, settings.workers)
-    return AppState(settings, engine, scene_store, jobs, lenses, keys, metrics, *limits)
+    state = AppState(settings, engine, scene_store, jobs, lenses, keys, metrics, *limits)
+    metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
+    return state
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:

@@ -19,6 +19,8 @@ METRICS_TYPE = CONTENT_TYPE_LATEST
 # From a rendered thumbnail to the longest searches.
 _SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60, 120)
 
+_FRAME_SECONDS = (0.005, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.12, 0.2, 0.5, 1, 2)
+
 GaugeValues = Mapping[tuple[str, ...], float]
 """Values of a gauge by the values of its labels."""
 
@@ -66,6 +68,18 @@ class Metrics:
             registry=registry,
         )
 
+        self._live_frames = Counter("splatfix_live_frames", "Frames of live sessions", ["outcome"], registry=registry)
+        self._live_s = Histogram(
+            "splatfix_live_answer_seconds",
+            "Time from a frame's arrival to its answer, by the session's mode",
+            ["mode"],
+            buckets=_FRAME_SECONDS,
+            registry=registry,
+        )
+        self._live_closed = Counter(
+            "splatfix_live_closed", "Live sessions that ended, by close code", ["code"], registry=registry
+        )
+
     def request(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request that was answered. `route` is the path with its parameters' names."""
         # Clients can invent methods: each would be a time series of its own.
@@ -93,6 +107,17 @@ class Metrics:
     def rendered(self, scene: str, seconds: float) -> None:
         """Count an image that was rendered for a client."""
         self._render_s.labels(scene).observe(seconds)
+
+    def live_frame(self, mode: str, status: str, seconds: float, dropped: int) -> None:
+        """Count a frame of a live session that was answered, and those dropped before it."""
+        self._live_frames.labels(status).inc()
+        self._live_s.labels(mode).observe(seconds)
+        if dropped:
+            self._live_frames.labels("dropped").inc(dropped)
+
+    def live_closed(self, code: int) -> None:
+        """Count a live session that ended."""
+        self._live_closed.labels(str(code)).inc()
 
     def gauge(self, name: str, text: str, labels: tuple[str, ...], read: Callable[[], GaugeValues]) -> None:
         """Add a gauge whose values are read at each scrape."""

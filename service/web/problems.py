@@ -195,8 +195,16 @@ def problem_answer(problem: Problem, path: str, headers: Mapping[str, str] | Non
 async def refuse(response: Response, scope: Scope, receive: Receive, send: Send) -> None:
     """Send a response before the body is read; then drop what still arrives of the body for a moment.
 
-    TCP resets a connection that is closed while data arrives, and the client would lose the response.
+    TCP resets a connection that is closed while data arrives, and the client would lose the response. A WebSocket is
+    refused in its handshake, with the response where the server can send one.
     """
+    if scope["type"] == "websocket":
+        await receive()  # websocket.connect, which ASGI wants read before the answer
+        if "websocket.http.response" in scope.get("extensions", {}):
+            await response(scope, receive, send)
+        else:
+            await send({"type": "websocket.close", "code": 1008})
+        return
 
     async def keep_open(message: Message) -> None:
         await send({**message, "more_body": True} if message["type"] == "http.response.body" else message)

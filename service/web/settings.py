@@ -130,6 +130,16 @@ class Settings(BaseSettings):
     """A client that reads nothing of its response for this long is disconnected."""
     rate_limit: str = "30/second"
     """Rate limit of each client, for requests other than GET, e.g. 10/second or 600/minute; empty: none."""
+    live_sessions: int = Field(default=16, ge=0)
+    """Live sessions at once; 0: none."""
+    live_sessions_of_client: int = Field(default=4, ge=1)
+    """Live sessions at once of one client."""
+    live_frame_bytes: int = Field(default=2_000_000, ge=1000)
+    """Size limit of a message of a live session."""
+    live_fps: int = Field(default=60, ge=1)
+    """Frames a second in a live session, on average over two seconds."""
+    live_idle_s: float = Field(default=60.0, gt=0)
+    """A live session without a frame for so long ends, and lets go of its scene."""
     max_wait_s: float = Field(default=60.0, gt=0, le=3600)
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"

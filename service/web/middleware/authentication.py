@@ -160,10 +160,6 @@ def allowed_hosts(listens_on: str, given: Sequence[str], *, open_to_all: bool) -
 
 
 async def _refuse(error: Unauthorized | Forbidden, scope: Scope, receive: Receive, send: Send) -> None:
-    if scope["type"] == "websocket":
-        await receive()  # websocket.connect, which ASGI wants read before the answer
-        await send({"type": "websocket.close", "code": 1008, "reason": error.message[:100]})
-        return
     response = problem_response(error, scope["path"])
     if isinstance(error, Unauthorized):
         response.headers["WWW-Authenticate"] = "Bearer"

@@ -40,7 +40,7 @@ class Limits:
         self._uploads = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
+        if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
         policy: RoutePolicy = scope["state"]["policy"]
@@ -48,6 +48,9 @@ class Limits:
             await self._check_head(scope, policy)
         except (SplatfixError, HTTPException) as error:
             await refuse(problem_response(error, scope["path"]), scope, receive, send)
+            return
+        if scope["type"] == "websocket":
+            await self._app(scope, receive, send)
             return
         if policy.body is None:
             await self._app(scope, _without_body(receive), send)

@@ -16,6 +16,7 @@ GET    /scenes/{id}/thumbnail.jpg             small JPEG
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
 POST   /scenes/{id}/render                    colour or depth from any pose
 POST   /scenes/{id}/registration              where the scene is; GET, DELETE (undo)
+WS     /scenes/{id}/live                      a moving camera's frames to poses, see docs/live.md
 GET    /lenses                                DELETE /lenses, /lenses/{id}
 POST   /tokens                                short-lived, for pages
 GET    /capabilities, /version, /livez, /readyz, /metrics
@@ -25,8 +26,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.web.routes import geopose, jobs, lenses, localize, registrations, scenes, system
+from service.web.routes import geopose, jobs, lenses, live, localize, registrations, scenes, system
 
 router = APIRouter()
-for part in (localize, geopose, jobs, scenes, registrations, lenses, system):
+for part in (localize, geopose, jobs, scenes, registrations, live, lenses, system):
     router.include_router(part.router)

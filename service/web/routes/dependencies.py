@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import anyio
@@ -39,6 +40,8 @@ class AppState:
     """Limits the photos that are decoded at once: one may take 450 MB."""
     rendering: anyio.CapacityLimiter
     """Limits the images that are rendered at once for clients: each thread of a renderer keeps working memory."""
+    live: Counter[str] = field(default_factory=Counter)
+    """Live sessions under way, by client."""
 
     async def render_in_thread(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
         """Render an image for a client in a thread, and count it in the metrics."""
