@@ -21,7 +21,8 @@ SOURCES = sorted(p for folder in ("service", "viewer") for p in (ROOT / folder).
 FLOORS = {
     "service": [
         {
-            *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "client", "codec"),
+            *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "codec"),
+            *("client", "live_client"),
             "operating_system",
         },
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
@@ -107,7 +108,7 @@ WRAPPED = {
     "structlog": {"service/logs.py"},
     "pyproj": {"service/geodesy.py"},
     "yaml": {"service/web/openapi.py"},
-    "websockets": {"service/web/viewer_relay.py"},
+    "websockets": {"service/web/viewer_relay.py", "service/live_client.py"},
     "httpx": {"service/web/viewer_relay.py", "service/client.py"},
     "uvicorn": {"service/cli/server.py"},
     "matplotlib": {"service/bench/paper/figures.py"},

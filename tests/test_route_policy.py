@@ -82,15 +82,14 @@ def status_of_head(app: FastAPI, method: str, path: str, key: str = "", root: st
         return {"type": "http.disconnect"}
 
     async def send(message) -> None:
-        if message["type"] == "http.response.start":
+        if message["type"] in ("http.response.start", "websocket.http.response.start"):
             answered.append(message["status"])
-        elif message["type"] == "websocket.close":
-            answered.append({1008: 401}.get(message["code"], 0))
 
     headers = [(b"host", b"127.0.0.1"), (b"content-length", b"%d" % LIMIT)]
     headers += [(b"authorization", f"Bearer {key}".encode())] if key else []
     headers += [(b"x-forwarded-prefix", root.encode())] if root else []
-    kind = {"type": "websocket"} if method == "WEBSOCKET" else {"type": "http", "method": method}
+    refusable = {"extensions": {"websocket.http.response": {}}}
+    kind = {"type": "websocket", **refusable} if method == "WEBSOCKET" else {"type": "http", "method": method}
     scope = {**kind, "path": path, "query_string": b"", "headers": headers, "client": ("127.0.0.1", 1)}
     scope["asgi"] = {"version": "3.0", "spec_version": "2.4"}
 
@@ -110,7 +109,7 @@ def test_every_route_refuses_before_it_reads(locked, keys, root):
         if policy.role is None:
             continue
         assert status_of_head(locked, method, path, root=root) == 401, (method, path)
-        for role in ROLES[: ROLES.index(policy.role)] if method != "WEBSOCKET" else ():
+        for role in ROLES[: ROLES.index(policy.role)]:
             assert status_of_head(locked, method, path, keys[role], root) == 403, (method, path, role)
         if policy.body:
             assert status_of_head(locked, method, path, keys[policy.role], root) == 413, (method, path)

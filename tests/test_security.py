@@ -294,7 +294,7 @@ def test_the_viewers_socket_needs_a_key(stepping, ring, tmp_path):
         address = f"ws://127.0.0.1:{client.base_url.port}/viewer/"
         with pytest.raises(InvalidStatus) as refused, connect(address, proxy=None):
             pass
-        assert refused.value.response.status_code == 403
+        assert refused.value.response.status_code == 401
         assert_problem(client.get("/viewer/"), 401, "unauthorized")
 
 

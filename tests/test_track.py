@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 import threading
+import time
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from api_server import until
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service import tracking as track
 from service.bench import track as bench
 from service.bench.pose_metrics import Units
-from service.errors import SceneNotFound
+from service.errors import InvalidImage, SceneNotFound
 from service.geometry import moved, pose_distance
+from service.live.background import Background
+from service.live.live_tracker import LiveTracker
+from service.live.live_values import LiveFrame, LiveTask
 from service.localize import Cancelled, LoadedScene, Request, render_and_verify
 from service.photos.camera_identity import CameraIdentity
 from service.photos.images import encode_image, query_of, read_query
@@ -227,3 +235,72 @@ def test_a_photo_and_its_file_are_the_same_query(room):
     b = read_query(encode_image(pixels, "png"), intrinsics=LENS, long_side=200)
     assert a.intrinsics == b.intrinsics
     assert np.array_equal(a.rgb, b.rgb)
+
+
+# ------------------------------------------------------------------ live
+
+
+def test_a_live_camera_is_searched_beside_followed_and_found_again(room):
+    """Frames as they come from a camera; a lens that was covered for a while; the camera elsewhere afterwards."""
+    tracker = LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room)
+    black = encode_image(BLACK.rgb)
+    there, elsewhere = path(8), path(6, start=3.0)
+    frames = [(k / 30, encode_image(photo(room, pose, k)), pose) for k, pose in enumerate(there)]
+    frames += [(0.5 + k / 30, black, None) for k in range(3)]
+    frames += [(9 + k / 30, encode_image(photo(room, pose, k)), pose) for k, pose in enumerate(elsewhere)]
+    found, number = [], 0
+    with closing(tracker):
+        for time_s, jpeg, truth in frames:
+            # The camera stands still until the search beside has ended.
+            for _ in range(200):
+                number += 1
+                answer = tracker.use(LiveFrame(number, time_s, jpeg))
+                if truth is None or answer.mode == "tracking":
+                    break
+                time.sleep(0.05)
+            found.append((answer, truth))
+    assert [answer.mode for answer, _ in found] == [*8 * ["tracking"], *3 * ["relocalizing"], *6 * ["tracking"]]
+    poses = [(answer, truth) for answer, truth in found if truth is not None]
+    assert {answer.verdict.status for answer, _ in poses} == {Status.LOCALIZED}
+    assert all(close(answer.pose, truth) for answer, truth in poses)  # seen: 0.02 degrees, 0.001
+    assert all(answer.pose is None and answer.verdict is None for answer, truth in found if truth is None)
+
+
+def test_a_live_lens_is_estimated_once_and_kept_for_frames_of_any_size(room):
+    wrong = replace(LENS, fx=1.1 * FOCAL, fy=1.1 * FOCAL, trust="approximate")
+    half = LENS.resized(WIDTH // 2, HEIGHT // 2)
+    with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=wrong), room)) as tracker:
+        first = encode_image(photo(room, place(1.0, 0.1)))
+        until(lambda: tracker.use(LiveFrame(0, 0.0, first)).mode == "tracking")
+        small = tracker.use(LiveFrame(1, 0.1, encode_image(photo(room, place(1.02, 0.1), 1, half))))
+        # This frame says what its lens is.
+        own = tracker.use(LiveFrame(2, 0.2, encode_image(photo(room, place(1.04, 0.1), 2)), intrinsics=LENS))
+        with pytest.raises(InvalidImage, match="at most 4200000 pixels, not 2300 x 2000"):
+            tracker.use(LiveFrame(3, 0.3, encode_image(np.zeros((2000, 2300, 3), np.uint8))))
+    assert small.intrinsics is not None
+    assert small.intrinsics.fx == pytest.approx(FOCAL / 2, rel=0.02)
+    assert small.pose is not None
+    assert close(small.pose, place(1.02, 0.1), 0.2, 0.05)
+    assert own.intrinsics == LENS
+
+
+def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():
+    began = threading.Event()
+
+    def call(cancel: threading.Event) -> int:
+        began.set()
+        assert cancel.wait(10)
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) if sys.platform == "linux" else 0
+
+    background: Background[int] = Background()
+    with closing(background):
+        background.start(call)
+        assert began.wait(10)
+        assert not background.idle
+        assert background.result() is None
+        background.cancel()
+        while (nice := background.result()) is None:
+            time.sleep(0.005)
+        assert background.idle
+    if sys.platform == "linux":
+        assert nice > os.getpriority(os.PRIO_PROCESS, 0)

@@ -12,7 +12,7 @@ def openapi(
         bool, typer.Option("--live", help="The JSON Schema of live sessions, docs/live.schema.json.")
     ] = False,
 ) -> None:
-    """Print the API's description, as openapi.yaml has it."""
+    """Print the API's description, as openapi.yaml has it, or docs/live.schema.json."""
     from service.web.app import openapi_yaml
     from service.web.schemas.live import live_schema
 

@@ -165,6 +165,10 @@ class LiveTracker:
             query = query_in_scene(query, self._origin)
         return asked_of(query, self._loaded, Request(accuracy=self._task.accuracy))
 
+    def _through_lens(self, query: Query) -> Query:
+        """Return a frame with what is known of the session's lens; one with exact intrinsics as it is."""
+        return self._lens.applied_to(query) if query.lens_prior else query
+
     def _answer(self, frame: LiveFrame, size: tuple[int, int], followed: _Followed | None) -> LiveAnswer:
         mode: Mode = "lost" if self._searches else "relocalizing"
         astray = frame.time_s - self._verified_s > self._config.unverified_s
@@ -198,7 +202,7 @@ class LiveTracker:
     def _followed(self, query: Query, time_s: float) -> _Followed | None:
         """Refine near the expected pose; None where the gate refuses what that led to."""
         self._tried_s = time_s
-        query = self._lens.applied_to(query)
+        query = self._through_lens(query)
         images = QueryImages(query, self._loaded.matcher)
         tracking = self._config.tracking
         fresh = time_s - self._past[-1][0] <= self._config.stale_s
@@ -242,7 +246,7 @@ class LiveTracker:
         return float(query.rgb[::8, ::8].std()) < self._config.min_contrast
 
     def _searched(self, query: Query, time_s: float, expected: Pose | None, cancel: threading.Event) -> _Found | None:
-        query = self._lens.applied_to(query)
+        query = self._through_lens(query)
         loaded = self._loaded.as_seen_by(query)
         seconds = self._config.search_s[self._searches % len(self._config.search_s)]
         task = self._task

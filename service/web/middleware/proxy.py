@@ -47,7 +47,7 @@ class Proxy:
             return
         scope = {**scope, **_sub_path(scope, self._default_root), "state": dict(scope.get("state", {}))}
         if scope["type"] == "websocket":
-            await self._app(scope, receive, send)
+            await self._handshake(scope, receive, send)
             return
         response = _Response(scope, send, self._send_s)
         began = time.perf_counter()
@@ -64,6 +64,26 @@ class Proxy:
                     await problem_response(error, scope["path"])(scope, receive, response.send)
             finally:
                 self._report(scope, response.status, time.perf_counter() - began)
+
+    async def _handshake(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a WebSocket on; report its handshake like a request, when it is answered."""
+        request_id, began, answered = _request_id(scope), time.perf_counter(), False
+
+        async def send_and_report(message: Message) -> None:
+            nonlocal answered
+            # A close before the handshake is a refusal, which servers answer with 403.
+            statuses = {"websocket.accept": 101, "websocket.close": 403}
+            status = message.get("status", statuses.get(message["type"]))
+            if not answered and status is not None:
+                answered = True
+                if message["type"] != "websocket.close":
+                    headers = MutableHeaders(scope=message)
+                    headers[REQUEST_ID] = request_id
+                self._report({**scope, "method": "GET"}, status, time.perf_counter() - began)
+            await send(message)
+
+        with bound(request_id=request_id):
+            await self._app(scope, receive, send_and_report)
 
     def _report(self, scope: Scope, status: int, seconds: float) -> None:
         route = getattr(scope.get("route"), "path", "other")
@@ -82,9 +102,7 @@ class _Response:
 
     def __init__(self, scope: Scope, send: Send, send_s: float) -> None:
         self._send, self._send_s = send, send_s
-        given = Headers(scope=scope).get(REQUEST_ID, "")
-        # A proxy's id is kept, so that its log and ours can be joined, but only if it can't forge log lines.
-        self.request_id = given if re.fullmatch(r"[\w.-]{1,64}", given) else secrets.token_hex(8)
+        self.request_id = _request_id(scope)
         self.status = 499  # as in nginx: the client closed the connection before the response
         self.begun = self.dropped = False
         path = scope["path"].removeprefix(scope.get("root_path", ""))
@@ -107,6 +125,12 @@ class _Response:
         except TimeoutError:
             self.dropped = True
             raise OSError("the client reads too slowly") from None
+
+
+def _request_id(scope: Scope) -> str:
+    given = Headers(scope=scope).get(REQUEST_ID, "")
+    # A proxy's id is kept, so that its log and ours can be joined, but only if it can't forge log lines.
+    return given if re.fullmatch(r"[\w.-]{1,64}", given) else secrets.token_hex(8)
 
 
 def _sub_path(scope: Scope, default: str) -> dict[str, str]:

@@ -1,0 +1,179 @@
+"""A live session from Python: send a moving camera's frames, read where it is.
+
+    from service.live_client import Live
+    with Live("http://127.0.0.1:8000", "studio") as live:
+        live.send(jpeg)
+        answer = live.answer()
+        print(answer.mode, answer.status, answer.world_from_camera)
+
+One file that applications copy: Python 3.10 and the package websockets, nothing else of ours. Frames may be sent from
+one thread while another reads the answers. docs/live.md has the protocol.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+from urllib.parse import quote
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+_HEAD, _INTRINSICS = struct.Struct("<4sBBHIId"), struct.Struct("<4d")
+
+
+class LiveRefused(Exception):
+    """The handshake was refused: key, role, rate or address."""
+
+    def __init__(self, status: int, problem: Mapping[str, Any]) -> None:
+        super().__init__(f"HTTP {status}: {problem.get('detail', '')} {problem.get('hint', '')}".strip())
+        self.status = status
+        self.problem = problem
+        """The problem document; empty if something else answered."""
+
+
+class LiveClosed(Exception):
+    """The session ended; docs/live.md lists the codes."""
+
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(f"{code} {reason}".strip())
+        self.code = code
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class LiveAnswer:
+    """What a frame led to."""
+
+    id: int
+    """The frame's, as `send` returned it."""
+    time_s: float
+    mode: str
+    """tracking, relocalizing or lost."""
+    status: str
+    """localized, uncertain or not_localized."""
+    reason: str | None
+    score: float | None
+    world_from_camera: list[list[float]] | None
+    """4x4, OpenCV camera axes, scene units; None without a pose."""
+    covariance: list[list[float]] | None
+    """6x6, of the twist (rotation in rad, translation in units) in the camera frame: true = pose @ exp(twist)."""
+    intrinsics: dict[str, Any] | None
+    waited_ms: float
+    used_ms: float
+    dropped: list[int]
+    """Ids of the frames since the last answer that were not used."""
+
+
+class Live:
+    """One session. Raises LiveRefused when it can't begin, LiveClosed once it has ended."""
+
+    def __init__(
+        self,
+        url: str,
+        scene: str,
+        *,
+        key: str = "",
+        intrinsics: Mapping[str, Any] | None = None,
+        prior: Mapping[str, Any] | None = None,
+        accuracy: Mapping[str, Any] | None = None,
+        timeout_s: float = 60.0,
+        **connection: Any,
+    ) -> None:
+        """Connect to the service at `url` (http or https) and begin; a scene may have to be loaded for that.
+
+        `intrinsics`, `prior` and `accuracy` are those of a request to localize. `connection` goes to
+        `websockets.sync.client.connect`, e.g. `ssl=` for a certificate of your own.
+        """
+        address = f"ws{url.removeprefix('http').rstrip('/')}/scenes/{quote(scene, safe='')}/live"
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        try:
+            self._socket = connect(
+                address, additional_headers=headers, compression=None, open_timeout=timeout_s, **connection
+            )
+        except InvalidStatus as error:
+            raise LiveRefused(error.response.status_code, _problem(error.response.body)) from None
+        self.hint: dict[str, Any] = {}
+        """What the service advises: `max_fps`, `long_side_px`; empty while there is no advice."""
+        self._next_id = 0
+        hello = {"type": "hello", "version": 1, "intrinsics": intrinsics, "prior": prior, "accuracy": accuracy}
+        self._send(json.dumps({name: value for name, value in hello.items() if value is not None}))
+        self.welcome: dict[str, Any] = json.loads(self._receive(timeout_s))
+        """The service's first message, with the session's limits."""
+
+    def __enter__(self) -> Live:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Iterator[LiveAnswer]:
+        """Yield the answers until the session ends by itself or by `close`."""
+        while True:
+            try:
+                answer = self.answer()
+            except LiveClosed as closed:
+                if closed.code == 1000:
+                    return
+                raise
+            if answer:
+                yield answer
+
+    def send(self, jpeg: bytes, time_s: float | None = None, fx_fy_cx_cy: Sequence[float] | None = None) -> int:
+        """Send a frame, return its id. It may be dropped for a newer one.
+
+        `time_s` is when it was taken, by any clock that doesn't go back; default: now. `fx_fy_cx_cy` are this frame's
+        intrinsics in its pixels, for lenses that change.
+        """
+        number, self._next_id = self._next_id, self._next_id + 1
+        more = _INTRINSICS.pack(*fx_fy_cx_cy) if fx_fy_cx_cy else b""
+        taken = time.monotonic() if time_s is None else time_s
+        head = _HEAD.pack(b"SFLV", 1, 1 if more else 0, _HEAD.size + len(more), number, 0, taken)
+        self._send(head + more + jpeg)
+        return number
+
+    def answer(self, timeout_s: float | None = None) -> LiveAnswer | None:
+        """Wait for the next answer; None if none came in that time."""
+        until = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            try:
+                message = json.loads(self._receive(None if until is None else max(0.0, until - time.monotonic())))
+            except TimeoutError:
+                return None
+            if message["type"] == "hint":
+                self.hint = {name: message[name] for name in ("max_fps", "long_side_px") if message[name]}
+            elif message["type"] == "answer":
+                return LiveAnswer(**{field.name: message[field.name] for field in fields(LiveAnswer)})
+
+    def close(self) -> None:
+        """End the session; without effect on one that has ended."""
+        self._socket.close()
+
+    def _send(self, message: str | bytes) -> None:
+        try:
+            self._socket.send(message)
+        except ConnectionClosed as error:
+            raise _closed(error) from None
+
+    def _receive(self, timeout_s: float | None) -> str | bytes:
+        try:
+            return self._socket.recv(timeout_s)
+        except ConnectionClosed as error:
+            raise _closed(error) from None
+
+
+def _closed(error: ConnectionClosed) -> LiveClosed:
+    # 1006: the connection broke without a close frame.
+    return LiveClosed(error.rcvd.code, error.rcvd.reason) if error.rcvd else LiveClosed(1006, "connection lost")
+
+
+def _problem(body: bytes | None) -> Mapping[str, Any]:
+    try:
+        problem = json.loads(body or b"")
+    except ValueError:
+        return {}
+    return problem if isinstance(problem, dict) else {}

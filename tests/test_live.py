@@ -1,0 +1,240 @@
+"""Live sessions over real sockets: the protocol, its refusals and limits; and the tracker on rendered frames."""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import httpx
+import pytest
+from api_server import ROOT, create_app, fake_estimators, photo, serving, settings, until, until_ready
+from jsonschema import Draft202012Validator
+from stand_ins import make_scene
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Origin
+
+from service.live.live_values import LiveFrame
+from service.live.mailbox import Mailbox
+from service.live.pace import Pace
+from service.live_client import Live, LiveClosed, LiveRefused
+from service.web.api_keys import add_key, remove_key
+from service.web.routes import live as live_routes
+from service.web.schemas.live import live_schema
+
+SCHEMA = json.loads((ROOT / "docs" / "live.schema.json").read_text("utf-8"))
+VALID = Draft202012Validator(SCHEMA)
+HELLO = {"type": "hello", "version": 1}
+
+
+def test_the_schema_is_that_of_the_messages():
+    Draft202012Validator.check_schema(SCHEMA)
+    assert live_schema() == (ROOT / "docs" / "live.schema.json").read_text("utf-8"), (
+        "splatfix openapi --live > docs/live.schema.json"
+    )
+    assert not VALID.is_valid({"type": "hello"})
+
+
+def test_the_document_lists_every_close_code():
+    text = (ROOT / "docs" / "live.md").read_text("utf-8")
+    told = set(re.findall(r"^\| (4\d{3}) \|", text, re.M))
+    names = ("BAD_MESSAGE", "KEY_GONE", "NO_SCENE", "TIMEOUT", "TOO_LARGE", "TOO_MANY", "FAILED", "UNAVAILABLE")
+    assert told == {str(getattr(live_routes, name)) for name in names}
+
+
+@pytest.fixture(scope="module")
+def service(stepping_module) -> Iterator[httpx.Client]:
+    chosen = settings(live_sessions_of_client=2, live_fps=30, rate_limit="")
+    with serving(create_app(chosen, {"room": make_scene()})) as client:
+        until_ready(client)
+        yield client
+
+
+@pytest.fixture(scope="module")
+def stepping_module() -> Iterator[object]:
+    with fake_estimators() as stepping:
+        yield stepping
+
+
+def address(client: httpx.Client, scene: str = "room") -> str:
+    return f"ws://127.0.0.1:{client.base_url.port}/scenes/{scene}/live"
+
+
+def url(client: httpx.Client) -> str:
+    return f"http://127.0.0.1:{client.base_url.port}"
+
+
+def live(client: httpx.Client, scene: str = "room", **options) -> Live:
+    return Live(url(client), scene, proxy=None, **options)
+
+
+def frame(number: int, time_s: float, jpeg: bytes | None = None, *, flags: int = 0, length: int = 24) -> bytes:
+    head = struct.pack("<4sBBHIId", b"SFLV", 1, flags, length, number, 0, time_s)
+    return head + (photo() if jpeg is None else jpeg)
+
+
+@contextmanager
+def raw(client: httpx.Client, *messages: str | bytes, scene: str = "room") -> Iterator[ClientConnection]:
+    with connect(address(client, scene), proxy=None, compression=None) as socket:
+        for message in messages:
+            socket.send(message)
+        yield socket
+
+
+def closed(socket: ClientConnection) -> tuple[int, str]:
+    """Read until the service closes the socket; all that it says is valid by the schema."""
+    with pytest.raises(ConnectionClosed) as ended:
+        list(iter(lambda: VALID.validate(json.loads(socket.recv(10))), ""))
+    received = ended.value.rcvd
+    assert received
+    return received.code, received.reason
+
+
+def sessions(client: httpx.Client) -> float:
+    return float(re.search(r"^splatfix_live_sessions ([\d.]+)$", client.get("/metrics").text, re.M)[1])  # type: ignore[index]
+
+
+def test_frames_are_answered_in_messages_of_the_schema(service):
+    with raw(service, json.dumps(HELLO)) as socket:
+        welcome = json.loads(socket.recv(10))
+        VALID.validate(welcome)
+        assert (welcome["type"], welcome["scene"], welcome["limits"]["frames_per_s"]) == ("welcome", "room", 30)
+        assert service.get("/scenes/room").json()["jobs"] == 1  # the scene is pinned
+        seen = []
+        for number in range(5):
+            socket.send(frame(number, number / 30))
+            answer = json.loads(socket.recv(10))
+            VALID.validate(answer)
+            seen.append(
+                (answer["id"], answer["time_s"], answer["status"], answer["world_from_camera"], answer["dropped"])
+            )
+        assert seen == [(number, number / 30, "not_localized", None, []) for number in range(5)]
+    until(lambda: sessions(service) == 0)
+    assert service.get("/scenes/room").json()["jobs"] == 0
+    told = service.get("/metrics").text
+    assert re.search(r'splatfix_live_frames_total\{outcome="not_localized"\} \d', told)
+    assert 'splatfix_requests_total{method="GET",route="/scenes/{scene_id}/live",status="101"}' in told
+
+
+def test_only_the_newest_frame_waits_and_what_it_replaced_is_told():
+    box = Mailbox()
+    for number in range(4):
+        box.put(LiveFrame(number, float(number), b""))
+    taken = box.take()
+    assert taken is not None
+    assert (taken[0].id, taken[2]) == (3, (0, 1, 2))
+    box.put(LiveFrame(4, 4.0, b""))
+    assert box.take()[2] == ()  # type: ignore[index]
+    box.put(LiveFrame(5, 5.0, b""))
+    box.close()
+    assert box.take() is None
+
+
+def test_advice_follows_what_can_be_used():
+    pace = Pace(60)
+    # 30 frames a second come, 20 can be used; then 15 come, and still 20 could be.
+    told = [pace.used(k / 20, 0.05, k % 2, 640) for k in range(90)]
+    assert [(hint.max_fps, hint.long_side_px) for hint in told if hint] == [(20, None)]
+    told = [pace.used(5 + k / 15, 0.02, 0, 2000) for k in range(60)]
+    assert [(hint.max_fps, hint.long_side_px) for hint in told if hint] == [(50, 640)]
+
+
+BAD = {
+    "no JSON": (["{"], 4400, "hello: the first message is not JSON"),
+    "no hello": (['{"type": "hi", "version": 1}'], 4400, "type: Input should be 'hello'"),
+    "another version": (['{"type": "hello", "version": 2}'], 4400, "version: Input should be 1"),
+    "an unknown field": (['{"type": "hello", "version": 1, "odometry": true}'], 4400, "odometry: unknown field"),
+    "bytes first": ([b"x"], 4400, "hello: the first message is JSON"),
+    "bad intrinsics": ([json.dumps(HELLO | {"intrinsics": {"width": 3}})], 4400, "intrinsics."),
+    "text later": ([json.dumps(HELLO), "{}"], 4400, "frame: after the hello"),
+    "a truncated header": ([json.dumps(HELLO), b"SFLV\1"], 4400, "frame: the header has 24 bytes or more"),
+    "garbage": ([json.dumps(HELLO), b"x" * 999], 4400, "frame: a message begins with SFLV and version 1"),
+    "an unknown flag": ([json.dumps(HELLO), frame(1, 1.0, flags=2)], 4400, "frame.flags: unknown flags"),
+    "a wrong length": ([json.dumps(HELLO), frame(1, 1.0, length=99)], 4400, "frame.length: the header has 24 bytes"),
+    "an id again": ([json.dumps(HELLO), *2 * [frame(1, 1.0)]], 4400, "frame.id: must ascend: 1 after 1"),
+    "time goes back": ([json.dumps(HELLO), frame(1, 1.0), frame(2, 0.5)], 4400, "frame.time: must be finite"),
+    "no time": ([json.dumps(HELLO), frame(1, float("nan"))], 4400, "frame.time: must be finite"),
+    "a PNG": ([json.dumps(HELLO), frame(1, 1.0, photo("png"))], 4400, "frame: a frame is a JPEG."),
+    "half a JPEG": ([json.dumps(HELLO), frame(1, 1.0, photo()[:200])], 4400, ""),
+    "too large": ([json.dumps(HELLO), b"x" * 2_000_001], 4413, "a message has at most 2000000 bytes, not 2000001."),
+    "too many": ([json.dumps(HELLO), *(frame(k, k / 99) for k in range(80))], 4429, "more than 30 frames a second."),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_ends_the_session_with_a_code_and_a_reason(service, case):
+    messages, code, reason = BAD[case]
+    with raw(service) as socket:
+        for message in messages:
+            try:
+                socket.send(message)
+            except ConnectionClosed:
+                break  # it was ended by an earlier one
+        found = closed(socket)
+    assert found[0] == code, found
+    assert found[1].startswith(reason), found
+
+
+def test_scenes_and_places_that_are_not_there_are_told(service):
+    with raw(service, json.dumps(HELLO), scene="attic") as socket:
+        assert closed(socket)[0] == 4404
+    with live(service), live(service), raw(service) as third:
+        assert closed(third) == (4429, "2 live sessions of yours go on already.")
+    until(lambda: sessions(service) == 0)
+    with live(service) as again:
+        assert again.welcome["scene"] == "room"
+
+
+def test_an_idle_session_ends(stepping_module):
+    app = create_app(settings(live_idle_s=1.0, live_sessions=1, viewer=False), {"room": make_scene()})
+    with serving(app) as client:
+        until_ready(client)
+        with live(client) as idle, pytest.raises(LiveClosed) as ended:
+            idle.answer()
+        assert (ended.value.code, ended.value.reason) == (4408, "no frame came for 1 s.")
+        with live(client), pytest.raises(LiveClosed, match="4429 the service has 1 live sessions"):
+            live(client)
+        until(lambda: sessions(client) == 0)
+        # A shutdown closes sessions with a code that says: connect again.
+        last = live(client)
+    with pytest.raises(LiveClosed) as ended:
+        last.answer(10)
+    assert ended.value.code == 1012
+
+
+def test_the_handshake_is_refused_by_http_status(stepping_module, tmp_path):
+    file = tmp_path / "keys.json"
+    keys = {role: add_key(file, role, role) for role in ("read", "localize")}
+    app = create_app(settings(keys_file=file, rate_limit="4/hour"), {"room": make_scene()})
+    with serving(app) as client:
+        until(lambda: client.get("/readyz").status_code == 200)
+        for key, status, code in (
+            ("", 401, "unauthorized"),
+            ("sfx_x", 401, "unauthorized"),
+            (keys["read"], 403, "forbidden"),
+        ):
+            with pytest.raises(LiveRefused) as refused:
+                live(client, key=key)
+            assert (refused.value.status, refused.value.problem["code"]) == (status, code)
+        with (
+            pytest.raises(InvalidStatus) as foreign,
+            connect(address(client), origin=Origin("https://evil.example"), proxy=None),
+        ):
+            pass
+        assert foreign.value.response.status_code == 403
+        token = client.post("/tokens", headers={"Authorization": f"Bearer {keys['localize']}"}).json()["token"]
+        with connect(f"{address(client)}?token={token}", proxy=None) as by_token:
+            by_token.send(json.dumps(HELLO))
+            assert json.loads(by_token.recv(10))["type"] == "welcome"
+            session = live(client, key=keys["localize"])
+            with live(client, key=keys["localize"]), pytest.raises(LiveRefused) as refused:
+                live(client, key=keys["localize"])
+            assert (refused.value.status, refused.value.problem["code"]) == (429, "rate_limited")
+            remove_key(file, "localize")
+            with pytest.raises(LiveClosed) as ended:
+                session.answer(10)
+            assert (ended.value.code, ended.value.reason) == (4401, "the session's key is not valid any more.")
+            assert closed(by_token)[0] == 4401
