@@ -171,7 +171,7 @@ def _closed(error: ConnectionClosed) -> LiveClosed:
     return LiveClosed(error.rcvd.code, error.rcvd.reason) if error.rcvd else LiveClosed(1006, "connection lost")
 
 
-def _problem(body: bytes | None) -> Mapping[str, Any]:
+def _problem(body: bytes | bytearray | None) -> Mapping[str, Any]:
     try:
         problem = json.loads(body or b"")
     except ValueError:

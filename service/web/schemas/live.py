@@ -6,7 +6,7 @@ import json
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
-from pydantic.json_schema import models_json_schema
+from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.errors import InvalidRequest
@@ -150,13 +150,15 @@ def live_hint_out(hint: Hint) -> LiveHint:
 
 def live_schema() -> str:
     """Return the text of docs/live.schema.json: each JSON message is one of its definitions."""
-    sent = [(LiveHello, "validation")]
-    received = [(model, "serialization") for model in (LiveWelcome, LiveAnswerOut, LiveHint)]
-    _, schema = models_json_schema([*sent, *received], ref_template="#/$defs/{model}")
+    messages: list[tuple[type[Model], JsonSchemaMode]] = [
+        *((model, "serialization") for model in (LiveWelcome, LiveAnswerOut, LiveHint)),
+        (LiveHello, "validation"),
+    ]
+    _, schema = models_json_schema(messages, ref_template="#/$defs/{model}")
     schema = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"JSON messages of a live session, version {PROTOCOL}",
-        "oneOf": [{"$ref": f"#/$defs/{model.__name__}"} for model, _ in (*sent, *received)],
+        "oneOf": [{"$ref": f"#/$defs/{model.__name__}"} for model, _ in messages],
         **schema,
     }
     return json.dumps(schema, indent=1) + "\n"
