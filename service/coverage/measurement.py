@@ -1,0 +1,129 @@
+"""Measures a coverage map: localizes spoilt renders spread over the scene, and held-out real photos, on all cores."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from service.coverage.calibration import Calibration, calibrated
+from service.coverage.coverage_map import CoverageMap, Trial
+from service.coverage.held_out_photos import HeldOutPhoto
+from service.coverage.plan import PLAN, PlanConfig, Places, find_places, spread
+from service.coverage.spoilt_photos import SPOIL, SpoilConfig, spoilt_photo
+from service.geometry import pose_distance
+from service.localize import DEFAULT_ESTIMATOR, Cancelled, LoadedScene, Request, localize
+from service.photos.images import read_query
+from service.pose.features.image_sizes import RENDER_PX, sized
+from service.pose.verification.signals import typical_depth
+from service.results import Status
+from service.scene_origin import shifted
+from service.types import Camera, Query
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageConfig:
+    trials: int = 160
+    """Spoilt renders: some 50 s of the studio on two cores."""
+    budget_renders: int = 60
+    """Of each photo: what takes longer is not found in a second or two, and a user has taken the next photo."""
+    plan: PlanConfig = PLAN
+    spoil: SpoilConfig = SPOIL
+
+
+COVERAGE = CoverageConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """What a measurement needs beside the scene."""
+
+    held_out: Sequence[HeldOutPhoto] = ()
+    progress: Callable[[int, int], None] | None = None
+    """Called with the photos that are done, and all, from several threads."""
+    cancel: threading.Event = field(default_factory=threading.Event)
+    config: CoverageConfig = COVERAGE
+
+
+def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
+    """Return the coverage map of a scene for the default estimator; deterministic but for its `seconds`.
+
+    Raises Cancelled after `how.cancel` was set.
+    """
+    began, config, origin = time.perf_counter(), how.config, loaded.scene.info.origin_in_world
+    index = loaded.prepare(DEFAULT_ESTIMATOR)
+    captured = [named.camera for named in loaded.searched.cameras] or [view.camera for view in index.views]
+    distance = _distance(index.views)
+    places = find_places(
+        loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan
+    )
+    pairs = spread(places, config.trials)
+    runner = _Runner(loaded, how, len(pairs) + len(how.held_out))
+    with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="coverage") as pool:
+        cameras = [places.cameras[cell][heading] for cell, heading in pairs]
+        trials = tuple(pool.map(runner.try_render, cameras, range(len(cameras))))
+        real = tuple(pool.map(runner.try_photo, how.held_out))
+    found = CoverageMap(
+        loaded.scene.info.sha256,
+        places.plan_from_world,
+        places.cell,
+        places.positions + np.array(origin),
+        places.headings_rad,
+        places.sees_scene,
+        trials,
+        real,
+        Calibration(),
+        0.0,
+    )
+    calibration = calibrated(found.rate_of_renders([t.pose for t in real]), np.array([t.found for t in real], bool))
+    return replace(found, calibration=calibration, seconds=time.perf_counter() - began)
+
+
+def _distance(views: Sequence) -> float:
+    """Return the typical distance from the index's views to what they see."""
+    far = [np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1)) for v in views]
+    return float(np.median(far)) if far else 1.0
+
+
+class _Runner:
+    """Localizes photos; safe from several threads."""
+
+    def __init__(self, loaded: LoadedScene, how: Measurement, total: int) -> None:
+        self._loaded, self._how, self._total = loaded, how, total
+        self._done, self._lock = 0, threading.Lock()
+
+    def try_render(self, camera: Camera, seed: int) -> Trial:
+        rng = np.random.default_rng([1, seed])
+        query = spoilt_photo(camera, self._loaded.rasterizer, rng, self._how.config.spoil)
+        return self._tried(query, Camera(camera.intrinsics, shifted(camera.pose, self._loaded.scene.info.origin_in_world)))
+
+    def try_photo(self, photo: HeldOutPhoto) -> Trial:
+        told = replace(photo.camera.intrinsics, trust="approximate")
+        query = read_query(
+            photo.path.read_bytes(), intrinsics=told, background_rgb=self._loaded.scene.info.background_rgb
+        )
+        return self._tried(query, photo.camera, photo.name)
+
+    def _tried(self, query: Query, truth: Camera, name: str = "") -> Trial:
+        if self._how.cancel.is_set():
+            raise Cancelled
+        request = Request(budget_renders=self._how.config.budget_renders, cancel=self._how.cancel)
+        estimate = localize(query, self._loaded, request)
+        degrees, units = pose_distance(estimate.pose, truth.pose)
+        verdict = estimate.verdict
+        right = degrees <= request.accuracy.deg and units <= request.accuracy.bound_units(self._depth(truth))
+        if self._how.progress:
+            with self._lock:
+                self._done += 1
+                self._how.progress(self._done, self._total)
+        return Trial(truth.pose, verdict.status, verdict.status is Status.LOCALIZED and right, degrees, units, name)
+
+    def _depth(self, truth: Camera) -> float:
+        """Return the distance to what is seen at the true pose."""
+        pose = shifted(truth.pose, -np.array(self._loaded.scene.info.origin_in_world))
+        return typical_depth(self._loaded.rasterizer.render([Camera(sized(truth.intrinsics, RENDER_PX), pose)])[0])

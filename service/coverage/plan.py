@@ -1,0 +1,168 @@
+"""The plan view of a scene, and the places where photos of it may be taken: cells around the capture's cameras.
+
+Height, pitch and lens of each place and heading are those of the nearest of the capture's cameras that looks about
+there; without training cameras, of the view index's views. Positions are relative to the scene's origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from service.coverage.coverage_map import heading_of
+from service.geometry import look_at
+from service.interfaces import Rasterizer
+from service.pose.features.image_sizes import sized
+from service.pose.retrieval.free_space import free_space_of
+from service.pose.retrieval.lod_proxy import lod_proxy
+from service.pose.retrieval.view_placement import shows_single_surface
+from service.types import Camera, GaussianScene, Pose
+
+
+@dataclass(frozen=True, slots=True)
+class PlanConfig:
+    """Sizes of the map. All are this map's own choice."""
+
+    cells: int = 64
+    """About so many cover the places around the capture's cameras."""
+    headings: int = 12
+    reach: float = 0.25
+    """How far around the capture's cameras photos are taken, as a share of the distance to what these see."""
+    heading_weight: float = 1.0
+    """Of the chord between two directions against distances in reaches, where the nearest camera is looked for."""
+    render_px: int = 64
+    """Long side of the renders that tell whether a place sees the scene."""
+    min_distance: float = 0.06
+    """What is nearer than this share of the distance blocks the view."""
+    min_solid_share: float = 0.3
+    """A place sees the scene if the share of its view that shows a single surface is this share of the capture's."""
+
+
+PLAN = PlanConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Cells and headings, each with its camera."""
+
+    plan_from_world: Float64[np.ndarray, "3 3"]
+    cell: float
+    positions: Float64[np.ndarray, "c 3"]
+    headings_rad: Float64[np.ndarray, "h"]
+    cameras: tuple[tuple[Camera, ...], ...]
+    """By cell and heading."""
+    sees_scene: Bool[np.ndarray, "c h"]
+
+
+def find_places(
+    scene: GaussianScene,
+    rasterizer: Rasterizer,
+    captured: Sequence[Camera],
+    distance: float,
+    rng: np.random.Generator,
+    config: PlanConfig = PLAN,
+) -> Places:
+    """Return where photos may be taken; `distance` is the typical one to what `captured`, at least one camera, see."""
+    space, plan = free_space_of(scene), plan_axes(captured, scene.info.up_in_world)
+    at = np.array([plan @ camera.pose.position_in_world for camera in captured])
+    cell, middles = _cells(at[:, :2], config.reach * distance, config.cells)
+    headings = np.arange(config.headings) * 2 * np.pi / config.headings
+    rows = [[_camera(m, h, captured, at, plan, config.reach * distance, config) for h in headings] for m in middles]
+    heights = np.array([np.median([plan[2] @ c.pose.position_in_world for c in row]) for row in rows])
+    positions = np.column_stack([middles, heights]) @ plan
+    search = lod_proxy(scene, rasterizer, rng)
+    least = config.min_solid_share * float(np.median(_solid_shares(search, captured[:64], distance, config)))
+    flat = [camera for row in rows for camera in row]
+    solid = _solid_shares(search, flat, distance, config)
+    free = ~space.occupied(np.array([camera.pose.position_in_world for camera in flat]))
+    sees = (free & (solid >= max(least, 1e-9))).reshape(len(middles), config.headings)
+    kept = sees.any(1)
+    return Places(
+        plan, cell, positions[kept], headings, tuple(tuple(row) for row, k in zip(rows, kept, strict=True) if k),
+        sees[kept],
+    )  # fmt: skip
+
+
+def plan_axes(
+    captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None
+) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation from the world to the plan: up is the third axis, the first as near as can be to a world axis.
+
+    Without a known up direction it is the mean of the cameras' own.
+    """
+    up = np.array(up_in_world) if up_in_world else -np.sum([c.pose.world_from_camera[:3, 1] for c in captured], 0)
+    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
+    first = np.eye(3)[int(np.argmin(np.abs(up)))]
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(up, first), up])
+
+
+def _cells(
+    at: Float64[np.ndarray, "n 2"], reach: float, count: int
+) -> tuple[float, Float64[np.ndarray, "c 2"]]:
+    """Return the side and the middles of about `count` square cells that lie within reach of points."""
+    low, high = at.min(0) - reach, at.max(0) + reach
+    cell = float(np.sqrt(np.prod(high - low) / count))
+    # The cells beside the cameras are left out: smaller ones, until there are enough.
+    for _ in range(8):
+        across = [np.arange(a + 0.5 * cell, b + 0.5 * cell, cell) for a, b in zip(low, high, strict=True)]
+        grid = np.stack(np.meshgrid(*across, indexing="ij"), -1).reshape(-1, 2)
+        near = np.linalg.norm(grid[:, None] - at, axis=2).min(1) <= reach
+        if near.sum() >= 0.9 * count:
+            break
+        cell *= 0.85
+    return cell, grid[near]
+
+
+def _camera(
+    middle: Float64[np.ndarray, "2"],
+    heading: float,
+    captured: Sequence[Camera],
+    at: Float64[np.ndarray, "n 3"],
+    plan: Float64[np.ndarray, "3 3"],
+    reach: float,
+    config: PlanConfig,
+) -> Camera:
+    """Return a camera at a place that looks along a heading, otherwise like the nearest camera of the capture."""
+    directions = np.array([heading_of(camera.pose, plan) for camera in captured])
+    chords = 2 * np.abs(np.sin(0.5 * (directions - heading)))
+    apart = np.linalg.norm(at[:, :2] - middle, axis=1) / reach
+    like = int(np.argmin(apart**2 + (config.heading_weight * chords) ** 2))
+    pitch = float(np.arcsin(np.clip(plan[2] @ captured[like].pose.axis_in_world, -1, 1)))
+    return Camera(captured[like].intrinsics, pose_at(np.array([*middle, at[like, 2]]), heading, pitch, plan))
+
+
+def pose_at(
+    at: Float64[np.ndarray, "3"], heading: float, pitch: float, plan: Float64[np.ndarray, "3 3"]
+) -> Pose:
+    """Return an upright camera at a position of the plan with this heading and pitch (rad, above the horizon)."""
+    pitch = float(np.clip(pitch, np.radians(-85), np.radians(85)))
+    axis = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), np.sin(pitch)])
+    return look_at(at @ plan, (at + axis) @ plan, plan[2])
+
+
+def _solid_shares(
+    search: Rasterizer, cameras: Sequence[Camera], distance: float, config: PlanConfig
+) -> Float64[np.ndarray, "n"]:
+    small = [Camera(sized(camera.intrinsics, config.render_px), camera.pose) for camera in cameras]
+    frames = search.render(small, approximate=True)
+    return np.array([float(shows_single_surface(f, config.min_distance * distance).mean()) for f in frames])
+
+
+def spread(places: Places, count: int) -> Int64[np.ndarray, "k 2"]:
+    """Return at most `count` pairs of cell and heading that see the scene, spread evenly: farthest points first."""
+    pairs = np.argwhere(places.sees_scene)
+    if not len(pairs):
+        return pairs
+    angles = places.headings_rad[pairs[:, 1]]
+    at = (places.positions[pairs[:, 0]] @ places.plan_from_world.T)[:, :2] / places.cell
+    coordinates = np.column_stack([at, 2 * np.cos(angles), 2 * np.sin(angles)])
+    chosen, apart = [0], np.linalg.norm(coordinates - coordinates[0], axis=1)
+    while len(chosen) < min(count, len(pairs)):
+        chosen.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(coordinates - coordinates[chosen[-1]], axis=1))
+    return pairs[chosen]
