@@ -599,6 +599,10 @@ class Client:
             time.sleep(_scene_pause(scene, waiting))
         return scene
 
+    def coverage(self, scene_id: str, *, measure: bool = False) -> Json:
+        """Return a scene's coverage map as the API has it, or how far it is measured; `measure`: begin that."""
+        return _document(self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
+
     def splats(self, scene_id: str, limit: int) -> bytes:
         """Return the most important Gaussians for drawing, in the binary form of GET /scenes/{id}/splats."""
         return self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit}).content
@@ -747,6 +751,9 @@ class AsyncClient:
         while (scene := await self.scene(scene_id)).state != "ready":
             await asyncio.sleep(_scene_pause(scene, waiting))
         return scene
+
+    async def coverage(self, scene_id: str, *, measure: bool = False) -> Json:
+        return _document(await self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
 
     async def splats(self, scene_id: str, limit: int) -> bytes:
         return (await self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit})).content

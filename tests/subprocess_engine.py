@@ -21,7 +21,14 @@ from service.errors import SceneNotReady
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.live.live_values import LiveTask
-from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
+from service.scene_manager.status import (
+    CoverageStatus,
+    PictureSpec,
+    SceneContents,
+    SceneReadiness,
+    SceneStatus,
+    StoredScene,
+)
 from service.types import SceneInfo
 
 SetUp = Callable[[EmbeddedEngine], None]
@@ -165,6 +172,12 @@ class SubprocessEngine:
 
     def splats(self, scene_id: str, limit: int) -> bytes:
         return self._ask("splats", scene_id, limit)
+
+    def coverage(self, scene_id: str) -> CoverageStatus:
+        return self._ask("coverage", scene_id)
+
+    def measure_coverage(self, scene_id: str) -> CoverageStatus:
+        return self._ask("measure_coverage", scene_id)
 
     # ------------------------------------------------------------------ the pipe
 

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from service.cli.terminal import registrations_folder
+from service.cli.terminal import registrations_folder, settings_of
+from service.coverage.coverage_cache import coverage_file, read_coverage
+from service.coverage.held_out_photos import held_out_photos
 from service.localize import ASSUMED_TRAINING_PX, choose_rasterizer
 from service.pose.retrieval.floaters import find_floaters, without_floaters
 from service.pose.retrieval.view_placement import coverage, find_views
@@ -25,7 +27,8 @@ def scene_facts(path: Path) -> dict[str, Any]:
     Returns values that JSON can hold. Raises SceneError.
     """
     scene = load_scene(path)
-    rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(without_floaters(scene))
+    searched = without_floaters(scene)
+    rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(searched)
     info, floaters = scene.info, find_floaters(scene)
     registration = SceneRegistrations(registrations_folder()).of(path, info)
     told = registered_info(info, registration)
@@ -60,7 +63,8 @@ def scene_facts(path: Path) -> dict[str, Any]:
             }
             for frame in info.frames
         ],
-        "index": _index(without_floaters(scene), rasterizer),
+        "index": _index(searched, rasterizer),
+        "expected_accuracy": _expected_accuracy(path, searched, rasterizer.name),
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
     if not info.up_in_world:
@@ -104,6 +108,26 @@ def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
     }
 
 
+def _expected_accuracy(path: Path, searched: GaussianScene, rasterizer: str) -> dict[str, Any] | None:
+    """Return what the scene's coverage map says, None if none was measured."""
+    settings = settings_of({})
+    if settings.cache_dir is None:
+        return None
+    file = coverage_file(settings.cache_dir, searched, rasterizer, settings.matcher, held_out_photos(path))
+    found = read_coverage(file)
+    if found is None:
+        return None
+    expected = found.expected_accuracy()
+    return {
+        "title": found.title,
+        "found": expected.found,
+        "sure_share": expected.sure_share,
+        "median_rotation_deg": expected.median_rotation_deg,
+        "median_position_units": expected.median_position_units,
+        "brier": found.calibration.brier,
+    }
+
+
 def as_lines(facts: dict[str, Any]) -> dict[str, str]:
     """Return the facts as text, by label."""
     index, size, memory = facts["index"], facts["training_size"], facts["memory_bytes"]
@@ -132,9 +156,19 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         },
         "index": placed,
         "coverage": f"{index['coverage']:.1%} of the opaque Gaussians are seen by these views",
+        "expected accuracy": _accuracy(facts),
         "sha256": facts["sha256"],
     }
     return lines | {f"warning {i}": text for i, text in enumerate(facts["warnings"], 1)}
+
+
+def _accuracy(facts: dict[str, Any]) -> str:
+    expected, scale = facts["expected_accuracy"], facts["metres_per_unit"]
+    if expected is None:
+        return "not measured: splatfix scenes coverage"
+    position = f"{expected['median_position_units'] * (scale or 1.0):.2g} {'m' if scale else 'units'}"
+    accuracy = f"median {expected['median_rotation_deg']:.2g} degrees, {position}"
+    return f"{accuracy}; {expected['found']:.0%} of photos are found ({expected['title']})"
 
 
 def _floaters(facts: dict[str, Any]) -> str:

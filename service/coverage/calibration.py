@@ -8,6 +8,7 @@ photo differs from it by what was changed, moved, lit otherwise, or reconstructe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,8 @@ class CalibrationPrior:
 
 
 PRIOR = CalibrationPrior()
+_WIDE = 5.0
+"""Standard deviation of weights of which nothing is known: only keeps them finite where one outcome is missing."""
 _SHARES = (0.01, 0.99)
 """Shares are kept within: a kernel over a few trials can't tell them from 0 and 1."""
 
@@ -78,21 +81,39 @@ def brier_score(probabilities: Float64[np.ndarray, "k"], found: Bool[np.ndarray,
     return float(np.mean((probabilities - found) ** 2))
 
 
+def fitted_line(
+    x: Float64[np.ndarray, "k"], found: Bool[np.ndarray, "k"]
+) -> Callable[[Float64[np.ndarray, "n"]], Float64[np.ndarray, "n"]]:
+    """Return the logistic regression of an outcome on one variable, as a function of that variable."""
+    offset, slope = _maximum(np.stack([np.ones(len(x)), x], 1), found, np.zeros(2), np.full(2, _WIDE))
+    return lambda values: _sigmoid(offset + slope * values)
+
+
 def _fit(
     shares: Float64[np.ndarray, "k"], found: Bool[np.ndarray, "k"], prior: CalibrationPrior
 ) -> tuple[float, float]:
     design = np.stack([np.ones(len(shares)), _logit(shares)], 1)
-    mean = np.array([prior.offset, prior.slope])
-    precision = np.diag([prior.offset_sigma**-2, prior.slope_sigma**-2])
-    at = mean.copy()
-    # The posterior is log-concave: a few damped steps reach its maximum to many digits.
+    mean, sigma = np.array([prior.offset, prior.slope]), np.array([prior.offset_sigma, prior.slope_sigma])
+    offset, slope = _maximum(design, found, mean, sigma)
+    return float(offset), float(slope)
+
+
+def _maximum(
+    design: Float64[np.ndarray, "k d"],
+    found: Bool[np.ndarray, "k"],
+    mean: Float64[np.ndarray, "d"],
+    sigma: Float64[np.ndarray, "d"],
+) -> Float64[np.ndarray, "d"]:
+    """Return the weights of a logistic regression with a normal prior, by damped Newton steps."""
+    precision, at = np.diag(sigma**-2), mean.copy()
+    # The posterior is log-concave: so many steps reach its maximum to many digits.
     for _ in range(50):
         p = _sigmoid(design @ at)
         gradient = design.T @ (found - p) - precision @ (at - mean)
         hessian = (design * (p * (1 - p))[:, None]).T @ design + precision
         step = np.linalg.solve(hessian, gradient)
-        at += step / max(1.0, float(np.abs(step).max()))
-    return float(at[0]), float(at[1])
+        at = at + step / max(1.0, float(np.abs(step).max()))
+    return at
 
 
 def _logit(shares: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "k"]:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from service.coverage.calibration import Calibration
+from service.coverage.calibration import Calibration, fitted_line
 from service.results import Status
 from service.types import Pose, frozen
 
 FOUND_AT = 0.9
 """Probability from which on a place is shown as one where photos are found."""
-SMOOTHING_CELLS, SMOOTHING_RAD, PRIOR_WEIGHT = 1.2, float(np.radians(25)), 0.5
-"""Standard deviations of the kernel over places and headings, and trials' worth of the mean over the whole scene."""
+SMOOTHING_CELLS, SMOOTHING_RAD, PRIOR_WEIGHT = 1.2, float(np.radians(25)), 2.0
+"""Standard deviations of the kernel over places and headings, and how many trials' worth the prediction by the novelty
+has against those nearby."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +32,8 @@ class Trial:
     rotation_deg: float
     """Errors of the pose that was found; 0 without a status."""
     position_units: float
+    novelty: float
+    """How far it is from the capture's cameras (`plan.novelty`)."""
     photo: str = ""
     """Name of a real photo."""
 
@@ -49,6 +53,8 @@ class CoverageMap:
     headings_rad: Float64[np.ndarray, "h"]
     sees_scene: Bool[np.ndarray, "c h"]
     """Whether enough of the scene is in view there."""
+    novelties: Float64[np.ndarray, "c h"]
+    """Of each place and heading (`plan.novelty`)."""
     trials: tuple[Trial, ...]
     """Of spoilt renders."""
     real_trials: tuple[Trial, ...]
@@ -58,7 +64,7 @@ class CoverageMap:
     """Wall time of the measurement."""
 
     def __post_init__(self) -> None:
-        for name in ("plan_from_world", "positions_in_world", "headings_rad"):
+        for name in ("plan_from_world", "positions_in_world", "headings_rad", "novelties"):
             object.__setattr__(self, name, frozen(getattr(self, name), np.float64))
         object.__setattr__(self, "sees_scene", frozen(self.sees_scene, np.bool_))
 
@@ -74,26 +80,34 @@ class CoverageMap:
         """Probability that a photo of each place and heading is found; 0 where nothing of the scene is in view."""
         count = len(self.headings_rad)
         at = np.repeat(self.positions_in_world @ self.plan_from_world.T, count, 0)[:, :2]
-        raw = self._smoothed(at, np.tile(self.headings_rad, len(self.positions_in_world)))
-        return np.where(self.sees_scene, self.calibration.applied(raw).reshape(self.sees_scene.shape), 0.0)
+        headings = np.tile(self.headings_rad, len(self.positions_in_world))
+        rates = self._rates(at, headings, self.novelties.ravel())
+        return np.where(self.sees_scene, self.calibration.applied(rates).reshape(self.sees_scene.shape), 0.0)
 
-    def rate_of_renders(self, poses: list[Pose]) -> Float64[np.ndarray, "k"]:
-        """Return the share of spoilt renders found near poses of the world, before calibration."""
-        at = np.array([self.plan_from_world @ pose.position_in_world for pose in poses]).reshape(-1, 3)[:, :2]
-        return self._smoothed(at, np.array([heading_of(pose, self.plan_from_world) for pose in poses]))
+    def rates_near(self, trials: Sequence[Trial]) -> Float64[np.ndarray, "k"]:
+        """Return the probability that a spoilt render is found where other photos were taken, before calibration."""
+        return self._rates(*self._coordinates(trials), np.array([trial.novelty for trial in trials]))
 
-    def _smoothed(self, at: Float64[np.ndarray, "k 2"], headings: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "k"]:
-        """Average the trials by a Gaussian kernel (Nadaraya-Watson), with the scene's mean as a weak prior."""
+    def _coordinates(self, trials: Sequence[Trial]) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k"]]:
+        at = np.array([self.plan_from_world @ trial.pose.position_in_world for trial in trials]).reshape(-1, 3)[:, :2]
+        return at, np.array([heading_of(trial.pose, self.plan_from_world) for trial in trials])
+
+    def _rates(
+        self, at: Float64[np.ndarray, "k 2"], headings: Float64[np.ndarray, "k"], novelties: Float64[np.ndarray, "k"]
+    ) -> Float64[np.ndarray, "k"]:
+        """Predict by the novelty, and add what the trials nearby were better or worse (Nadaraya-Watson's average)."""
         tried = [trial for trial in self.trials if trial.status is not None]
         if not tried:
             return np.zeros(len(at))
-        found = np.array([trial.found for trial in tried], np.float64)
-        places = np.array([self.plan_from_world @ trial.pose.position_in_world for trial in tried])[:, :2]
-        directions = np.array([heading_of(trial.pose, self.plan_from_world) for trial in tried])
+        found = np.array([trial.found for trial in tried])
+        known = np.array([trial.novelty for trial in tried])
+        line = fitted_line(known, found)
+        places, directions = self._coordinates(tried)
         apart = np.linalg.norm(at[:, None] - places, axis=2) / (SMOOTHING_CELLS * self.cell)
         turned = np.abs((headings[:, None] - directions + np.pi) % (2 * np.pi) - np.pi) / SMOOTHING_RAD
         weights = np.exp(-0.5 * (apart**2 + turned**2))
-        return (weights @ found + PRIOR_WEIGHT * found.mean()) / (weights.sum(1) + PRIOR_WEIGHT)
+        local = (weights @ (found - line(known))) / (weights.sum(1) + PRIOR_WEIGHT)
+        return np.clip(line(novelties) + local, 0.0, 1.0)
 
     def expected_accuracy(self) -> ExpectedAccuracy:
         """Summarize: what to expect of a photo that is taken where the scene was captured."""

@@ -14,12 +14,13 @@ import numpy as np
 from service.coverage.calibration import Calibration, calibrated
 from service.coverage.coverage_map import CoverageMap, Trial
 from service.coverage.held_out_photos import HeldOutPhoto
-from service.coverage.plan import PLAN, PlanConfig, Places, find_places, spread
+from service.coverage.plan import PLAN, PlanConfig, find_places, novelty, spread
 from service.coverage.spoilt_photos import SPOIL, SpoilConfig, spoilt_photo
 from service.geometry import pose_distance
-from service.localize import DEFAULT_ESTIMATOR, Cancelled, LoadedScene, Request, localize
+from service.localize import DEFAULT_ESTIMATOR, Cancelled, LoadedScene, Request, localize_in_scene
 from service.photos.images import read_query
 from service.pose.features.image_sizes import RENDER_PX, sized
+from service.pose.features.rendered_views import View
 from service.pose.verification.signals import typical_depth
 from service.results import Status
 from service.scene_origin import shifted
@@ -57,13 +58,13 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
     """
     began, config, origin = time.perf_counter(), how.config, loaded.scene.info.origin_in_world
     index = loaded.prepare(DEFAULT_ESTIMATOR)
+    # Once for the scene; else the first photo that needs them would spend its budget on them.
+    index.free_views.of(loaded.searched, loaded.rasterizer, loaded.matcher, index.views)
     captured = [named.camera for named in loaded.searched.cameras] or [view.camera for view in index.views]
     distance = _distance(index.views)
-    places = find_places(
-        loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan
-    )
+    places = find_places(loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan)
     pairs = spread(places, config.trials)
-    runner = _Runner(loaded, how, len(pairs) + len(how.held_out))
+    runner = _Runner(loaded, how, captured, distance, len(pairs) + len(how.held_out))
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="coverage") as pool:
         cameras = [places.cameras[cell][heading] for cell, heading in pairs]
         trials = tuple(pool.map(runner.try_render, cameras, range(len(cameras))))
@@ -75,55 +76,64 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         places.positions + np.array(origin),
         places.headings_rad,
         places.sees_scene,
+        places.novelties,
         trials,
         real,
         Calibration(),
         0.0,
     )
-    calibration = calibrated(found.rate_of_renders([t.pose for t in real]), np.array([t.found for t in real], bool))
+    calibration = calibrated(found.rates_near(real), np.array([trial.found for trial in real], bool))
     return replace(found, calibration=calibration, seconds=time.perf_counter() - began)
 
 
-def _distance(views: Sequence) -> float:
+def _distance(views: Sequence[View]) -> float:
     """Return the typical distance from the index's views to what they see."""
-    far = [np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1)) for v in views]
+    seeing = [v for v in views if len(v.points_in_world)]
+    far = [np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1)) for v in seeing]
     return float(np.median(far)) if far else 1.0
 
 
 class _Runner:
     """Localizes photos; safe from several threads."""
 
-    def __init__(self, loaded: LoadedScene, how: Measurement, total: int) -> None:
+    def __init__(
+        self, loaded: LoadedScene, how: Measurement, captured: Sequence[Camera], distance: float, total: int
+    ) -> None:
+        self._captured, self._distance = captured, distance
         self._loaded, self._how, self._total = loaded, how, total
         self._done, self._lock = 0, threading.Lock()
 
     def try_render(self, camera: Camera, seed: int) -> Trial:
         rng = np.random.default_rng([1, seed])
-        query = spoilt_photo(camera, self._loaded.rasterizer, rng, self._how.config.spoil)
-        return self._tried(query, Camera(camera.intrinsics, shifted(camera.pose, self._loaded.scene.info.origin_in_world)))
+        return self._tried(spoilt_photo(camera, self._loaded.rasterizer, rng, self._how.config.spoil), camera)
 
     def try_photo(self, photo: HeldOutPhoto) -> Trial:
         told = replace(photo.camera.intrinsics, trust="approximate")
         query = read_query(
             photo.path.read_bytes(), intrinsics=told, background_rgb=self._loaded.scene.info.background_rgb
         )
-        return self._tried(query, photo.camera, photo.name)
+        # Inside of the scene, as the capture's cameras are.
+        pose = shifted(photo.camera.pose, -np.array(self._loaded.scene.info.origin_in_world))
+        return self._tried(query, Camera(photo.camera.intrinsics, pose), photo.name)
 
     def _tried(self, query: Query, truth: Camera, name: str = "") -> Trial:
         if self._how.cancel.is_set():
             raise Cancelled
         request = Request(budget_renders=self._how.config.budget_renders, cancel=self._how.cancel)
-        estimate = localize(query, self._loaded, request)
+        estimate = localize_in_scene(query, self._loaded, request)
         degrees, units = pose_distance(estimate.pose, truth.pose)
         verdict = estimate.verdict
+        (new,) = novelty([truth], self._captured, self._distance, self._how.config.plan)
         right = degrees <= request.accuracy.deg and units <= request.accuracy.bound_units(self._depth(truth))
         if self._how.progress:
             with self._lock:
                 self._done += 1
                 self._how.progress(self._done, self._total)
-        return Trial(truth.pose, verdict.status, verdict.status is Status.LOCALIZED and right, degrees, units, name)
+        found = verdict.status is Status.LOCALIZED and right
+        pose = shifted(truth.pose, self._loaded.scene.info.origin_in_world)
+        return Trial(pose, verdict.status, found, degrees, units, float(new), name)
 
     def _depth(self, truth: Camera) -> float:
         """Return the distance to what is seen at the true pose."""
-        pose = shifted(truth.pose, -np.array(self._loaded.scene.info.origin_in_world))
-        return typical_depth(self._loaded.rasterizer.render([Camera(sized(truth.intrinsics, RENDER_PX), pose)])[0])
+        camera = Camera(sized(truth.intrinsics, RENDER_PX), truth.pose)
+        return typical_depth(self._loaded.rasterizer.render([camera])[0])

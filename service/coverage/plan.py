@@ -33,6 +33,10 @@ class PlanConfig:
     """How far around the capture's cameras photos are taken, as a share of the distance to what these see."""
     heading_weight: float = 1.0
     """Of the chord between two directions against distances in reaches, where the nearest camera is looked for."""
+    novel_position: float = 0.5
+    """Distance to the nearest of the capture's cameras, as a share of the distance to what is seen, and chord between
+    the viewing directions, that count as 1 in the novelty."""
+    novel_chord: float = 0.5
     render_px: int = 64
     """Long side of the renders that tell whether a place sees the scene."""
     min_distance: float = 0.06
@@ -55,6 +59,7 @@ class Places:
     cameras: tuple[tuple[Camera, ...], ...]
     """By cell and heading."""
     sees_scene: Bool[np.ndarray, "c h"]
+    novelties: Float64[np.ndarray, "c h"]
 
 
 def find_places(
@@ -82,14 +87,27 @@ def find_places(
     kept = sees.any(1)
     return Places(
         plan, cell, positions[kept], headings, tuple(tuple(row) for row, k in zip(rows, kept, strict=True) if k),
-        sees[kept],
+        sees[kept], novelty(flat, captured, distance, config).reshape(sees.shape)[kept],
     )  # fmt: skip
 
 
-def plan_axes(
-    captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None
-) -> Float64[np.ndarray, "3 3"]:
-    """Return the rotation from the world to the plan: up is the third axis, the first as near as can be to a world axis.
+def novelty(
+    cameras: Sequence[Camera], captured: Sequence[Camera], distance: float, config: PlanConfig = PLAN
+) -> Float64[np.ndarray, "n"]:
+    """Return how far cameras are from the nearest of the capture's, over position and viewing direction.
+
+    The root of two squares: distance in shares of `distance`, and the chord between the axes, each relative to what
+    the config has; what a photo shows there was seen from about here where it is below 1.
+    """
+    own = np.array([(c.pose.position_in_world, c.pose.axis_in_world) for c in cameras]).reshape(-1, 2, 3)
+    known = np.array([(c.pose.position_in_world, c.pose.axis_in_world) for c in captured])
+    scale = np.array([config.novel_position * distance, config.novel_chord])
+    apart = np.linalg.norm(own[:, None] - known, axis=3) / scale
+    return np.sqrt((apart**2).sum(2)).min(1)
+
+
+def plan_axes(captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None) -> Float64[np.ndarray, "3 3"]:
+    """Return the rotation from the world to the plan: up is the third axis, the first is nearest to a world axis.
 
     Without a known up direction it is the mean of the cameras' own.
     """
@@ -101,9 +119,7 @@ def plan_axes(
     return np.stack([first, np.cross(up, first), up])
 
 
-def _cells(
-    at: Float64[np.ndarray, "n 2"], reach: float, count: int
-) -> tuple[float, Float64[np.ndarray, "c 2"]]:
+def _cells(at: Float64[np.ndarray, "n 2"], reach: float, count: int) -> tuple[float, Float64[np.ndarray, "c 2"]]:
     """Return the side and the middles of about `count` square cells that lie within reach of points."""
     low, high = at.min(0) - reach, at.max(0) + reach
     cell = float(np.sqrt(np.prod(high - low) / count))
@@ -136,9 +152,7 @@ def _camera(
     return Camera(captured[like].intrinsics, pose_at(np.array([*middle, at[like, 2]]), heading, pitch, plan))
 
 
-def pose_at(
-    at: Float64[np.ndarray, "3"], heading: float, pitch: float, plan: Float64[np.ndarray, "3 3"]
-) -> Pose:
+def pose_at(at: Float64[np.ndarray, "3"], heading: float, pitch: float, plan: Float64[np.ndarray, "3 3"]) -> Pose:
     """Return an upright camera at a position of the plan with this heading and pitch (rad, above the horizon)."""
     pitch = float(np.clip(pitch, np.radians(-85), np.radians(85)))
     axis = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), np.sin(pitch)])

@@ -23,9 +23,17 @@ from service.registration.registration import Registration
 from service.results import PoseEstimate
 from service.scene_manager import scene_images
 from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.scene_coverage import SceneCoverages
 from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
 from service.scene_manager.splat_sample import packed_splats
-from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
+from service.scene_manager.status import (
+    CoverageStatus,
+    PictureSpec,
+    SceneContents,
+    SceneReadiness,
+    SceneStatus,
+    StoredScene,
+)
 from service.tracking import localize_sequence
 from service.types import Query, SceneInfo
 from service.versions import versions
@@ -67,6 +75,7 @@ class EmbeddedEngine:
             memory_bytes=config.memory_bytes,
         )
         self._registrations = SceneRegistrations(config.data_folder)
+        self._coverages = SceneCoverages(self._manager)
         self._held: dict[str, _Held] = {}
         self._cancels: dict[str, threading.Event] = {}
         """By the id of the attempt that runs."""
@@ -75,6 +84,7 @@ class EmbeddedEngine:
         self._manager.start()
 
     def close(self) -> None:
+        self._coverages.close()
         self._manager.close()
 
     # ------------------------------------------------------------------ scenes
@@ -173,6 +183,12 @@ class EmbeddedEngine:
 
     def splats(self, scene_id: str, limit: int) -> bytes:
         return packed_splats(self._manager.get(scene_id).scene, limit)
+
+    def coverage(self, scene_id: str) -> CoverageStatus:
+        return self._coverages.of(scene_id)
+
+    def measure_coverage(self, scene_id: str) -> CoverageStatus:
+        return self._coverages.measure(scene_id)
 
 
 def run_task(

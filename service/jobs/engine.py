@@ -17,7 +17,14 @@ from service.jobs.model import JobRecord, JobResult
 from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.photos.sequence import SequenceOptions
 from service.results import StageTiming
-from service.scene_manager.status import PictureSpec, SceneContents, SceneReadiness, SceneStatus, StoredScene
+from service.scene_manager.status import (
+    CoverageStatus,
+    PictureSpec,
+    SceneContents,
+    SceneReadiness,
+    SceneStatus,
+    StoredScene,
+)
 from service.types import Query, SceneInfo
 
 
@@ -175,4 +182,12 @@ class Engine(Protocol):
 
     def splats(self, scene_id: str, limit: int) -> bytes:
         """Return a scene's most important Gaussians in the form of `splat_sample`. Raises SceneError."""
+        ...
+
+    def coverage(self, scene_id: str) -> CoverageStatus:
+        """Return a scene's coverage map, or how far it is measured. Raises SceneNotFound."""
+        ...
+
+    def measure_coverage(self, scene_id: str) -> CoverageStatus:
+        """Begin to measure a scene's coverage map, unless that is under way. Raises SceneError."""
         ...

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64
 
+from service.coverage.coverage_map import CoverageMap
 from service.errors import Failure
 from service.types import Intrinsics, NamedCamera, Pose, SceneInfo
 
@@ -86,3 +87,17 @@ class PictureSpec:
     """`depth` is a NumPy file (.npy): float32 of height x width, z-depth in scene units, 0 where nothing is."""
     quality: int = 90
     """JPEG's, 1..100."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageStatus:
+    """A scene's coverage map, or how far it is measured."""
+
+    state: Literal["none", "running", "ready", "failed"]
+    done: int = 0
+    """Photos that were localized."""
+    total: int = 0
+    """Of so many; 0 while the measurement waits or begins."""
+    found: CoverageMap | None = None
+    failure: Failure | None = None
+    """Why there is none."""

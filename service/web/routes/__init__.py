@@ -15,6 +15,7 @@ PUT    /scenes/{id}                           upload; POST .../load, .../unload;
 GET    /scenes/{id}/thumbnail.jpg             small JPEG
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
 POST   /scenes/{id}/render                    colour or depth from any pose
+GET    /scenes/{id}/coverage                  where a photo would be found; POST measures it
 POST   /scenes/{id}/registration              where the scene is; GET, DELETE (undo)
 WS     /scenes/{id}/live                      a moving camera's frames to poses, see docs/live.md
 GET    /lenses                                DELETE /lenses, /lenses/{id}
@@ -26,8 +27,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.web.routes import geopose, jobs, lenses, live, localize, registrations, scenes, system
+from service.web.routes import coverage, geopose, jobs, lenses, live, localize, registrations, scenes, system
 
 router = APIRouter()
-for part in (localize, geopose, jobs, scenes, registrations, live, lenses, system):
+for part in (localize, geopose, jobs, scenes, coverage, registrations, live, lenses, system):
     router.include_router(part.router)

@@ -1,0 +1,101 @@
+"""Draws a coverage map in plan view, with its legend in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from service.coverage.coverage_map import CoverageMap
+from service.photos.images import encode_image
+
+LEVELS: tuple[tuple[float, tuple[int, int, int], str], ...] = (
+    (0.9, (253, 231, 37), "found: 90 % and more"),
+    (0.7, (94, 201, 98), "usually found: 70 to 90 %"),
+    (0.4, (33, 145, 140), "sometimes found: 40 to 70 %"),
+    (0.0, (59, 82, 139), "rarely found: below 40 %"),
+)
+"""Least probability, colour (sRGB, of the viridis scale: told apart also by lightness), words."""
+_PX, _MARGIN, _LEGEND = 900, 40, 200
+_BLIND, _CAMERA, _INK, _PAPER = (205, 205, 205), (190, 40, 40), (30, 30, 30), (255, 255, 255)
+
+
+def drawn_plan(
+    found: CoverageMap, surfaces_in_world: Float[np.ndarray, "n 3"], cameras_in_world: Float[np.ndarray, "k 3"]
+) -> bytes:
+    """Return a PNG: each cell a disc of wedges, one a heading; the scene's surfaces grey, its training cameras red."""
+    cells, cameras = (points @ found.plan_from_world.T for points in (found.positions_in_world, cameras_in_world))
+    around = np.concatenate([cells[:, :2], cameras[:, :2]])
+    low, high = around.min(0) - 1.5 * found.cell, around.max(0) + 1.5 * found.cell
+    scale = (_PX - 2 * _MARGIN) / float((high - low).max())
+    height = int((high - low)[1] * scale) + 2 * _MARGIN
+
+    def pixels(points: np.ndarray) -> np.ndarray:
+        x, y = ((points[:, :2] - low) * scale).T
+        return np.stack([_MARGIN + x, height - _MARGIN - y], 1)
+
+    image = np.full((height + _LEGEND, _PX, 3), _PAPER, np.uint8)
+    _shade(image[:height], pixels(surfaces_in_world @ found.plan_from_world.T))
+    radius = 0.46 * found.cell * scale
+    for middle, row, sees in zip(pixels(cells), found.probabilities, found.sees_scene, strict=True):
+        for heading, probability, seen in zip(found.headings_rad, row, sees, strict=True):
+            half = np.pi / len(found.headings_rad)
+            _wedge(image, middle, radius, heading, half, level_colour(probability) if seen else _BLIND)
+    for at in pixels(cameras):
+        cv2.circle(image, tuple(np.rint(at).astype(int).tolist()), 3, _CAMERA, -1, cv2.LINE_AA)
+    _legend(image, height, found, scale)
+    return encode_image(image, "png")
+
+
+def level_colour(probability: float) -> tuple[int, int, int]:
+    """Return the colour of a probability."""
+    return next(colour for least, colour, _ in LEVELS if probability >= least)
+
+
+def _shade(image: UInt8[np.ndarray, "h w 3"], at: np.ndarray) -> None:
+    """Darken pixels by the number of the scene's surfaces there."""
+    height, width = image.shape[:2]
+    x, y = np.floor(at).astype(int).T
+    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    counts = np.bincount(y[inside] * width + x[inside], minlength=height * width).reshape(height, width)
+    smooth = cv2.GaussianBlur(counts.astype(np.float32), (0, 0), 1.5)
+    dark = np.clip(smooth / max(float(np.quantile(smooth, 0.98)), 1e-6), 0, 1)[..., None]
+    image[:] = (image * (1 - 0.35 * dark)).astype(np.uint8)
+
+
+def _wedge(
+    image: np.ndarray, middle: np.ndarray, radius: float, heading: float, half: float, colour: Sequence[int]
+) -> None:
+    angles = heading + np.linspace(-0.9 * half, 0.9 * half, 6)
+    # Image rows go down, the plan's second axis up.
+    rim = middle + radius * np.stack([np.cos(angles), -np.sin(angles)], 1)
+    corners = np.concatenate([middle + 0.25 * (rim[[0]] - middle), rim, middle + 0.25 * (rim[[-1]] - middle)])
+    cv2.fillPoly(image, [np.rint(corners * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
+
+
+def _legend(image: np.ndarray, top: int, found: CoverageMap, scale: float) -> None:
+    _text(image, found.title, (_MARGIN, top + 22), 0.6)
+    rows = [*((colour, words) for _, colour, words in LEVELS), (_BLIND, "nothing of the scene in view")]
+    for number, (colour, words) in enumerate(rows):
+        x, y = _MARGIN + 430 * (number % 2), top + 52 + 26 * (number // 2)
+        cv2.rectangle(image, (x, y - 13), (x + 18, y + 3), colour, -1)
+        _text(image, words, (x + 28, y), 0.5)
+    cv2.circle(image, (_MARGIN + 439, top + 99), 4, _CAMERA, -1, cv2.LINE_AA)
+    _text(image, "training camera", (_MARGIN + 458, top + 104), 0.5)
+    length = round_length(100 / scale)
+    end = _MARGIN + round(length * scale)
+    cv2.line(image, (_MARGIN, top + 140), (end, top + 140), _INK, 2)
+    _text(image, f"{length:g} units; each wedge points where the camera looks", (end + 12, top + 145), 0.5)
+    _text(image, f"{len(found.trials)} renders made as photos are, seen from above", (_MARGIN, top + 175), 0.5)
+
+
+def round_length(about: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, at most `about`."""
+    power = 10.0 ** np.floor(np.log10(about))
+    return float(max(step for step in (1, 2, 5) if step * power <= about * (1 + 1e-9)) * power)
+
+
+def _text(image: np.ndarray, words: str, at: tuple[int, int], size: float) -> None:
+    cv2.putText(image, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
