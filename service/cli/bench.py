@@ -5,6 +5,7 @@ from __future__ import annotations
 import typer
 
 from service.cli.bench_ablation import bench_ablation
+from service.cli.bench_coverage import bench_coverage
 from service.cli.bench_device import bench_device
 from service.cli.bench_evaluate import bench_evaluate
 from service.cli.bench_field import bench_field
@@ -23,6 +24,7 @@ bench_app.command("paper")(bench_paper)
 bench_app.command("gate")(bench_gate)
 bench_app.command("render")(bench_render)
 bench_app.command("device")(bench_device)
+bench_app.command("coverage")(bench_coverage)
 bench_app.command("gpu")(bench_gpu)
 bench_app.command("scale")(bench_scale)
 bench_app.command("ablation")(bench_ablation)

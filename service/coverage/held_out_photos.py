@@ -54,7 +54,10 @@ def held_out_photos(folder: Path) -> list[HeldOutPhoto]:
 def _from_truth(folder: Path) -> list[HeldOutPhoto]:
     found = []
     try:
-        for entry in json.loads((folder / TRUTH).read_text("utf-8")):
+        entries = json.loads((folder / TRUTH).read_text("utf-8"))
+        if not isinstance(entries, list):
+            raise TypeError(type(entries).__name__)
+        for entry in entries:
             name = entry["photo"]
             photo = next((p for p in (folder / name, folder / "photos" / name) if p.is_file()), None)
             if photo is not None:
