@@ -325,6 +325,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("get_registration", "scene_not_found"): lambda s: s.client.get("/scenes/none/registration"),
     ("get_registration", "registration_not_found"): lambda s: s.client.get("/scenes/good/registration"),
     ("get_registration", "corrupt_scene"): lambda s: damaged_registration(s, "GET"),
+    ("get_coverage", "scene_not_found"): lambda s: s.client.get("/scenes/none/coverage"),
     ("undo_registration", "scene_not_found"): lambda s: s.client.delete("/scenes/none/registration"),
     ("undo_registration", "registration_not_found"): lambda s: s.client.delete("/scenes/good/registration"),
     ("undo_registration", "corrupt_scene"): lambda s: damaged_registration(s, "DELETE"),
@@ -345,6 +346,7 @@ for _code, _scene in SCENES.items():
         ("scene_splats", _code): lambda s, scene=_scene: s.client.get(f"/scenes/{scene}/splats"),
         ("render_scene", _code): lambda s, scene=_scene: render(s, scene),
         ("register_scene", _code): lambda s, scene=_scene: register(s, scene),
+        ("measure_coverage", _code): lambda s, scene=_scene: s.client.post(f"/scenes/{scene}/coverage"),
     }
 for _name in ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose"):
     PROVOKED[_name, "job_not_found"] = lambda s, name=_name: plainly(s.client, name, job="none")
