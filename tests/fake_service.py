@@ -19,6 +19,8 @@ import httpx
 import numpy as np
 from PIL import Image
 
+from service.coverage.calibration import Calibration
+from service.coverage.coverage_map import CoverageMap, Trial
 from service.geometry import look_at
 from service.jobs.model import JobResult
 from service.results import (
@@ -32,8 +34,10 @@ from service.results import (
     Verdict,
 )
 from service.scene_manager.splat_sample import packed_splats
+from service.scene_manager.status import CoverageStatus
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web.schemas.conversion import intrinsics_out, named_camera_out, pose_out, record_out, result_out
+from service.web.schemas.coverage import coverage_status_out
 from service.web.schemas.job_results import FrameOut
 from service.web.schemas.jobs import JobLinks, JobOut, PhotoOut
 from service.web.schemas.scenes import SceneLinks, SceneOut
@@ -117,6 +121,17 @@ def records(count: int, seed: int = 0) -> list[IterationRecord]:
             )
         )
     return result
+
+
+def coverage_map(found: float = 0.95) -> CoverageMap:
+    """Two places of the ball's scene: beside each other on the orbit, looked at in four directions."""
+    poses = [orbit(share) for share in (0.0, 0.1)]
+    trials = tuple(Trial(pose, Status.LOCALIZED, found > 0.5, 0.1, 0.01, 0.1) for pose in poses * 20)
+    sees = np.array([[True, True, True, False]] * 2)
+    return CoverageMap(
+        "0" * 64, np.eye(3), 0.8, np.array([pose.position_in_world for pose in poses]),
+        np.arange(4) * np.pi / 2, sees, np.full((2, 4), 0.1), trials, (), Calibration(), 1.0,
+    )  # fmt: skip
 
 
 @dataclass
@@ -247,6 +262,7 @@ class FakeService:
         """Jobs on the first page of the list."""
         self.unloaded = False
         """The scene isn't in memory yet."""
+        self.coverage = CoverageStatus("none")
         self.photos_kept = True
         self.loading_s = 0.0
         """How long splats take."""
@@ -297,6 +313,9 @@ class FakeService:
             return httpx.Response(200, json=self._scene_out(name).model_dump(mode="json"))
         if kind == "scenes" and rest == ["render"]:
             return self._render(json.loads(request.content))
+        if kind == "scenes" and rest == ["coverage"]:
+            answer = coverage_status_out(self.coverage, path)
+            return httpx.Response(200, json=answer.model_dump(mode="json"))
         if kind == "scenes" and rest == ["splats"]:
             time.sleep(self.loading_s)
             return httpx.Response(200, content=packed_splats(self.scene, int(request.url.params["max"])))

@@ -25,6 +25,7 @@ from viewer.controls import NEXT, PLAY, PREVIOUS, Controls, on_user_change
 from viewer.job_display import JobDisplay
 from viewer.job_selection import JobSelection
 from viewer.panel_html import headline_html
+from viewer.plan_display import PlanDisplay
 from viewer.replay_download import ReplayDownload
 from viewer.requested_page import RequestedPage
 from viewer.scene_3d import Scene3D
@@ -46,6 +47,7 @@ class BrowserSession:
         self._scene = Scene3D(client, splats=splats)
         self._background = BackgroundRender(client, shared.client, self._show_background)
         self._scene_display = SceneDisplay(self._controls, self._scene, self._background, shared.scenes)
+        self._plan = PlanDisplay(self._controls, self._scene, self._background, self._scene_display, shared.client)
         self._job = JobDisplay(self._controls, self._scene, self._scene_display, shared.streams, self._stream_changed)
         self._selection = JobSelection(self._controls, shared.lists, self._job, self._scene_display, page)
         self._replay = ReplayDownload(client, self._controls, self._queue)
@@ -70,6 +72,7 @@ class BrowserSession:
             # Idle work is done in small parts, between which new actions are taken first.
             for action in actions or [self._idle]:
                 self._try(action)
+            self._try(self._plan.follow_scene)
         self._shared.lists.remove_listener(self._lists_changed)
         self._job.close()
         # Widgets form reference cycles, which Python would otherwise collect only after many more browsers.
@@ -111,13 +114,14 @@ class BrowserSession:
         on_user_change(
             controls.photo_opacity, lambda opacity: post(partial(self._background.set_opacity, opacity), "opacity")
         )
+        on_user_change(controls.plan_view, lambda on: post(partial(self._plan.set_plan_view, on), "plan"))
         for widget in (controls.match_lines, controls.weight, controls.colour_by):
             on_user_change(widget, lambda _: post(self._job.redraw))
         on_user_change(
             controls.exact, lambda enabled: post(partial(self._background.set_enabled, enabled), "exact render")
         )
         for name, checkbox in controls.layers.items():
-            show = partial(self._scene_display.set_layer_visible, name)
+            show = partial(self._plan.set_layer_visible, name)
             on_user_change(checkbox, lambda shown, name=name, show=show: post(partial(show, shown), ("layer", name)))
 
     def _connect_player(self) -> None:
@@ -140,6 +144,7 @@ class BrowserSession:
 
     def _lists_changed(self) -> None:
         self._queue.post(self._selection.sync)
+        self._queue.post(self._plan.refresh, "plan layers")
 
     def _stream_changed(self) -> None:
         self._queue.post(self._job.sync)

@@ -15,6 +15,7 @@ from service.types import Camera, Pose
 
 _FOV_RAD = float(np.radians(60))
 """Vertical field of view of views that no photo prescribes."""
+_PLAN_FOV_RAD = float(np.radians(15))
 _OCCLUDING_SPLATS = 12
 """Splats near the line of sight that occlude it; floaters are fewer, surfaces have dozens."""
 
@@ -81,6 +82,30 @@ def initial_view(scene: SceneExtent, cameras: Sequence[Camera]) -> Viewpoint:
     away = across - scene.up * (across @ scene.up) + 0.5 * scene.up
     position = scene.centre + 2.5 * scene.radius * away / np.linalg.norm(away)
     return Viewpoint(position, scene.centre, scene.up, _FOV_RAD)
+
+
+def view_from_above(
+    scene: SceneExtent, cameras: Sequence[Camera], points: Float32[np.ndarray, "n 3"], aspect: float
+) -> Viewpoint:
+    """Return the view straight down on the training cameras and on nine tenths of `points`, nearly without perspective.
+
+    What is right in the picture is the world axis nearest to a horizontal one, like the first axis of coverage maps.
+    """
+    right = np.eye(3)[np.argmin(np.abs(scene.up))]
+    right = right - (right @ scene.up) * scene.up
+    right /= np.linalg.norm(right)
+    top = np.cross(scene.up, right)
+    at = np.array([camera.pose.position_in_world for camera in cameras], np.float64).reshape(-1, 3)
+    low, high = (np.quantile(points @ np.stack([right, top], 1), q, axis=0) for q in (0.05, 0.95))
+    if len(at):
+        flat = at @ np.stack([right, top], 1)
+        low, high = np.minimum(low, flat.min(0)), np.maximum(high, flat.max(0))
+    half = 0.5 * (high - low)
+    reach = 1.15 * max(half[1], half[0] / max(aspect, 1e-6), 1e-6)
+    middle = 0.5 * (low + high) @ np.stack([right, top]) + scene.up * (scene.up @ scene.centre)
+    height = reach / np.tan(0.5 * _PLAN_FOV_RAD)
+    # The browser can't look exactly along the axis that it turns about: that axis lies in the plan.
+    return Viewpoint(middle + height * scene.up, middle, top, _PLAN_FOV_RAD)
 
 
 def view_through(camera: Camera, scene: SceneExtent, aspect: float) -> Viewpoint:

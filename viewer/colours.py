@@ -26,6 +26,14 @@ ERROR_COLOUR: RGB = (215, 65, 65)
 INITIAL_COLOUR: RGB = (150, 150, 150)
 CURRENT_COLOUR: RGB = (255, 140, 0)
 TRUTH_COLOUR: RGB = (240, 240, 240)
+COVERAGE_LEVELS: tuple[tuple[float, RGB, str], ...] = (
+    (0.9, (253, 231, 37), "found: 90 % and more"),
+    (0.7, (94, 201, 98), "usually found: 70 to 90 %"),
+    (0.4, (33, 145, 140), "sometimes found: 40 to 70 %"),
+    (0.0, (85, 110, 180), "rarely found: below 40 %"),
+)
+"""Of the coverage map: least probability, colour, words."""
+BLIND_COLOUR: RGB = (90, 90, 90)
 TRAINING_COLOUR: RGB = (70, 105, 160)
 
 INLIER_COLOUR: RGB = (70, 225, 120)
@@ -41,6 +49,11 @@ _SCORE_SCALE = np.array([(72, 84, 150), (44, 130, 165), (60, 175, 150), (150, 20
 def outcome_colour(outcome: JobOutcome | None) -> RGB:
     """Return the colour of a job's status; None: the job runs."""
     return STATUS_COLOURS[outcome.status] if outcome else PENDING_COLOUR
+
+
+def coverage_colour(probability: float) -> RGB:
+    """Return the colour of a probability that a photo is found."""
+    return next(colour for least, colour, _ in COVERAGE_LEVELS if probability >= least)
 
 
 def match_colours(view: MatchView, by: ColourBy) -> UInt8[np.ndarray, "m 3"]:

@@ -17,6 +17,7 @@ NO_SCENE: str = "no scene yet"
 PLAY, PREVIOUS, NEXT = "play / pause", "◀ previous", "next ▶"
 _COLUMN_WIDTH_PX = 430
 """Both panels are one column: at 1280 px two thirds are left for the 3D view."""
+HIDDEN_AT_FIRST: tuple[LayerName, ...] = ("axes and scale", "poses of all jobs", "coverage", "floor plan")
 _REPLAY_LABEL = "save as replay file"
 _REPLAY_HINT = "One HTML file that plays this job from disk, without a service."
 _SPEEDS = ("1", "2", "5", "10", "20")
@@ -53,12 +54,16 @@ class Controls:
             "photo opacity", 0.0, 1.0, 0.05, 0.5, visible=False, hint="Of the photo over the view through its camera."
         )
         self.measure = gui.add_checkbox("measure distances", False, hint="Click two points of the scene.")
+        self.plan_view = gui.add_checkbox(
+            "plan view", False, hint="From above, cut open, with training cameras and the poses of all jobs."
+        )
         self.use_view = gui.add_button("use this view as prior", hint="For the next photo: a pose to start from.")
         self.prior = gui.add_html("")
         self.replay = gui.add_button(_REPLAY_LABEL, disabled=True, hint=_REPLAY_HINT)
         with gui.add_folder("show"):
-            shown = {"splats": splats, "axes and scale": False}
+            shown = {"splats": splats} | dict.fromkeys(HIDDEN_AT_FIRST, False)
             self.layers = {layer: gui.add_checkbox(layer, shown.get(layer, True)) for layer in get_args(LayerName)}
+            self.coverage = gui.add_html("", visible=False)
             self.colour_by = gui.add_dropdown("colour matches by", get_args(ColourBy), initial_value="inlier")
             self.exact = gui.add_checkbox(
                 "full-quality render when still",

@@ -14,6 +14,8 @@ import numpy as np
 from service.results import IterationRecord
 from service.types import Pose
 from viewer.colours import (
+    BLIND_COLOUR,
+    COVERAGE_LEVELS,
     CURRENT_COLOUR,
     ERROR_COLOUR,
     INITIAL_COLOUR,
@@ -30,7 +32,7 @@ from viewer.colours import (
 )
 from viewer.comparison_images import Mode
 from viewer.match_geometry import MatchView, pose_error
-from viewer.service_values import Job, JobOutcome, ListedJob
+from viewer.service_values import CoverageAnswer, Job, JobOutcome, ListedJob
 
 
 def job_label(job: ListedJob, zone: ZoneInfo | None = None) -> str:
@@ -161,6 +163,20 @@ def legend_html(outcome: JobOutcome | None, *, truth: bool) -> str:
     ramp = ",".join(f"rgb{tuple(map(int, colour))}" for colour in score_colours(np.linspace(0, 1, 5)))
     scores = f"{_swatch(f'linear-gradient(90deg,{ramp})', '2.4em')}candidates, worst to best score"
     return _small(f"cameras: {named}<br>{scores}")
+
+
+def coverage_html(answer: CoverageAnswer) -> str:
+    """Return the coverage map's title with the legend of its colours, or why there is no map."""
+    if answer.found is not None:
+        levels = [(f"rgb{colour}", words) for _, colour, words in COVERAGE_LEVELS]
+        levels.append((f"rgb{BLIND_COLOUR}", "nothing of the scene in view"))
+        rows = "".join(f"<div style='white-space:nowrap'>{_swatch(ground)}{words}</div>" for ground, words in levels)
+        return _small(f"<b>{escape(answer.found.title)}</b>{rows}each ray points where the camera looks")
+    if answer.state == "running":
+        return _small(f"coverage: {answer.done} of {answer.total or '…'} photos are localized")
+    if answer.problem:
+        return _small(f"coverage could not be measured: {escape(answer.problem)}")
+    return _small("coverage is not measured yet: start it on the scene's card of the start page")
 
 
 def _swatch(ground: str, width: str = ".7em") -> str:

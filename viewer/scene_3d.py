@@ -8,9 +8,12 @@ import numpy as np
 
 from service.types import Camera, Pose
 from viewer.browser_camera import BrowserCamera
-from viewer.camera_views import initial_view, view_from_behind, view_through
+from viewer.camera_views import initial_view, view_from_above, view_from_behind, view_through
 from viewer.layers.axes_layer import AxesLayer
 from viewer.layers.candidate_layer import CandidateLayer
+from viewer.layers.coverage_layer import CoverageLayer
+from viewer.layers.floor_plan_layer import FloorPlanLayer, below_the_cut
+from viewer.layers.job_poses_layer import JobPosesLayer
 from viewer.layers.layer import Canvas, Layer, LayerName
 from viewer.layers.match_layer import MatchLayer
 from viewer.layers.measure_layer import MeasureLayer
@@ -33,8 +36,11 @@ class Scene3D:
         self.matches = MatchLayer(canvas)
         self.axes = AxesLayer(canvas, visible=False)
         self.measured = MeasureLayer(canvas)
+        self.job_poses = JobPosesLayer(canvas, visible=False)
+        self.coverage = CoverageLayer(canvas, visible=False)
+        self._floor_plan = FloorPlanLayer(canvas, visible=False)
         layers = self.splats, self.training_cameras, self.trajectory, self.candidates, self.matches
-        layers += self.axes, self.measured
+        layers += self.axes, self.measured, self.job_poses, self.coverage, self._floor_plan
         self._layers: dict[LayerName, Layer] = {layer.name: layer for layer in layers}
         self._canvas = canvas
         self._camera = BrowserCamera(canvas)
@@ -65,7 +71,10 @@ class Scene3D:
         self._canvas.flush()
         self.training_cameras.show(cameras)
         self.axes.show(self.metres_per_unit)
-        self.measured.clear()
+        for layer in (self.measured, self.job_poses, self.coverage, self._floor_plan):
+            layer.clear()
+        if self._floor_plan.visible:
+            self._floor_plan.show(content)
 
     def clear_job(self) -> None:
         """Remove everything that belongs to a job."""
@@ -75,6 +84,13 @@ class Scene3D:
     def set_visible(self, name: LayerName, visible: bool) -> None:
         """Show or hide a layer."""
         self._layers[name].set_visible(visible)
+        # Megabytes that most browsers never need.
+        if name == "floor plan" and visible and self._content is not None:
+            self._floor_plan.show(self._content)
+
+    def is_visible(self, name: LayerName) -> bool:
+        """Return whether the user shows a layer."""
+        return self._layers[name].visible
 
     def hit(self, origin: Sequence[float], direction: Sequence[float]) -> int | Camera | None:
         """Return what a click's ray hits: the index of a record, or a training camera."""
@@ -95,6 +111,19 @@ class Scene3D:
         """Take the view of a camera."""
         if self._content is not None:
             self._camera.set_view(view_through(camera, self._content.extent, self._camera.aspect))
+
+    def look_from_above(self) -> None:
+        """Take the plan view: all of the scene's surroundings, straight from above."""
+        if self._content is not None:
+            points = self._content.splats.centres[below_the_cut(self._content)]
+            cameras = [named.camera for named in self._content.description.cameras]
+            self._camera.set_view(view_from_above(self._content.extent, cameras, points, self._camera.aspect))
+
+    def look_at_first(self) -> None:
+        """Take the view of a scene before any job."""
+        if self._content is not None:
+            cameras = [named.camera for named in self._content.description.cameras]
+            self._camera.set_view(initial_view(self._content.extent, cameras))
 
     def look_from_behind(self, pose: Pose) -> None:
         """Take a view from behind a camera, at once."""

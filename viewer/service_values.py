@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, cast
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from service import client as api
 from service.results import Candidates, IterationRecord, MatchVectors
@@ -93,6 +93,70 @@ class Job:
     def camera(self, record: IterationRecord) -> Camera:
         """Return the photo's camera as a record estimates it: its pose, and the intrinsics with its correction."""
         return Camera(self.photo.corrected(record.correction), record.pose)
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageMap:
+    """Where photos of a scene are found."""
+
+    title: str
+    cell: float
+    positions_in_world: Float64[np.ndarray, "c 3"]
+    directions_in_world: Float64[np.ndarray, "h 3"]
+    """Horizontal, unit length."""
+    probabilities: Float64[np.ndarray, "c h"]
+    """NaN: nothing of the scene is in view."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoverageAnswer:
+    """A coverage map, or how far it is measured."""
+
+    state: str
+    done: int
+    total: int
+    problem: str
+    found: CoverageMap | None
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """The camera of a photo that a job has found."""
+
+    camera: Camera
+    status: str
+
+
+def coverage_of(raw: dict[str, Any]) -> CoverageAnswer:
+    """Return a coverage map from the API's answer."""
+    found, error = raw["map"], raw["error"]
+    return CoverageAnswer(
+        raw["state"], raw["done"], raw["total"], error["detail"] if error else "", found and _coverage_map(found)
+    )
+
+
+def _coverage_map(raw: dict[str, Any]) -> CoverageMap:
+    angles = np.radians(raw["headings_deg"])
+    in_plan = np.stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))], 1)
+    cells = raw["cells"]
+    return CoverageMap(
+        raw["title"],
+        raw["cell"],
+        frozen(np.array([cell["position"] for cell in cells]).reshape(-1, 3), np.float64),
+        frozen(in_plan @ np.array(raw["plan_from_world"]), np.float64),
+        frozen(np.array([cell["probabilities"] for cell in cells], np.float64), np.float64),
+    )
+
+
+def found_cameras(job: api.Job) -> tuple[FoundCamera, ...]:
+    """Return the cameras of a job's photos but for those that are not localized."""
+    result = job.result
+    if result is None:
+        return ()
+    camera = Intrinsics(**{**result.raw["intrinsics"], "distortion": tuple(result.raw["intrinsics"]["distortion"])})
+    answers = result.frames or (result,)
+    found = [(Pose(answer.pose.world_from_camera), answer.status) for answer in answers]
+    return tuple(FoundCamera(Camera(camera, pose), status) for pose, status in found if status != "not_localized")
 
 
 def listed_job_of(job: api.Job) -> ListedJob:

@@ -16,7 +16,8 @@ from viewer.colours import RGB
 from viewer.frusta import viser_frustum
 
 LayerName = Literal[
-    "splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance"
+    *("splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance"),
+    *("poses of all jobs", "coverage", "floor plan"),
 ]
 
 _WIDTH_PX = 2.0
