@@ -5,6 +5,7 @@ import * as compare from "./compare.js";
 import * as history from "./history.js";
 import * as key from "./key.js";
 import * as job from "./job.js";
+import * as scene from "./scene.js";
 import * as start from "./start.js";
 
 const ROUTES = [
@@ -12,6 +13,7 @@ const ROUTES = [
   [/^#\/batch\/([\w,-]*)$/, batch.show],
   [/^#\/jobs$/, history.show],
   [/^#\/jobs\/([\w-]+)$/, job.show],
+  [/^#\/scenes\/([\w%-]+)$/, scene.show],
   [/^#\/compare\/([\w-]+)\/([\w-]+)$/, compare.show],
   [/^/, start.show],
 ];

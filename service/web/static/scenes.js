@@ -91,7 +91,8 @@ export class SceneList {
     return `${sentence(state)}, ${seconds(Math.round((performance.now() - (this.since.get(id) ?? performance.now())) / 1000))}`;
   }
 
-  #actions({ id, name, state, uploaded }) {
+  #actions({ id, name, state, uploaded, gaussians }) {
+    const loaded = gaussians !== null;
     const path = `scenes/${encodeURIComponent(id)}`;
     const button = (label, method, address, question = "") => {
       const element = h("button", { type: "button", class: "plain", "aria-label": `${label} ${name}` }, label);
@@ -104,7 +105,9 @@ export class SceneList {
       });
       return element;
     };
+    const plan = h("a", { href: `#/scenes/${encodeURIComponent(id)}`, "aria-label": `Plan and coverage of ${name}` }, "Plan and coverage");
     return [
+      loaded ? plan : null,
       ["unloaded", "failed"].includes(state) ? button("Load", "POST", `${path}/load`) : null,
       ["ready", "preparing"].includes(state) ? button("Unload", "POST", `${path}/unload`) : null,
       uploaded ? button("Delete", "DELETE", path, `Delete the scene ${name} and its files?`) : null,

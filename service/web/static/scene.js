@@ -1,0 +1,128 @@
+// One scene in plan: where photos are found, its training cameras, and the poses of all jobs.
+
+import { service } from "./service.js";
+import { degrees, facts, h, length, say, words } from "./dom.js";
+import { drawPlan, LEVELS, planAxes } from "./plan.js";
+
+const POLL_MS = 1000;
+const JOBS = 100;
+
+export function show(main, id) {
+  const plan = h("div", { class: "planbox" });
+  const aside = h("div");
+  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], coverage: null, stopped: false, timer: 0 };
+  document.title = "scene – splatfix";
+  const title = h("h1", {}, state.id);
+  main.append(title, h("div", { class: "columns" }, plan, aside));
+  begin(state, title).catch(error => plan.replaceChildren(trouble(error)));
+  return () => {
+    state.stopped = true;
+    clearTimeout(state.timer);
+  };
+}
+
+async function begin(state, title) {
+  const scene = await service.scene(state.id);
+  title.textContent = scene.name;
+  if (scene.gaussians === null) {
+    const where = `The scene is ${scene.state}. Load it on the start page.`;
+    state.plan.replaceChildren(h("p", { class: "note" }, where));
+    return;
+  }
+  state.scene = scene;
+  state.axes = planAxes(scene);
+  await refresh(state);
+  state.jobs = await jobsOf(state.id);
+  draw(state);
+}
+
+const path = state => `scenes/${encodeURIComponent(state.id)}/coverage`;
+
+/** Ask for the coverage map, again and again while it is measured. */
+async function refresh(state) {
+  const before = state.coverage?.state;
+  state.coverage = await service.ask(path(state));
+  if (state.stopped) return;
+  if (before === "running" && state.coverage.state === "ready") say("The coverage map is ready");
+  draw(state);
+  if (state.coverage.state !== "running") return;
+  state.timer = setTimeout(() => refresh(state).catch(error => state.aside.replaceChildren(trouble(error))), POLL_MS);
+}
+
+/** The newest jobs of a scene whose photos were localized, or uncertain, with their poses. */
+async function jobsOf(id) {
+  const { jobs } = await service.jobs({ scene: id, limit: JOBS });
+  const ended = jobs.filter(job => ["localized", "uncertain"].includes(job.status));
+  const whole = await Promise.all(ended.map(job => service.job(job.id).catch(() => null)));
+  return whole.filter(Boolean).flatMap(job => (job.result.frames ?? [job.result])
+    .filter(answer => answer.status !== "not_localized")
+    .map(answer => ({
+      matrix: (answer.pose?.world_from_camera ?? answer.world_from_camera).matrix, status: answer.status,
+      href: `#/jobs/${job.id}`, title: `${answer.name ?? job.photo.name}: ${words(answer.status)}`,
+    })));
+}
+
+function draw(state) {
+  const { scene, axes, coverage, jobs } = state;
+  const map = coverage?.map ?? null;
+  const picture = drawPlan({
+    axes, map, jobs, cameras: scene.training_cameras.map(camera => camera.world_from_camera),
+    anchors: [], metresPerUnit: scene.metres_per_unit,
+  });
+  state.plan.replaceChildren(picture ?? h("p", { class: "note" }, "No cameras, no jobs and no coverage map yet: there is nothing to draw."));
+  state.aside.replaceChildren(...coverageParts(state, map), legend(map, jobs));
+}
+
+function coverageParts(state, map) {
+  const { coverage, scene } = state;
+  const running = coverage.state === "running";
+  const button = h("button", { type: "button", disabled: running }, map ? "Measure again" : "Measure coverage");
+  button.addEventListener("click", () => measure(state, button));
+  const parts = [h("h2", {}, "Where photos are found")];
+  if (map) {
+    parts.push(h("p", {}, h("strong", {}, map.title)), facts([
+      ["found on average", percent(map.found)],
+      ["places found with 90 % or more", percent(map.sure_share)],
+      ["median rotation error", degrees(map.median_rotation_deg)],
+      ["median position error", length(map.median_position_units, scene.metres_per_unit)],
+      ["Brier score", map.brier === null ? null : map.brier.toFixed(3)],
+    ]));
+  } else if (!running) {
+    parts.push(h("p", {}, "Not measured yet. The service localizes renders that are spoilt as photos are, all over the scene; photos take longer meanwhile."));
+  }
+  if (running) {
+    const total = coverage.total || null;
+    parts.push(h("p", { role: "status" }, total ? `${coverage.done} of ${total} photos are localized` : "Preparing…"),
+      h("progress", { "aria-label": "Measuring coverage", max: total ?? 1, ...(total ? { value: coverage.done } : {}) }));
+  }
+  if (coverage.error) parts.push(trouble({ message: `${coverage.error.detail} ${coverage.error.hint}` }));
+  return [...parts, h("p", { class: "buttons" }, button)];
+}
+
+async function measure(state, button) {
+  button.disabled = true;
+  try {
+    await service.send(path(state), { method: "POST" });
+    await refresh(state);
+  } catch (error) {
+    button.disabled = false;
+    button.after(trouble(error));
+  }
+}
+
+function legend(map, jobs) {
+  const row = (kind, text) => h("li", {}, h("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
+  const statuses = ["localized", "uncertain"].filter(status => jobs.some(job => job.status === status));
+  return h("ul", { class: "legend", "aria-label": "Legend" },
+    map ? [...LEVELS.map(([, kind, text]) => row(kind, text)), row("blind", "nothing of the scene in view")] : [],
+    row("camera", "training camera"), statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
+    h("li", { class: "quiet" }, "Seen from above; each wedge and line points where its camera looks."));
+}
+
+function percent(share) {
+  return `${Math.round(100 * share)} %`;
+}
+
+function trouble(error) {
+  return h("p", { class: "trouble", role: "alert" }, error.message);
+}
