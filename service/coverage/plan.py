@@ -16,7 +16,7 @@ from service.coverage.coverage_map import heading_of
 from service.geometry import look_at
 from service.interfaces import Rasterizer
 from service.pose.features.image_sizes import sized
-from service.pose.retrieval.free_space import free_space_of
+from service.pose.retrieval.free_space import Space, free_space_of
 from service.pose.retrieval.lod_proxy import lod_proxy
 from service.pose.retrieval.view_placement import shows_single_surface
 from service.types import Camera, GaussianScene, Pose
@@ -46,6 +46,8 @@ class PlanConfig:
 
 
 PLAN = PlanConfig()
+NEAREST = 4
+"""Cameras from which a place must be in sight, one of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +84,8 @@ def find_places(
     least = config.min_solid_share * float(np.median(_solid_shares(search, captured[:64], distance, config)))
     flat = [camera for row in rows for camera in row]
     solid = _solid_shares(search, flat, distance, config)
-    free = ~space.occupied(np.array([camera.pose.position_in_world for camera in flat]))
+    standing = np.array([camera.pose.position_in_world for camera in flat])
+    free = ~space.occupied(standing) & _reached(standing, at @ plan, space)
     sees = (free & (solid >= max(least, 1e-9))).reshape(len(middles), config.headings)
     kept = sees.any(1)
     return Places(
@@ -104,6 +107,20 @@ def novelty(
     scale = np.array([config.novel_position * distance, config.novel_chord])
     apart = np.linalg.norm(own[:, None] - known, axis=3) / scale
     return np.sqrt((apart**2).sum(2)).min(1)
+
+
+def _reached(
+    positions: Float64[np.ndarray, "n 3"], captured: Float64[np.ndarray, "k 3"], space: Space
+) -> Bool[np.ndarray, "n"]:
+    """Return which positions are in sight of one of the nearest cameras: others lie behind walls."""
+    rays = positions[:, None] - captured
+    apart = np.linalg.norm(rays, axis=2)
+    near = np.argsort(apart, 1)[:, :NEAREST]
+    rays, apart = (np.take_along_axis(a, b, 1) for a, b in ((rays, near[..., None]), (apart, near)))
+    starts = captured[near].reshape(-1, 3)
+    directions = (rays / np.maximum(apart, 1e-12)[..., None]).reshape(-1, 3)
+    clear = space.free_distance(starts, directions, float(apart.max())).reshape(apart.shape)
+    return (clear >= apart - space.cell).any(1)
 
 
 def plan_axes(captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None) -> Float64[np.ndarray, "3 3"]:
