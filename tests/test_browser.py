@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
-from fake_service import FakeService, records
+from fake_service import FakeService, coverage_map, records
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import Client
+from service.scene_manager.status import CoverageStatus
 from service.web.pages import PAGES
 from service.web.viewer_relay import Relay
 from viewer.viewer_server import Viewer
@@ -201,6 +202,24 @@ def share_of_3d(page: Page) -> float:
             return parts.flatMap(y => parts.map(x => at(x, y))).filter(Boolean).length / 400;
         }"""
     )
+
+
+def test_the_plan_view_shows_coverage_with_its_legend(browser: Browser, fake: FakeService, url: str) -> None:
+    fake.job("one", 3, finished=True)
+    fake.coverage = CoverageStatus("ready", found=coverage_map())
+    page = opened(browser, f"{url}/", 1280, 800)
+    page.get_by_text("localized", exact=True).wait_for()
+    page.get_by_role("checkbox", name="plan view").check()
+    page.get_by_role("checkbox", name="coverage").check()
+    page.get_by_text("found: 90 % and more").wait_for()
+    expect(page.get_by_role("checkbox", name="floor plan")).to_be_checked()
+    expect(page.get_by_role("checkbox", name="poses of all jobs")).to_be_checked()
+    expect(page.get_by_role("checkbox", name="splats")).not_to_be_checked()
+    found = Axe().run(page, options={"runOnly": ["color-contrast"]})
+    assert not found.violations_count, found.generate_report()
+    page.get_by_role("checkbox", name="plan view").uncheck()
+    expect(page.get_by_role("checkbox", name="floor plan")).not_to_be_checked()
+    page.close()
 
 
 def test_a_new_job_is_followed_while_it_runs(browser: Browser, fake: FakeService, url: str) -> None:

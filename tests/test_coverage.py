@@ -26,12 +26,13 @@ from service.coverage.coverage_cache import coverage_file, read_coverage, write_
 from service.coverage.coverage_map import CoverageMap, Trial, heading_of
 from service.coverage.held_out_photos import held_out_photos
 from service.coverage.measurement import COVERAGE, Measurement, measured_coverage
-from service.coverage.plan import PLAN, find_places, novelty, plan_axes, pose_at, spread
+from service.coverage.plan import PLAN, _reached, find_places, novelty, plan_axes, pose_at, spread
 from service.coverage.plan_drawing import drawn_plan, level_colour
 from service.coverage.spoilt_photos import SPOIL, spoilt_photo
 from service.errors import CorruptScene
 from service.geometry import look_at, moved, project, transformed
 from service.localize import Cancelled, LoadedScene, Request
+from service.pose.retrieval.free_space import free_space_of
 from service.results import Status
 from service.types import Camera, Intrinsics, Pose
 
@@ -365,3 +366,23 @@ def test_a_measurement_that_fails_says_why(tmp_path, plugins):
         client.post("/scenes/hall/coverage")
         until(lambda: client.get("/scenes/hall/coverage").json()["state"] == "failed", 30)
         assert "truth.json" in str(client.get("/scenes/hall/coverage").json()["error"])
+
+
+def test_places_behind_walls_are_left_out():
+    """A wall crosses the room; the capture stands on one side, and cells on its other side are near enough."""
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(0.95, 1.05, 20_000), rng.uniform(-3, 3, 20_000), rng.uniform(-1, 1, 20_000)])
+    around = rng.uniform(-1, 1, (20_000, 3))
+    around = 3 * around / np.abs(around).max(1, keepdims=True) * [1, 1, 1 / 3]
+    scene = make_scene(count=1).scene
+    means = np.concatenate([wall, around]).astype(np.float32)
+    space = free_space_of(
+        replace(
+            scene, means=means, quats=np.tile(np.float32([1, 0, 0, 0]), (len(means), 1)),
+            scales=np.full((len(means), 3), 0.02, np.float32), opacities=np.ones(len(means), np.float32),
+            sh=np.zeros((len(means), 1, 3), np.float32),
+        )
+    )  # fmt: skip
+    captured = np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]])
+    places = np.array([[-1.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.8, 0.0, 0.0], [2.2, 1.0, 0.0]])
+    np.testing.assert_array_equal(_reached(places, captured, space), [True, True, False, False])

@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +21,13 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
 
-from service.geometry import rotation_from_quat
+from service.coverage.calibration import Calibration
+from service.coverage.coverage_map import CoverageMap, Trial
+from service.coverage.measurement import Measurement
+from service.geometry import look_at, rotation_from_quat
+from service.localize import LoadedScene
+from service.results import Status
+from service.types import Pose
 from service.web.api_keys import KeyRing, add_key
 from service.web.app import create_app
 from service.web.settings import Settings
@@ -597,3 +604,56 @@ def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
 
 def _overflow(page: Page) -> int:
     return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+
+
+def test_a_scenes_coverage_is_measured_and_drawn(browser: Browser, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a map that is known: the left one of two places is found in all directions, the right one in none."""
+    go_on = threading.Event()
+
+    def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
+        assert how.progress
+        how.progress(3, 10)
+        assert go_on.wait(60)
+        places = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
+        cameras = [(x, level_at(x, 90 * k)) for k in range(4) for x in (0, 20)]
+        trials = [Trial(pose, Status.LOCALIZED, x == 0, 0.1, 0.01, 0.1) for x, pose in cameras]
+        shape = np.ones((2, 4), bool)
+        return CoverageMap(
+            loaded.scene.info.sha256, np.eye(3), 0.5, places, np.arange(4) * np.pi / 2, shape, shape * 0.1,
+            tuple(trials * 9), (), Calibration(), 1.0,
+        )  # fmt: skip
+
+    monkeypatch.setattr("service.scene_manager.scene_coverage.measured_coverage", measured)
+    for scheme in ("light", "dark"):
+        page = browser.new_page(viewport={"width": 390, "height": 844}, color_scheme=scheme)  # type: ignore[arg-type]
+        page.set_default_timeout(PATIENCE_MS)
+        page.goto(f"{url}/")
+        page.get_by_role("link", name="Plan and coverage of room").click()
+        if scheme == "light":
+            expect(page.get_by_text("Not measured yet")).to_be_visible()
+            page.get_by_role("button", name="Measure coverage").click()
+            expect(page.get_by_text("3 of 10 photos")).to_be_visible()
+            go_on.set()
+        expect(page.get_by_text("upper bound: not calibrated")).to_be_visible()
+        assert page.locator("path.cell").count() == 8
+        assert page.locator("path.cell.sure").count() == page.locator("path.cell.rare").count() == 4
+        places = [box_of(page, kind)["x"] for kind in ("sure", "rare")]
+        assert places[0] < places[1]
+        assert page.locator("line.camera").count() == 24
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        _audit(page)
+        page.close()
+
+
+def level_at(x: float, degrees: float) -> Pose:
+    """A level camera at (x, 0, 0) with a heading."""
+    angle = np.radians(degrees)
+    at = np.array([x, 0.0, 0.0])
+    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+    return look_at(at, at + axis, np.array([0.0, 0.0, 1.0]))
+
+
+def box_of(page: Page, kind: str) -> dict:
+    box = page.locator(f"path.cell.{kind}").first.bounding_box()
+    assert box
+    return dict(box)
