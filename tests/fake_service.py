@@ -127,7 +127,7 @@ def coverage_map(found: float = 0.95) -> CoverageMap:
     """Two places of the ball's scene: beside each other on the orbit, looked at in four directions."""
     poses = [orbit(share) for share in (0.0, 0.1)]
     trials = tuple(Trial(pose, Status.LOCALIZED, found > 0.5, 0.1, 0.01, 0.1) for pose in poses * 20)
-    sees = np.array([[True, True, True, False]] * 2)
+    sees = np.array([[True, True, True, False], [True, True, True, False]])
     return CoverageMap(
         "0" * 64, np.eye(3), 0.8, np.array([pose.position_in_world for pose in poses]),
         np.arange(4) * np.pi / 2, sees, np.full((2, 4), 0.1), trials, (), Calibration(), 1.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -121,7 +122,7 @@ def test_from_above_all_cameras_are_in_view_and_x_is_right(aspect: float) -> Non
     assert right[2, 1] < right[0, 1]
 
 
-def display(client: Client) -> PlanDisplay:
+def display(client: Client) -> Any:
     controls, scene, scene_display = Mock(), Mock(), Mock(scene_id="ball")
     names = ("splats", "floor plan", "training cameras", "poses of all jobs", "coverage")
     controls.exact.value = True
@@ -137,16 +138,16 @@ def display(client: Client) -> PlanDisplay:
 def test_the_plan_view_shows_the_jobs_and_leaves_all_as_it_was(fake: FakeService, client: Client) -> None:
     fake.job("one", 3, finished=True)
     plan = display(client)
-    before = dict(plan.visible)  # type: ignore[attr-defined]
+    before = dict(plan.visible)
     plan.set_plan_view(True)
-    assert plan.visible == {  # type: ignore[attr-defined]
+    assert plan.visible == {
         **{"splats": False, "floor plan": True, "training cameras": True, "poses of all jobs": True, "coverage": False}
     }
     assert plan._scene.look_from_above.called
     plan._background.set_enabled.assert_called_with(False)
     assert [found.status for found in plan._scene.job_poses.show.call_args.args[0]] == ["localized"]
     plan.set_plan_view(False)
-    assert {**plan.visible, "poses of all jobs": False} == before  # type: ignore[attr-defined]
+    assert {**plan.visible, "poses of all jobs": False} == before
     plan._background.set_enabled.assert_called_with(True)
 
 

@@ -87,9 +87,9 @@ def find_places(
     standing = np.array([camera.pose.position_in_world for camera in flat])
     free = ~space.occupied(standing) & _reached(standing, at @ plan, space)
     sees = (free & (solid >= max(least, 1e-9))).reshape(len(middles), config.headings)
-    kept = sees.any(1)
+    kept = np.flatnonzero(sees.any(1))
     return Places(
-        plan, cell, positions[kept], headings, tuple(tuple(row) for row, k in zip(rows, kept, strict=True) if k),
+        plan, cell, positions[kept], headings, tuple(tuple(rows[i]) for i in kept),
         sees[kept], novelty(flat, captured, distance, config).reshape(sees.shape)[kept],
     )  # fmt: skip
 
@@ -120,7 +120,7 @@ def _reached(
     starts = captured[near].reshape(-1, 3)
     directions = (rays / np.maximum(apart, 1e-12)[..., None]).reshape(-1, 3)
     clear = space.free_distance(starts, directions, float(apart.max())).reshape(apart.shape)
-    return (clear >= apart - space.cell).any(1)
+    return np.asarray((clear >= apart - space.cell).any(1))
 
 
 def plan_axes(captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None) -> Float64[np.ndarray, "3 3"]:
@@ -140,15 +140,26 @@ def _cells(at: Float64[np.ndarray, "n 2"], reach: float, count: int) -> tuple[fl
     """Return the side and the middles of about `count` square cells that lie within reach of points."""
     low, high = at.min(0) - reach, at.max(0) + reach
     cell = float(np.sqrt(np.prod(high - low) / count))
-    # The cells beside the cameras are left out: smaller ones, until there are enough.
+    middles = _middles_near(at, low, high, cell, reach)
+    # Cells away from the cameras are left out: smaller ones, until there are enough.
     for _ in range(8):
-        across = [np.arange(a + 0.5 * cell, b + 0.5 * cell, cell) for a, b in zip(low, high, strict=True)]
-        grid = np.stack(np.meshgrid(*across, indexing="ij"), -1).reshape(-1, 2)
-        near = np.linalg.norm(grid[:, None] - at, axis=2).min(1) <= reach
-        if near.sum() >= 0.9 * count:
+        if len(middles) >= 0.9 * count:
             break
         cell *= 0.85
-    return cell, grid[near]
+        middles = _middles_near(at, low, high, cell, reach)
+    return cell, middles
+
+
+def _middles_near(
+    at: Float64[np.ndarray, "n 2"],
+    low: Float64[np.ndarray, "2"],
+    high: Float64[np.ndarray, "2"],
+    cell: float,
+    reach: float,
+) -> Float64[np.ndarray, "c 2"]:
+    across = [np.arange(a + 0.5 * cell, b + 0.5 * cell, cell) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*across, indexing="ij"), -1).reshape(-1, 2)
+    return grid[np.linalg.norm(grid[:, None] - at, axis=2).min(1) <= reach]
 
 
 def _camera(

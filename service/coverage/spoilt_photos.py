@@ -93,6 +93,7 @@ def _sensed(
     for axis in (0, 1):
         pad = [(reach, reach) if a == axis else (0, 0) for a in range(3)]
         padded, size = np.pad(rgb, pad, mode="edge"), rgb.shape[axis]
-        rgb = np.sum([w * padded.take(range(i, i + size), axis) for i, w in enumerate(kernel)], 0, np.float32)
+        shifted = np.stack([padded.take(range(i, i + size), axis) for i in range(len(kernel))])
+        rgb = np.tensordot(kernel, shifted, 1).astype(np.float32)
     noise = rng.uniform(*config.noise) * np.sqrt(rgb + 0.05) * rng.standard_normal(rgb.shape, np.float32)
     return np.clip(rgb + noise, 0, 1).astype(np.float32)

@@ -16,9 +16,9 @@ from viewer.colours import RGB
 from viewer.frusta import viser_frustum
 
 LayerName = Literal[
-    *("splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance"),
-    *("poses of all jobs", "coverage", "floor plan"),
-]
+    "splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance",
+    "poses of all jobs", "coverage", "floor plan",
+]  # fmt: skip
 
 _WIDTH_PX = 2.0
 """Of the trajectory's and of single frusta's lines."""
