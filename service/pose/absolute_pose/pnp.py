@@ -1,13 +1,13 @@
-"""Absolute pose by PnP-RANSAC; wraps PoseLib."""
+"""Absolute pose by PnP-RANSAC."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import poselib
 from jaxtyping import Bool, Float
 
+from service.pose.absolute_pose.ransac import solve_pnp
 from service.types import NO_CORRECTION, Intrinsics, IntrinsicsCorrection, Pose
 
 
@@ -17,6 +17,20 @@ class AbsolutePoseConfig:
     """Fewest correspondences, and fewest inliers of a solution: three fix a pose (P3P), the fourth confirms it."""
     min_trials: int = 100
     """RANSAC trials before the inlier ratio may end the search: one sample with many inliers by chance is no proof."""
+    confidence: float = 0.9999
+    """That a sample of inliers was among the trials, where the search ends early."""
+    trials_factor: float = 3.0
+    """Times as many trials as that takes without noise. This and the above are PoseLib's defaults."""
+    seed: int = 1
+    """Of the sampler."""
+    search_steps: int = 10
+    """Of Levenberg-Marquardt, for each pose that is better than those before; most converge in 4."""
+    final_steps: int = 50
+    """The same, for the answer."""
+    final_tolerance: float = 1e-8
+    """Shortest step, rad and share of the distance."""
+    loss_scale: float = 0.5
+    """Of the answer's robust loss, in largest errors of an inlier; PoseLib's."""
 
 
 ABSOLUTE_POSE = AbsolutePoseConfig()
@@ -48,35 +62,30 @@ def estimate_absolute_pose(
 ) -> AbsolutePose | None:
     """Estimate the pose from pixels of a photo and the scene points (world frame, scene units) seen there.
 
-    P3P in LO-RANSAC with progressive sampling (PROSAC, Chum and Matas, CVPR 2005), refined on the inliers. The
-    correspondences are ordered by confidence, highest first. Without that order 500 trials find the pose with 98 %
-    certainty where one match in five is right, 2000 where one in eight is. Deterministic: the sampler has a fixed
-    seed. `max_error_px` is the largest reprojection error of an inlier. None if no pose has enough inliers.
+    P3P in locally optimized RANSAC with progressive sampling (LO-RANSAC, PROSAC), then Levenberg-Marquardt on the
+    inliers with a Cauchy loss. The correspondences are ordered by confidence, highest first. Without that order 500
+    trials find the pose with 98 % certainty where one match in five is right, 2000 where one in eight is.
+    Deterministic: the sampler has a fixed seed. `max_error_px` is the largest reprojection error of an inlier. None if
+    no pose has enough inliers.
     """
     if len(photo_px) < config.min_points:
         return None
-    camera = {
-        "model": "PINHOLE",
-        "width": intrinsics.width,
-        "height": intrinsics.height,
-        "params": [intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy],
-    }
-    ransac = {
-        "max_reproj_error": max_error_px,
-        "min_iterations": config.min_trials,
-        "max_iterations": max_trials,
-        "progressive_sampling": True,
-        # Progressive to the end: later trials still prefer confident matches.
-        "max_prosac_iterations": max_trials,
-        "seed": 0,
-    }
-    found, info = poselib.estimate_absolute_pose(
-        np.asarray(photo_px, np.float64), np.asarray(points_in_world, np.float64), camera, ransac, {}
+    rotation, translation, inlier = solve_pnp(
+        # Copies: for read-only or strided arrays the kernel would be compiled once more.
+        np.array(photo_px, np.float64, order="C"),
+        np.array(points_in_world, np.float64, order="C"),
+        np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy]),
+        float(max_error_px),
+        (config.min_trials, max_trials),
+        (config.confidence, config.trials_factor),
+        (config.search_steps, config.final_steps),
+        config.seed,
+        config.loss_scale * max_error_px,
+        config.final_tolerance,
     )
-    # Where no sample gains enough inliers PoseLib's pose has no meaning, and may hold NaN.
-    if info["num_inliers"] < config.min_points or not np.all(np.isfinite(found.Rt)):
+    if np.count_nonzero(inlier) < config.min_points or not np.isfinite(translation).all():
         return None
     world_from_camera = np.eye(4)
-    world_from_camera[:3, :3] = found.R.T
-    world_from_camera[:3, 3] = -found.R.T @ found.t
-    return AbsolutePose(Pose(world_from_camera), np.array(info["inliers"], bool))
+    world_from_camera[:3, :3] = rotation.T
+    world_from_camera[:3, 3] = -rotation.T @ translation
+    return AbsolutePose(Pose(world_from_camera), inlier)
