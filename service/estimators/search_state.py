@@ -35,7 +35,7 @@ from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
 from service.pose.verification.ambiguity import explains_whole_photo, rank_answers
 from service.pose.verification.appearance import appearance
-from service.pose.verification.gate import VerificationConfig, verify
+from service.pose.verification.gate import VerificationConfig, downgraded, verify
 from service.pose.verification.mirror_images import dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import IntrinsicsCorrection, Query
@@ -138,7 +138,10 @@ class SearchState:
         rendered, refinement = found.view_at_pose(images, self.renderer)
         # A pose refined from a prior has no matches behind it.
         matches, unique = found.num_inliers or 0, is_unique or not self.tools.prepared.repeats_itself
-        return verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
+        verdict = verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
+        # Distance and focal length still move along together, however little one step of it says.
+        moves = images.query.lens_prior is not None and not found.settled
+        return downgraded(verdict, Reason.FOCAL_UNCERTAIN) if moves else verdict
 
     def appearance_at(self, found: RefinedPose) -> dict[str, float]:
         """Return how alike photo and render are at a pose."""

@@ -72,6 +72,8 @@ class RefinedPose:
     """The latest render, at the pose or nearby; None: there is none yet."""
     photometric: RefinementResult | None
     """The refinement on that render that led to the pose; None: the pose was not refined on it."""
+    settled: bool = True
+    """Whether another render would be the same; False: refinement ended while the pose was still moving."""
 
     def view_at_pose(self, images: QueryImages, renderer: ViewRenderer) -> tuple[RenderedView, RefinementResult | None]:
         """Return a render within a pixel of the pose, and the refinement on it: both at hand, or a new render."""
@@ -136,14 +138,14 @@ def refine_stage(
         diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
         if diverged or result.loss > max_loss or not np.isfinite(result.loss):
             # The last good pose was refined on an earlier render than the latest one.
-            refined = refined and replace(refined, rendered=rendered, photometric=None)
+            refined = refined and replace(refined, rendered=rendered, photometric=None, settled=False)
             is_astray = diverged or not np.isfinite(result.loss)
             return RefineOutcome(refined, found if trusted and is_astray else None, is_astray)
         refined = RefinedPose(result.pose, result.correction, result.loss, found.num_inliers or None, rendered, result)
         yield _record_of(refined, now.pose)
         is_first = free_lens and not round_number and not is_rematched
         if is_first and result.loss > config.max_first_loss and _moved_far(rendered, refined, images, config):
-            return RefineOutcome(replace(refined, photometric=None), restart=found)
+            return RefineOutcome(replace(refined, photometric=None, settled=False), restart=found)
         now, small_px = replace(found, pose=result.pose, correction=result.correction), None
     # Exact intrinsics: where photo and render agree, repeated texture may let refinement alternate between two poses.
     if refined is None or (not free_lens and (refined.loss or 0.0) <= config.max_first_loss):
@@ -152,7 +154,7 @@ def refine_stage(
     if following is None:
         return RefineOutcome(refined)
     # The pose began too far off, or distance and focal length still move along together: fresh matches bring it near.
-    return RefineOutcome(replace(refined, rendered=following, photometric=None), restart=now)
+    return RefineOutcome(replace(refined, rendered=following, photometric=None, settled=False), restart=now)
 
 
 def _next_render(

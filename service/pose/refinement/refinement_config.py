@@ -88,11 +88,9 @@ class LensTestConfig:
     k1_sigma: float = 0.15
     principal_point_scale: float = 0.05
     """Of the prior while they are free: wide, for wrong ones may be off by any amount."""
-    suspicious_deg: float = 0.5
-    suspicious_share: float = 0.0015
-    """Predicted motion of the pose (degrees; share of the median depth) from which on they are refined..."""
     suspicious_loss: float = 0.03
-    """...and mean absolute residual (0..1): most right answers with the right intrinsics have less."""
+    """Mean absolute residual (0..1) from which on matches are asked, too: most right answers with the right intrinsics
+    have less."""
     contradicting_deg: float = 1.25
     contradicting_share: float = 0.0025
     """Motion of the pose beyond which wrong intrinsics matter: about half of what counts as right where the scene is

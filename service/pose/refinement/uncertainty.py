@@ -103,7 +103,7 @@ def pose_uncertainty(
     last_step = se3_log(before @ np.linalg.inv(state.photo_from_render))
     score, hessian, scale = _normal_equations(level, state, frame, config)
     if lens_prior is None:
-        found = _with_exact_lens(level, state, score, hessian, scale, loss, config)
+        found = _with_exact_lens(level, state, hessian, scale, config)
     else:
         focal_lengths = answer.intrinsics.fx / answer.intrinsics.long_side
         found = _with_estimated_lens(hessian, score, scale, lens_prior, correction, focal_lengths, config)
@@ -119,10 +119,8 @@ def pose_uncertainty(
 def _with_exact_lens(
     level: PyramidLevel,
     state: RefinementState,
-    score: Float64[np.ndarray, "16"],
     hessian: Float64[np.ndarray, "16 16"],
     scale: float,
-    loss: float,
     config: RefinementConfig,
 ) -> PoseUncertainty | None:
     covariance = _covariance(hessian[:FOCAL, :FOCAL], scale)
@@ -131,7 +129,7 @@ def _with_exact_lens(
     of_lens = slice(0, CORRECTION.stop)
     information = _with_prior(hessian, scale, config.lens_test.prior, NO_CORRECTION)[of_lens, of_lens]
     free = inverse_spd(information)
-    lens_fit = None if free is None else fit_lens(level, state, free @ score[of_lens], loss, config)
+    lens_fit = fit_lens(level, state, config)
     # Beside the covariance, not in it: the gate trusts exact intrinsics, whoever uses the pose should know of the rest.
     untested = _covariance_of_untested_lens(level, hessian, scale, free, config.lens_test)
     return PoseUncertainty(np.zeros(6), covariance, lens_fit=lens_fit, untested_lens=untested)
