@@ -4,6 +4,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
+from importlib.util import find_spec
 
 # As on the command line: threads of a library that wait for one another burn the cores that other tests need. Too late
 # if a plug-in of pytest has imported numpy; test_demo.py notices.
@@ -24,6 +25,9 @@ shape_checks.install(("service", "viewer"))
 # No deadline: the machine may be busy. The same examples every time: a failure must not depend on luck.
 settings.register_profile("steady", deadline=None, derandomize=True, database=None, max_examples=60)
 settings.load_profile("steady")
+
+# These write scenes by gsply, which has no wheel for Linux on ARM.
+collect_ignore = [] if find_spec("gsply") else ["test_bench_gpu.py", "test_large_scenes.py", "test_train.py"]
 
 # The API's tests; imported where they are used, since other tests needn't wait for the engine.
 

