@@ -11,6 +11,7 @@ from service.geometry import pose_distance, project, rotation_from_quat, transfo
 from service.jit import kernel
 from service.pose.absolute_pose.p3p import WORK, solve_p3p
 from service.pose.absolute_pose.pnp import ABSOLUTE_POSE, AbsolutePose, estimate_absolute_pose
+from service.pose.absolute_pose.ransac import solve_pnp
 from service.types import Intrinsics, Pose
 
 CAMERA = Intrinsics(640, 480, 500.0, 520.0, 310.0, 250.0)
@@ -175,3 +176,14 @@ def test_noise_free_pixels_give_the_pose_exactly() -> None:
     assert found is not None
     assert found.num_inliers == 30
     np.testing.assert_allclose(found.pose.world_from_camera, truth.world_from_camera, atol=1e-9)
+
+
+def test_arrays_of_any_type_and_layout_use_one_compiled_kernel() -> None:
+    """That `doctor --warm` compiles, so that no job waits for a compiler."""
+    rng = np.random.default_rng(9)
+    px, points, _ = matched(rng, 60, 0.7, 0.5)
+    estimate_absolute_pose(px, points, CAMERA, ERROR_PX, 100)
+    strided = np.repeat(px, 2, axis=0).astype(np.float32)[::2]
+    strided.flags.writeable = False
+    estimate_absolute_pose(strided, np.asfortranarray(points), CAMERA, np.float64(ERROR_PX), 100)
+    assert len(solve_pnp.signatures) == 1
