@@ -33,6 +33,9 @@ if not os.environ.get("NUMBA_CACHE_DIR"):
     numba.config.CACHE_DIR = str(_cache_dir())  # type: ignore[attr-defined]
 
 
+_REORDERED = {"reassoc", "nsz", "contract"}
+
+
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function: without the GIL, bounds checks or Python's division by zero; with strict floating point."""
     return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False)(function)
@@ -40,10 +43,14 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def kernel_reordered_sums(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a kernel whose sums may be reordered, so that LLVM vectorizes them; NaN and infinity stay exact."""
-    flags = {"reassoc", "nsz", "contract"}
-    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=flags)(function)
+    return numba.njit(nogil=True, cache=True, error_model="numpy", boundscheck=False, fastmath=_REORDERED)(function)
 
 
 def inline(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that only kernels call; it has no cache of its own, since it is compiled into them."""
     return numba.njit(nogil=True, error_model="numpy", boundscheck=False)(function)
+
+
+def inline_reordered_sums(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function that only kernels call, whose sums may be reordered as `kernel_reordered_sums` says."""
+    return numba.njit(nogil=True, error_model="numpy", boundscheck=False, fastmath=_REORDERED)(function)

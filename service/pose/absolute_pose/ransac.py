@@ -13,14 +13,14 @@ import math
 
 import numpy as np
 
-from service.jit import inline, kernel, kernel_reordered_sums
+from service.jit import inline, inline_reordered_sums, kernel
 from service.pose.absolute_pose.p3p import WORK, solve_p3p
 
 TRUNCATED, CAUCHY = 0, 1
 """Losses: squared errors up to a limit; log(1 + error^2 / limit^2)."""
 
 
-@kernel_reordered_sums
+@inline_reordered_sums
 def score_pose(columns, rotation, translation, focal, limit_px):
     """Return the truncated squared error, px^2, summed over all points (MSAC), and the number of inliers."""
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
@@ -44,7 +44,7 @@ def score_pose(columns, rotation, translation, focal, limit_px):
     return cost, inliers
 
 
-@kernel_reordered_sums
+@inline_reordered_sums
 def linearize(columns, rotation, translation, focal, limit_px, loss, normal, gradient):
     """Write the normal equations of the loss in the pose's twist (translation, rotation; camera axes, applied on the
     left) and return the loss. Points behind the camera count as a point at the limit.
@@ -190,7 +190,7 @@ def copy_pose(rotation, translation, to_rotation, to_translation):
             to_rotation[i, j] = rotation[i, j]
 
 
-@kernel
+@inline
 def refine_pose(columns, rotation, translation, focal, limit_px, loss, steps, tolerance):
     """Minimize the loss in place by Levenberg-Marquardt: at most `steps`, until they are shorter than `tolerance`
     (radians; shares of the distance).
@@ -259,7 +259,7 @@ def enough_trials(inlier_share, confidence, factor, fewest, most):
     return max(fewest, min(most, np.int64(needed)))
 
 
-@kernel
+@inline
 def search_pose(columns, focal, limit_px, fewest, most, confidence, factor, refine_steps, seed, rotation, translation):
     """Write the pose of the lowest truncated squared error that was found; return how many inliers it has; 0: none.
 
