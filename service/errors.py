@@ -8,7 +8,7 @@
       |-- SceneError
       |     |-- SceneNotFound, UnsupportedFormat, CorruptScene
       |     |-- SceneExists
-      |     |-- SceneUnloaded, SceneInUse, SceneMemoryFull  (in memory, or not)
+      |     |-- SceneUnloaded, SceneInUse, SceneTooLarge  (in memory, or not)
       |     `-- SceneNotReady  (still loading; try again later)
       |-- JobNotFound, RecordNotFound, JobNotReady
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
@@ -115,8 +115,8 @@ class SceneInUse(SceneError):
     code = "scene_in_use"
 
 
-class SceneMemoryFull(SceneError):
-    code = "scene_memory_full"
+class SceneTooLarge(SceneError):
+    code = "scene_too_large"
 
 
 class SceneNotReady(SceneError):

@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from service.errors import SceneNotReady
+from service.errors import SceneNotReady, SplatfixError
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.live.live_values import LiveTask
@@ -113,20 +113,21 @@ class SubprocessEngine:
     def unload(self, scene_id: str) -> SceneStatus:
         return self._ask("unload", scene_id)
 
-    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        return self._ask("hold", asked)
+
+    def hold_later(
+        self, asked: str | Sequence[str] | None, take: Callable[[HeldScenes | SplatfixError], object]
+    ) -> None:
         def wait() -> None:
             while not self._closed:
                 try:
-                    self._ask("when_settled", scene_id)
+                    take(self._ask("hold_later", asked))
                 except _ChildGone:
                     continue
-                do()
                 return
 
         threading.Thread(target=wait, daemon=True).start()
-
-    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
-        return self._ask("hold", asked)
 
     def release(self, token: str) -> None:
         self._ask("release", token)
@@ -257,8 +258,8 @@ def _run(pipe: Connection, config: EngineConfig, set_up: SetUp) -> None:
             elif name == "live":
                 on_answer = partial(send, number, "answer")
                 value = engine.live(*arguments, partial(next_frame, number), on_answer)
-            elif name == "when_settled":
-                engine.when_settled(*arguments, lambda: send(number, "value", None))
+            elif name == "hold_later":
+                engine.hold_later(*arguments, lambda found: send(number, "value", found))
                 return
             elif name == "add":
                 value = engine.add(arguments[0], required=arguments[1])

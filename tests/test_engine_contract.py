@@ -12,6 +12,7 @@ What can't, because it doesn't speak HTTP only, is listed in `api_server.NOT_IN_
 from __future__ import annotations
 
 import pickle
+import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -38,6 +39,7 @@ from service.errors import (
     SceneNotFound,
     SceneNotReady,
     SceneUnloaded,
+    SplatfixError,
 )
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import Engine, EngineLost, HeldScenes, LocalizeTask, SequenceSource
@@ -155,15 +157,19 @@ def test_contents(engine):
 def test_a_scene_is_loaded_held_unloaded_and_removed(engine, folder):
     engine.add(StoredScene("attic", folder / "attic.ply"))
     assert (engine.scene("attic").state, engine.contents("attic")) == ("unloaded", None)
-    settled = threading.Event()
-    engine.when_settled("attic", settled.set)
-    assert settled.wait(60)
+    answers: queue.SimpleQueue[HeldScenes | SplatfixError] = queue.SimpleQueue()
+    engine.hold_later("attic", answers.put)
+    held = answers.get(timeout=60)
+    assert isinstance(held, HeldScenes)
+    assert held.ids == ("attic",)
+    assert engine.scene("attic").jobs == 1
+    engine.release(held.token)
     until(lambda: engine.scene("attic").state in ("ready", "failed"), 60)
     # The stand-in estimator needs a camera, which these files don't have: preparing fails, and that is told.
     assert engine.scene("attic").failure.code == "internal_error"
     engine.remove("attic")
-    engine.when_settled("attic", settled.clear)
-    until(lambda: not settled.is_set())
+    engine.hold_later("attic", answers.put)
+    assert isinstance(answers.get(timeout=60), SceneNotFound)
     assert "attic" not in {scene.id for scene in engine.scenes()}
 
 

@@ -37,7 +37,7 @@ from service.codec import encode
 from service.errors import BadInput, SceneError, SplatfixError
 from service.estimators import ESTIMATORS
 from service.localize import LoadedScene
-from service.scene_manager.manager import Entry
+from service.scene_manager.entry import Entry
 from service.web.api_keys import add_key
 from service.web.schemas.error_examples import EXAMPLES
 
@@ -88,6 +88,9 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
 
         stop: list[bool] = []
         patch.setattr(LoadedScene, "load", classmethod(held))
+        # None is tried again meanwhile.
+        patch.setattr("service.scene_manager.entry.RETRY_S", 1e6)
+        patch.setattr("service.scene_manager.entry.MAX_RETRY_S", 1e6)
         size = LoadedScene.load(folder / "scenes" / "good").nbytes
         changes = {
             **{"scenes": [folder / "scenes"], "cache_dir": None, "data_dir": folder / "data", "queue_size": 50},
@@ -119,7 +122,7 @@ def on_scene(s: SimpleNamespace, scene: str) -> str:
 
 SCENES = {
     "scene_not_found": "none", "scene_unloaded": "away", "corrupt_scene": "torn", "unsupported_format": "odd",
-    "scene_not_ready": "slow", "scene_memory_full": "fat",
+    "scene_not_ready": "slow", "scene_too_large": "fat",
 }  # fmt: skip
 
 
@@ -348,6 +351,8 @@ for _code, _scene in SCENES.items():
         ("register_scene", _code): lambda s, scene=_scene: register(s, scene),
         ("measure_coverage", _code): lambda s, scene=_scene: s.client.post(f"/scenes/{scene}/coverage"),
     }
+# A photo waits for its scene.
+del PROVOKED["localize_photo", "scene_not_ready"]
 for _name in ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose"):
     PROVOKED[_name, "job_not_found"] = lambda s, name=_name: plainly(s.client, name, job="none")
 
@@ -394,6 +399,7 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
     **{"photo_gone": "job_photo", "record_not_found": "job_render", "job_not_found": "get_job"},
     **{"scene_not_found": "get_scene", "bad_input": "unload_scene", "scene_in_use": "delete_scene"},
     **{
+        "scene_not_ready": "render_scene",
         "scene_exists": "upload_scene",
         "no_keys": "make_token",
         "lens_not_found": "delete_lens",

@@ -15,7 +15,8 @@ from service.photos.images import open_photo, query_of
 from service.results import Status
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
-from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.entry import Entry
+from service.scene_manager.manager import Scenes
 from service.scene_manager.scene_images import picture
 from service.scene_manager.splat_sample import packed_splats
 from service.scene_manager.status import PictureSpec

@@ -9,7 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from service.errors import SceneNotReady
+from service.errors import SceneNotReady, SplatfixError
 from service.estimators import ESTIMATORS
 from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord, SequenceSource
 from service.jobs.model import JobRecord, JobResult
@@ -22,7 +22,8 @@ from service.photos.sequence import read_sequence
 from service.registration.registration import Registration
 from service.results import PoseEstimate
 from service.scene_manager import scene_images
-from service.scene_manager.manager import Entry, Scenes
+from service.scene_manager.entry import Entry
+from service.scene_manager.manager import Acquired, Scenes
 from service.scene_manager.scene_coverage import SceneCoverages
 from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
 from service.scene_manager.splat_sample import packed_splats
@@ -59,7 +60,7 @@ class EngineConfig:
 class _Held:
     """Scenes that stay in memory, and the registrations in force when they were asked for."""
 
-    scenes: tuple[LoadedScene, ...]
+    acquired: Acquired
     registrations: tuple[Registration | None, ...]
 
 
@@ -125,22 +126,37 @@ class EmbeddedEngine:
         self._manager.unload(entry)
         return self._status(entry)
 
-    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
-        self._manager.when_settled(scene_id, do)
-
     def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
-        ids = self._manager.chosen(asked)
+        return self._held_scenes(self._manager.acquire(asked))
+
+    def hold_later(
+        self, asked: str | Sequence[str] | None, take: Callable[[HeldScenes | SplatfixError], object]
+    ) -> None:
+        def held(found: Acquired | SplatfixError) -> None:
+            try:
+                answer = found if isinstance(found, SplatfixError) else self._held_scenes(found)
+            except SplatfixError as error:
+                answer = error
+            take(answer)
+
+        self._manager.acquire_later(asked, held)
+
+    def _held_scenes(self, acquired: Acquired) -> HeldScenes:
         # A token instead of the scenes, so that an engine in another process can have the same interface.
-        held, token = self._manager.acquire(ids), secrets.token_hex(8)
-        paths = [self._manager.entry(scene_id).path for scene_id in ids]
-        pairs = zip(paths, held, strict=True)
-        registrations = tuple(self._registrations.of(path, loaded.scene.info) for path, loaded in pairs)
-        self._held[token] = _Held(held, registrations)
-        return HeldScenes(token, tuple(ids), held[0].scene.info.background_rgb)
+        token, scenes = secrets.token_hex(8), acquired.scenes
+        try:
+            paths = [self._manager.entry(scene_id).path for scene_id in acquired.ids]
+            pairs = zip(paths, scenes, strict=True)
+            registrations = tuple(self._registrations.of(path, loaded.scene.info) for path, loaded in pairs)
+        except BaseException:
+            self._manager.release(scenes)
+            raise
+        self._held[token] = _Held(acquired, registrations)
+        return HeldScenes(token, acquired.ids, scenes[0].scene.info.background_rgb, acquired.left_out)
 
     def release(self, token: str) -> None:
         held = self._held.pop(token, None)
-        self._manager.release(held.scenes if held else ())
+        self._manager.release(held.acquired.scenes if held else ())
 
     # ------------------------------------------------------------------ work
 
@@ -150,10 +166,14 @@ class EmbeddedEngine:
             raise SceneNotReady("the job's scenes were unloaded.", where="scene")
         cancel = self._cancels[task.id] = threading.Event()
         try:
-            result, loaded = run_task(task, held.scenes, on_record, cancel, held.registrations)
+            result, loaded = run_task(task, held.acquired.scenes, on_record, cancel, held.registrations)
         finally:
             # Also after an error: a later attempt has another id, so the entry would stay for ever.
             del self._cancels[task.id]
+        if left_out := held.acquired.left_out:
+            told = f"not searched, for they are not in memory: {', '.join(left_out)}"
+            estimate = result.estimate
+            result = replace(result, estimate=replace(estimate, warnings=(*estimate.warnings, told)))
         return EngineAnswer(result, self._manager.id_of(loaded))
 
     def _status(self, entry: Entry) -> SceneStatus:
@@ -171,7 +191,7 @@ class EmbeddedEngine:
         if held is None:
             raise SceneNotReady("the session's scene was unloaded.", where="scene")
         # Closed also after an error: a search in the background uses the scene.
-        with closing(LiveTracker(task, held.scenes[0])) as tracker:
+        with closing(LiveTracker(task, held.acquired.scenes[0])) as tracker:
             while (frame := next_frame()) is not None:
                 on_answer(tracker.use(frame))
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
+from service.errors import SplatfixError
 from service.jobs.model import JobRecord, JobResult
 from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.photos.sequence import SequenceOptions
@@ -41,6 +42,8 @@ class HeldScenes:
     ids: tuple[str, ...]
     background_rgb: tuple[float, float, float]
     """Of the first one."""
+    left_out: tuple[str, ...] = ()
+    """Scenes that AUTO does not look in: there is no memory for them, or they failed to load."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,12 +142,17 @@ class Engine(Protocol):
         """Drop a scene from memory as soon as no job uses it. Raises SceneNotFound, BadInput."""
         ...
 
-    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
-        """Call `do` once, as soon as the scene is in memory or certain not to come there; load it for that."""
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        """Keep scenes in memory: one, the only one (None), several, or all that there is memory for (AUTO).
+
+        Raises SceneError; SceneNotReady where one isn't in memory (yet), which has it loaded.
+        """
         ...
 
-    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
-        """Keep scenes in memory: one, the only one (None), several, or all that are ready (AUTO). Raises SceneError."""
+    def hold_later(
+        self, asked: str | Sequence[str] | None, take: Callable[[HeldScenes | SplatfixError], object]
+    ) -> None:
+        """Call `take` once: with the scenes, held, as soon as all are in memory, or with why they won't be."""
         ...
 
     def release(self, token: str) -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import suppress
 
+from service.errors import SplatfixError
 from service.jobs.engine import HeldScenes
 from service.jobs.model import JobRecord
 from service.jobs.read_photo import DecodedPhoto
@@ -26,7 +27,9 @@ class LiveJob:
         self.shown: Query | None = photo and photo.query
         """The photo that clients get: of a sequence, the last that was localized."""
         self.held = held
-        """Scenes that stay in memory for this job; None after a restart."""
+        """Scenes that stay in memory for this job; None while it waits for them."""
+        self.refused: SplatfixError | None = None
+        """Why its scenes won't come into memory."""
         self.cancelled = threading.Event()
         self.progress: tuple[int, list[JobRecord]] = (0, [])
         """The attempt, 0 before the first, and its records: one value, so that readers never mix two attempts."""

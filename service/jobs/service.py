@@ -14,12 +14,22 @@ import math
 import secrets
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-from service.errors import Failure, Interrupted, JobNotFound, JobNotReady, QueueFull, RecordNotFound, StorageFailed
+from service.errors import (
+    Failure,
+    Interrupted,
+    JobNotFound,
+    JobNotReady,
+    QueueFull,
+    RecordNotFound,
+    SceneNotReady,
+    StorageFailed,
+)
 from service.jobs.config import JobsConfig, Observer
-from service.jobs.engine import Engine
+from service.jobs.engine import Engine, HeldScenes
 from service.jobs.live_job import LiveJob
 from service.jobs.model import (
     Ending,
@@ -36,10 +46,12 @@ from service.jobs.model import (
 from service.jobs.photo_store import PhotoStore
 from service.jobs.queue import JobQueue
 from service.jobs.read_photo import DecodedPhoto, Recall, read_photo
+from service.jobs.scene_wait import SceneWait
 from service.jobs.store import JobStore
 from service.jobs.worker import Worker
 from service.lenses.lens_memory import LensMemory
 from service.photos.images import encode_image, undistorted_jpeg
+from service.scene_manager.status import AUTO
 from service.types import NO_CORRECTION
 
 _log = logging.getLogger(__name__)
@@ -95,6 +107,7 @@ class Jobs:
             queue_bytes=config.queue_bytes,
             stuck_s=config.stuck_s,
         )
+        self._scene_wait = SceneWait(engine, self._queue, store, self._worker)
         self._renew_at = 0.0
         self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
@@ -124,28 +137,54 @@ class Jobs:
         """
         if known := self._store.find_by_key(order.client, order.idempotency_key, order.digest):
             return known
-        held = self._engine.hold(order.spec.scene)
+        held = self._held(order.spec.scene)
         try:
-            for scene_id in held.ids:
-                order.spec.accuracy.in_units(scene_id, self._engine.require(scene_id).metres_per_unit)
+            if held is None:
+                # The photo is checked now, and decoded again before the search, over the scene's background.
+                scene, background = self._first_scene(order.spec.scene), (0.0, 0.0, 0.0)
+            else:
+                scene, background = held.ids[0], held.background_rgb
+                for scene_id in held.ids:
+                    order.spec.accuracy.in_units(scene_id, self._engine.require(scene_id).metres_per_unit)
             recall = self._recall(order)
-            photo = read_photo(order.photo, order.spec, held.background_rgb, self._config.max_frames, recall)
+            photo = read_photo(order.photo, order.spec, background, self._config.max_frames, recall)
             if recall:
                 # On record with the job: the same prior after a restart, whatever was learnt meanwhile.
                 lens = LensUse(order.lens_owner, photo.recalled)
                 order = replace(order, spec=replace(order.spec, lens=lens))
-            new = _new_job(order, held.ids[0], photo)
+            new = _new_job(order, scene, photo)
             job = self._stored(new, order.photo)
         # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
         except BaseException:
-            self._engine.release(held.token)
+            self._release(held)
             raise
         if job.id != new.id:  # two requests with the same idempotency key at the same time
-            self._engine.release(held.token)
-            return job
-        live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
-        self._queue.submit(live)
+            self._release(held)
+        elif held is None:
+            live = self._live[job.id] = LiveJob(job.id, job.scene)
+            self._scene_wait.submit(live, order.spec.scene, reserved=True)
+        else:
+            live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
+            self._queue.submit(live)
         return job
+
+    def _held(self, asked: str | Sequence[str] | None) -> HeldScenes | None:
+        """Return the scenes, held; None if one is not in memory yet: the job waits for it."""
+        try:
+            return self._engine.hold(asked)
+        except SceneNotReady:
+            return None
+
+    def _release(self, held: HeldScenes | None) -> None:
+        if held is not None:
+            self._engine.release(held.token)
+
+    def _first_scene(self, asked: str | Sequence[str] | None) -> str:
+        """Return the scene under which a job is listed until it has found the one that its photo shows."""
+        if asked == AUTO:
+            return self._engine.scenes()[0].id
+        names = [asked] if asked is None or isinstance(asked, str) else asked
+        return next(self._engine.scene(name).id for name in names)
 
     def _recall(self, order: JobOrder) -> Recall | None:
         """Return what recalls the lens of the order's photo; None: lenses aren't remembered."""
@@ -303,6 +342,7 @@ class Jobs:
             try:
                 self._renew()  # before `_reclaim`, which must not take attempts that are alive
                 self._reclaim(time.time())
+                self._scene_wait.expire()
                 for job_id in [*self._store.expire_photos(), *self._store.prune(kept)]:
                     self._photos.delete(job_id)
                 # No job may come that would show that the disk has space again: the service is not ready meanwhile.
@@ -331,10 +371,12 @@ class Jobs:
                 self._worker.clean_up(live)
 
     def _enqueue_when_ready(self, job: StoredJob) -> None:
-        """Queue a stored job as soon as its scene is loaded or has failed to load; keep its listeners."""
+        """Queue a stored job as soon as its scenes are loaded or have failed to load; keep its listeners."""
         # Clients may be waiting for the events of an attempt that was lost.
         live = self._live.setdefault(job.id, LiveJob(job.id, job.scene))
-        self._engine.when_settled(job.scene, partial(self._queue.submit, live, reserved=False))
+        live.refused = None
+        asked = job.spec.scene if job.spec.names_several_scenes else job.scene
+        self._scene_wait.submit(live, asked, reserved=False)
 
 
 def _new_job(order: JobOrder, scene: str, photo: DecodedPhoto) -> NewJob:

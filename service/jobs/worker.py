@@ -136,15 +136,17 @@ class Worker:
             return Ending(state, failure=Failure.of(error))
 
     def _localize(self, live: LiveJob, job: StoredJob, stored: _Stored) -> EngineAnswer:
-        spec = job.spec
-        # After a restart nothing is in memory; a job of several scenes looks in all of them again.
+        spec, budget_s = job.spec, self._budget_s(job)
+        if live.refused:
+            raise live.refused
+        # Of an attempt whose engine ended nothing is in memory; a job of several scenes looks in all of them again.
         if live.held is None:
             live.held = self._engine.hold(spec.scene if spec.names_several_scenes else job.scene)
         if live.photo is None:
             data = self._photos.original(job.id)
             live.photo = read_photo(data, spec, live.held.background_rgb, self._config.max_frames)
             live.shown = live.photo.query
-        task = live.photo.task(spec, live.task_id, live.held.token, self._budget_s(job))
+        task = live.photo.task(spec, live.task_id, live.held.token, budget_s)
 
         def on_record(record: JobRecord, shown: Query | None) -> None:
             # `cancel` may have come before the engine knew the attempt.
@@ -205,9 +207,10 @@ class Worker:
         self._photos.discard_original(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
         # After the photo is replaced: until then it is returned from memory.
         self.live.pop(live.id, None)
+        live.end()
+        # After its end, which those who wait for its scenes look at: scenes that come now are let go by them.
         if live.held is not None:
             self._engine.release(live.held.token)
-        live.end()
 
     def photo_until(self) -> float:
         """Return when the photo of a job that ends now is deleted."""

@@ -1,36 +1,36 @@
 """The scenes of a running process: loaded in the background, shared by all jobs, and dropped when memory is short.
 
     unloaded -> loading -> preparing -> ready -> (unloading ->) unloaded
-                   `-----------`-> failed
+                   `-----------`-> failed -> (a later request) -> loading
 
 A scene that was dropped for want of memory, or isn't in the preload list, is loaded when it is asked for; one that
-was unloaded by request stays unloaded until a request loads it.
+was unloaded by request stays unloaded until a request loads it. Who needs several scenes at once gets them together:
+those that the first one in line waits for are loaded first, and stay.
 """
 
 from __future__ import annotations
 
 import logging
-import queue
 import threading
 import time
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from service.errors import (
     BadInput,
-    Failure,
     SceneInUse,
-    SceneMemoryFull,
     SceneNotFound,
     SceneNotReady,
     SceneUnloaded,
     SplatfixError,
 )
 from service.localize import DEFAULT_MATCHER, LoadedScene
-from service.scene_manager.status import AUTO, SceneContents, SceneReadiness, SceneState, SceneStatus
+from service.scene_manager.entry import Entry
+from service.scene_manager.memory_limit import MemoryLimit
+from service.scene_manager.status import AUTO, SceneContents, SceneReadiness
 from service.scene_manager.warm_up import warm_up
 from service.scene_origin import shifted_camera
 
@@ -39,48 +39,25 @@ _log = logging.getLogger(__name__)
 _GRACE_S = 5.0
 
 
+@dataclass(frozen=True, slots=True)
+class Acquired:
+    """Scenes that stay in memory until they are released."""
+
+    ids: tuple[str, ...]
+    scenes: tuple[LoadedScene, ...]
+    left_out: tuple[str, ...] = ()
+    """Scenes that `auto` doesn't look in, because they are not in memory and don't fit, or failed to load."""
+
+
 @dataclass(slots=True)
-class Entry:
-    """One scene, the state of loading it, and who uses it."""
+class _Waiting:
+    """Who is given scenes as soon as all are in memory."""
 
-    id: str
-    path: Path | None
-    """None: it was given in memory, and can't be loaded again."""
-    state: SceneState = "unloaded"
-    loaded: LoadedScene | None = None
-    error: Exception | None = None
-    wanted: bool = True
-    """Load it when it is asked for."""
-    required: bool = False
-    """The service isn't ready without it."""
-    uploaded: bool = False
-    """It came over HTTP, and may be deleted."""
-    jobs: int = 0
-    """That use it, waiting or running: while there are any it stays."""
-    used: float = 0.0
-    """When it was last asked for, on the monotonic clock."""
-    waiting: list[Callable[[], object]] = field(default_factory=list)
-    """To call when it is loaded, or failed to."""
-
-    def status(self) -> SceneStatus:
-        """Return the scene's state, and its contents if it is loaded."""
-        failure = Failure.of(self.error) if self.error else None
-        loaded = self.loaded
-        if loaded is None:
-            return SceneStatus(self.id, self.state, self.jobs, self.uploaded, failure)
-        scene = loaded.scene
-        return SceneStatus(
-            self.id,
-            self.state,
-            self.jobs,
-            self.uploaded,
-            failure,
-            info=scene.info,
-            gaussians=scene.count,
-            sh_degree=scene.sh_degree,
-            cameras=len(scene.cameras),
-            memory_bytes=loaded.nbytes,
-        )
+    ids: list[str]
+    every: bool
+    """Each of the scenes is needed; otherwise those that fail are left out."""
+    left_out: list[str]
+    take: Callable[[Acquired | SplatfixError], object]
 
 
 class Scenes:
@@ -97,12 +74,13 @@ class Scenes:
     ) -> None:
         """`estimator` is the one that scenes are prepared for; `memory_bytes` limits them all together."""
         self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
-        self._cache_dir, self._memory_bytes = cache_dir, memory_bytes
+        self._cache_dir, self._limit = cache_dir, MemoryLimit(memory_bytes)
         self._entries: dict[str, Entry] = {}
-        # Reentrant: methods that hold it call others that take it.
-        self._lock = threading.RLock()
+        # Reentrant: methods that hold it call others that take it. Notified when a scene may fit now, or is asked for.
+        self._lock = threading.Condition(threading.RLock())
         self._stop = threading.Event()
-        self._tasks: queue.SimpleQueue[Entry | None] = queue.SimpleQueue()
+        self._requested: list[Entry] = []
+        self._waiting: list[_Waiting] = []
         # One thread: scenes that were loaded at once would need their peak memory at once.
         self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
 
@@ -116,7 +94,8 @@ class Scenes:
     def close(self) -> None:
         """Stop loading, between two scenes; return then, or soon anyway."""
         self._stop.set()
-        self._tasks.put(None)
+        with self._lock:
+            self._lock.notify_all()
         if self._thread.is_alive():
             self._thread.join(_GRACE_S)
 
@@ -142,6 +121,8 @@ class Scenes:
     def add(self, entry: Entry) -> None:
         """Add a scene without loading it; in the place of another of that name."""
         with self._lock:
+            if replaced := self._entries.get(entry.id):
+                self._withdraw(replaced)
             self._entries[entry.id] = entry
 
     def remove(self, scene_id: str) -> None:
@@ -154,6 +135,8 @@ class Scenes:
                 )
             del self._entries[scene_id]
             entry.wanted = False
+            self._withdraw(entry)
+        self._settle()
 
     def contents(self, scene_id: str) -> SceneContents | None:
         """Summarize a scene; None while it isn't in memory. Raises SceneNotFound."""
@@ -174,41 +157,78 @@ class Scenes:
             # Also while it is loading: who is waited for is not the next to be dropped.
             entry.used = time.monotonic()
             # Not loaded again by each request: a broken file would be read again and again.
-            if entry.error:
+            if entry.error and entry.used < entry.retry_at:
                 raise entry.error
-            if entry.loaded is not None and entry.state != "unloading":
+            if entry.loaded is not None and entry.state not in ("unloading", "failed"):
                 return entry.loaded
             if not entry.wanted:
                 raise SceneUnloaded(
                     f"scene '{entry.id}' was unloaded.", where="scene", hint=f"Load it: POST /scenes/{entry.id}/load."
                 )
-            if entry.state == "unloaded":
+            if entry.state in ("unloaded", "failed"):
                 self._request(entry)
         raise SceneNotReady(f"scene '{entry.id}' is {entry.state}.", where="scene", hint="Try again later.")
 
-    def chosen(self, asked: str | Sequence[str] | None) -> list[str]:
-        """Return the ids of the scenes that a request names: one, several, or all that are ready (`auto`).
+    def acquire(self, asked: str | Sequence[str] | None) -> Acquired:
+        """Return scenes that stay in memory until they are released as often: one, several, the only one (None), or
+        all that there is memory for (`auto`).
 
-        Raises SceneNotFound, SceneNotReady.
+        Raises SceneError; SceneNotReady where one isn't in memory (yet), which has it loaded.
+        """
+        with self._lock:
+            ids, left_out = self._chosen(asked)
+            # All or none: if one is missing, nothing is counted as used.
+            loaded = [self._or_error(scene_id) for scene_id in ids]
+            for found in loaded:
+                if isinstance(found, SplatfixError):
+                    raise found
+            return self._held(ids, left_out)
+
+    def acquire_later(
+        self, asked: str | Sequence[str] | None, take: Callable[[Acquired | SplatfixError], object]
+    ) -> None:
+        """Call `take` once: with the scenes, as soon as all are in memory, or with the reason why they won't be.
+
+        Of `auto` scenes that fail to load are left out.
+        """
+        try:
+            with self._lock:
+                ids, left_out = self._chosen(asked)
+                self._waiting.append(_Waiting(ids, asked != AUTO, left_out, take))
+        except SplatfixError as error:
+            take(error)
+        self._settle()
+
+    def _chosen(self, asked: str | Sequence[str] | None) -> tuple[list[str], list[str]]:
+        """Return the ids of the scenes that a request names, and of those that `auto` leaves out.
+
+        Raises SceneNotFound, SceneTooLarge.
         """
         if asked == AUTO:
-            ready = [entry.id for entry in self.entries() if entry.state == "ready"]
-            if not ready:
-                raise SceneNotReady("no scene is ready.", where="scene", hint="Try again later.")
-            return ready
-        if asked is None or isinstance(asked, str):
-            return [self.entry(asked).id]
+            entries = [entry for entry in self.entries() if entry.wanted]
+            chosen = [entry.id for entry in self._limit.that_fit(entries)]
+            if not chosen:
+                raise SceneNotFound(
+                    "no scene can be searched: none is there, or all failed or were unloaded.", where="scene"
+                )
+            return chosen, [entry.id for entry in entries if entry.id not in chosen]
+        names = [asked] if asked is None or isinstance(asked, str) else asked
         # A scene that is named twice is searched once.
-        return list(dict.fromkeys(self.entry(scene_id).id for scene_id in asked))
+        found = {entry.id: entry for entry in map(self.entry, names)}
+        self._limit.require_together(list(found.values()))
+        return list(found), []
 
-    def acquire(self, ids: Sequence[str]) -> tuple[LoadedScene, ...]:
-        """Return scenes that stay in memory until they are released as often. Raises SceneError."""
-        with self._lock:
-            # All or none: if one is missing, nothing is counted as used.
-            loaded = tuple(self.get(scene_id) for scene_id in ids)
-            for scene_id in ids:
-                self.entry(scene_id).jobs += 1
-            return loaded
+    def _or_error(self, scene_id: str) -> LoadedScene | SplatfixError:
+        try:
+            return self.get(scene_id)
+        except SplatfixError as error:
+            return error
+
+    def _held(self, ids: Sequence[str], left_out: Sequence[str]) -> Acquired:
+        scenes = tuple(self.get(scene_id) for scene_id in ids)
+        for scene_id in ids:
+            self.entry(scene_id).jobs += 1
+        return Acquired(tuple(ids), scenes, tuple(left_out))
 
     def id_of(self, loaded: LoadedScene) -> str | None:
         """Return the name under which a scene is served; None if it was removed meanwhile."""
@@ -223,11 +243,12 @@ class Scenes:
                     entry.jobs -= 1
                     if entry.state == "unloading" and not entry.jobs:
                         _drop(entry)
+            self._lock.notify_all()
 
     def load(self, entry: Entry) -> None:
         """Load a scene, if it isn't there; also one that failed to load."""
         with self._lock:
-            entry.wanted = True
+            entry.wanted, entry.used = True, time.monotonic()
             if entry.state in ("unloaded", "failed"):
                 self._request(entry)
             elif entry.state == "unloading":
@@ -239,26 +260,21 @@ class Scenes:
             raise BadInput("the scene has no file to reload it from.", where="scene")
         with self._lock:
             entry.wanted = False
-            if entry.state == "ready":
-                entry.state = "unloading"
-            if entry.state == "unloading" and not entry.jobs:
-                _drop(entry)
+            self._withdraw(entry)
+            self._unload(entry)
+            self._lock.notify_all()
+        self._settle()
 
-    def when_settled(self, scene_id: str, do: Callable[[], object]) -> None:
-        """Call `do` as soon as the scene is in memory, or certain not to come there."""
-        with self._lock:
-            entry = self._entries.get(scene_id)
-            if entry is not None and entry.loaded is None and entry.error is None:
-                entry.waiting.append(do)
-                if entry.state == "unloaded":
-                    self._request(entry)
-                return
-        do()
+    def _unload(self, entry: Entry) -> None:
+        if entry.state == "ready":
+            entry.state = "unloading"
+        if entry.state == "unloading" and not entry.jobs:
+            _drop(entry)
 
     def readiness(self) -> SceneReadiness:
         """Return whether photos can be localized, what is still loading, and what failed."""
         entries = self.entries()
-        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.state in _UNDER_WAY]
+        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
         loaded = [e.loaded for e in entries if e.loaded]
@@ -273,11 +289,13 @@ class Scenes:
     # ------------------------------------------------------------------ on the loading thread
 
     def _request(self, entry: Entry) -> None:
-        entry.error, entry.state = None, "loading" if entry.loaded is None else "preparing"
-        self._tasks.put(entry)
+        with self._lock:
+            entry.error, entry.state = None, "loading" if entry.loaded is None else "preparing"
+            self._requested.append(entry)
+            self._lock.notify_all()
 
     def _work(self) -> None:
-        while (entry := self._tasks.get()) is not None:
+        while (entry := self._next()) is not None:
             try:
                 self._load(entry)
             except Exception as error:  # one bad scene must not take the others with it
@@ -287,58 +305,102 @@ class Scenes:
                 _log.error("scene %s can't be used: %s", entry.id, error, exc_info=unexpected)
                 if isinstance(error, SplatfixError) and entry.path:  # clients must not learn the operator's folders
                     error.where = error.where.replace(str(entry.path), entry.id)
-                entry.error, entry.state = error, "failed"
-            self._settle(entry)
+                with self._lock:
+                    entry.failed(error)
+            entry.required = False
+            self._settle()
+
+    def _next(self) -> Entry | None:
+        """Wait for a requested scene that fits into memory beside those in use; None once the process ends."""
+        with self._lock:
+            while not self._stop.is_set():
+                for entry in list(self._in_order()):
+                    if self._makes_room(entry):
+                        self._requested.remove(entry)
+                        return entry
+                self._lock.wait(_GRACE_S)
+        return None
+
+    def _in_order(self) -> Iterator[Entry]:
+        """Yield the requested scenes: first those that the first one in line waits for."""
+        first = self._first_in_line
+        yield from (entry for entry in self._requested if entry.id in first)
+        yield from (entry for entry in self._requested if entry.id not in first)
+
+    @property
+    def _first_in_line(self) -> Collection[str]:
+        return self._waiting[0].ids if self._waiting else ()
+
+    def _makes_room(self, entry: Entry) -> bool:
+        """Drop scenes until another one fits, and return whether it does."""
+        needed = 0 if entry.loaded is not None else entry.expected_bytes()
+        if not self._limit.could_hold(needed):
+            return True  # loading refuses it, and drops none for it
+        dropped = self._limit.to_drop(entry, needed, self.entries(), self._first_in_line)
+        if entry.required and not entry.used and dropped != []:
+            # Of a preload list that is larger than the memory the first ones stay.
+            _log.warning("scene %s is not preloaded: the others take the memory that scenes may take", entry.id)
+            self._withdraw(entry)
+            return False
+        for other in dropped or ():
+            _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
+            _drop(other)
+        return dropped is not None
+
+    def _withdraw(self, entry: Entry) -> None:
+        """Take back the request to load a scene, unless it is under way."""
+        entry.required = False
+        if entry in self._requested:
+            self._requested.remove(entry)
+            entry.state = "unloaded" if entry.loaded is None else "ready"
 
     def _load(self, entry: Entry) -> None:
         if entry.loaded is None and entry.path is not None:
+            self._limit.require(entry, entry.expected_bytes())
             tools = {"matcher": self._matcher, "rasterizer": self._rasterizer}
             loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, **tools)
-            # Only now is its size known; for a moment it is in memory beyond the limit.
-            self._make_room(entry, loaded.nbytes)
-            entry.loaded, entry.state = loaded, "preparing"
-            self._settle(entry)
+            # Only now is its size certain.
+            entry.measured_bytes = loaded.nbytes
+            self._limit.require(entry, loaded.nbytes)
+            with self._lock:
+                # Where the header told too little the scenes in use stay, and all together are over the limit.
+                for other in self._limit.to_drop(entry, loaded.nbytes, self.entries()) or ():
+                    _drop(other)
+                entry.loaded, entry.state = loaded, "preparing"
+            self._settle()
         if entry.loaded is not None and not self._stop.is_set():
             entry.loaded.prepare(self._estimator)
             # Compiles and loads what the first photo would wait for.
             warm_up(entry.loaded, self._estimator)
         with self._lock:
-            entry.state = "ready"
-            if not entry.wanted:  # unloaded in the meantime
-                self.unload(entry)
+            entry.state, entry.failures = "ready", 0
+            if not entry.wanted:
+                self._unload(entry)  # as was asked for in the meantime
+            self._lock.notify_all()
 
-    def _make_room(self, entry: Entry, needed: int) -> None:
-        """Drop the least recently used scenes until another one fits. Raises SceneMemoryFull."""
-        if self._memory_bytes is None:
-            return
+    def _settle(self) -> None:
+        """Give scenes to those who have waited for them, in their order."""
+        settled: list[tuple[_Waiting, Acquired | SplatfixError]] = []
         with self._lock:
-            there = [e for e in self._entries.values() if e.loaded and e is not entry]
-            total = sum(e.loaded.nbytes for e in there if e.loaded)
-            # A scene without a file could not be loaded again.
-            idle = [e for e in there if e.state == "ready" and not e.jobs and e.path]
-            for other in sorted(idle, key=lambda e: e.used):
-                if total + needed <= self._memory_bytes:
-                    return
-                total -= other.loaded.nbytes if other.loaded else 0
-                _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
-                _drop(other)
-            if total + needed > self._memory_bytes:
-                raise SceneMemoryFull(
-                    f"scene '{entry.id}' takes {needed / 1e6:.0f} MB, {total / 1e6:.0f} of "
-                    f"{self._memory_bytes / 1e6:.0f} MB are in use.",
-                    where="scene",
-                    hint="Unload another scene, or raise SPLATFIX_SCENE_MEMORY_BYTES.",
-                )
-
-    def _settle(self, entry: Entry) -> None:
-        with self._lock:
-            waiting, entry.waiting = entry.waiting, []
+            for waiting in list(self._waiting):
+                if (answer := self._answer(waiting)) is not None:
+                    self._waiting.remove(waiting)
+                    settled.append((waiting, answer))
         # Outside of the lock: they submit jobs, which take locks of their own.
-        for do in waiting:
-            do()
+        for waiting, answer in settled:
+            waiting.take(answer)
 
-
-_UNDER_WAY = ("unloaded", "loading", "preparing")
+    def _answer(self, waiting: _Waiting) -> Acquired | SplatfixError | None:
+        """Return what somebody waits for, if it is certain by now; ask for what is missing."""
+        found = {scene_id: self._or_error(scene_id) for scene_id in waiting.ids}
+        errors = {i: e for i, e in found.items() if isinstance(e, SplatfixError) and not isinstance(e, SceneNotReady)}
+        if errors and (waiting.every or len(errors) == len(found)):
+            return next(iter(errors.values()))
+        waiting.ids = [scene_id for scene_id in waiting.ids if scene_id not in errors]
+        waiting.left_out += errors
+        if any(isinstance(one, SceneNotReady) for one in found.values()):
+            return None
+        return self._held(waiting.ids, waiting.left_out)
 
 
 def _drop(entry: Entry) -> None:

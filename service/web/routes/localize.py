@@ -14,7 +14,7 @@ from service.jobs.service import JobOrder
 from service.web.middleware.limits import client_of, too_large
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document, lens_owner
-from service.web.schemas.error_examples import SCENE_ERRORS, errors
+from service.web.schemas.error_examples import AWAITED_SCENE_ERRORS, errors
 from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
 from service.web.schemas.request_body import Body, read_body
@@ -72,7 +72,7 @@ _ACCEPTED = {
     response_model=JobOut,
     responses=_ACCEPTED
     | errors(
-        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *SCENE_ERRORS),
+        *("invalid_request", "bad_request", "unsupported_media_type", "request_timeout", *AWAITED_SCENE_ERRORS),
         *(
             "invalid_image",
             "invalid_intrinsics",

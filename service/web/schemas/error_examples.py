@@ -58,17 +58,17 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.SceneNotFound("unknown scene 'attic'; known: studio.", where="scene"), "/scenes/attic"),
     (
         e.SceneNotReady("scene 'studio' is loading.", where="scene", hint=_AGAIN),
-        "/localize",
+        f"{_SCENE}/render",
     ),
     (
         e.SceneUnloaded("scene 'studio' was unloaded.", where="scene", hint="Load it: POST /scenes/studio/load."),
         "/localize",
     ),
     (
-        e.SceneMemoryFull(
-            "scene 'studio' takes 812 MB, 1400 of 2000 MB are in use.",
+        e.SceneTooLarge(
+            "scene 'studio' takes 2812.0 MB, and all scenes together may take 2000.0 MB.",
             where="scene",
-            hint="Unload another scene, or raise SPLATFIX_SCENE_MEMORY_BYTES.",
+            hint="Raise SPLATFIX_SCENE_MEMORY_BYTES, or serve a smaller scene.",
         ),
         "/localize",
     ),
@@ -148,14 +148,15 @@ ALWAYS = ("unauthorized", "forbidden", "internal_error")
 """Errors of every operation."""
 WITH_BODY = ("content_too_large", "rate_limited", "queue_full")
 """Errors of operations other than GET, sent before the body is read."""
-SCENE_ERRORS = (
+AWAITED_SCENE_ERRORS = (
     "scene_not_found",
     "scene_unloaded",
     "corrupt_scene",
     "unsupported_format",
-    "scene_not_ready",
-    "scene_memory_full",
+    "scene_too_large",
 )
+"""Errors of operations that wait for their scene."""
+SCENE_ERRORS = (*AWAITED_SCENE_ERRORS, "scene_not_ready")
 """Errors of operations that need a loaded scene."""
 
 _MEANINGS = {

@@ -1,0 +1,86 @@
+"""One scene of the process: the state of loading it, and who uses it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from service.errors import Failure
+from service.localize import LoadedScene
+from service.scene_formats.size_estimate import estimated_bytes
+from service.scene_manager.status import SceneState, SceneStatus
+
+RETRY_S = 5.0
+"""A scene that failed to load is tried again by the next request after this time, doubled with each failure."""
+MAX_RETRY_S = 300.0
+
+
+@dataclass(slots=True)
+class Entry:
+    """Changed by the scene manager only, under its lock."""
+
+    id: str
+    path: Path | None
+    """None: it was given in memory, and can't be loaded again."""
+    state: SceneState = "unloaded"
+    loaded: LoadedScene | None = None
+    error: Exception | None = None
+    wanted: bool = True
+    """Load it when it is asked for."""
+    required: bool = False
+    """The service isn't ready before it has been loaded once, or failed to."""
+    uploaded: bool = False
+    """It came over HTTP, and may be deleted."""
+    jobs: int = 0
+    """That use it, waiting or running: while there are any it stays."""
+    used: float = 0.0
+    """When it was last asked for, on the monotonic clock."""
+    measured_bytes: int | None = None
+    """What it took of memory when it was loaded last."""
+    failures: int = 0
+    """Since it was loaded last."""
+    retry_at: float = 0.0
+    """When a request has it loaded again after it failed, on the monotonic clock."""
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether it is in memory and may be dropped; a scene without a file could not be loaded again."""
+        return self.state == "ready" and not self.jobs and self.path is not None
+
+    @property
+    def memory_bytes(self) -> int:
+        """What it takes of memory; 0 while it isn't there."""
+        return self.loaded.nbytes if self.loaded else 0
+
+    def expected_bytes(self) -> int:
+        """Return what it will take once it is loaded; 0 where that isn't known before."""
+        if self.measured_bytes is not None:
+            return self.measured_bytes
+        return (estimated_bytes(self.path) or 0) if self.path else 0
+
+    def failed(self, error: Exception) -> None:
+        """Note that loading failed, and from when on it is tried again."""
+        self.error, self.state = error, "failed"
+        self.retry_at = time.monotonic() + min(RETRY_S * 2**self.failures, MAX_RETRY_S)
+        self.failures += 1
+
+    def status(self) -> SceneStatus:
+        """Return the scene's state, and its contents if it is loaded."""
+        failure = Failure.of(self.error) if self.error else None
+        loaded = self.loaded
+        if loaded is None:
+            return SceneStatus(self.id, self.state, self.jobs, self.uploaded, failure)
+        scene = loaded.scene
+        return SceneStatus(
+            self.id,
+            self.state,
+            self.jobs,
+            self.uploaded,
+            failure,
+            info=scene.info,
+            gaussians=scene.count,
+            sh_degree=scene.sh_degree,
+            cameras=len(scene.cameras),
+            memory_bytes=loaded.nbytes,
+        )
