@@ -66,7 +66,7 @@ class SceneCoverages:
             if run is not None and run.status.state == "running":
                 return run.status
             # Held until it ends, so that it isn't dropped for want of memory.
-            (loaded,) = self._scenes.acquire([scene_id])
+            (loaded,) = self._scenes.acquire([scene_id]).scenes
             run = self._runs[scene_id] = _Run(loaded.scene.info.sha256)
             self._pool.submit(self._work, scene_id, run, loaded)
             return run.status
