@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import struct
 from collections.abc import Iterator
@@ -117,6 +118,15 @@ def test_frames_are_answered_in_messages_of_the_schema(service):
     told = service.get("/metrics").text
     assert re.search(r'splatfix_live_frames_total\{outcome="not_localized"\} \d', told)
     assert 'splatfix_requests_total{method="GET",route="/scenes/{scene_id}/live",status="101"}' in told
+
+
+def test_a_client_that_leaves_is_no_error(service, caplog):
+    with live(service) as session:
+        session.send(photo())
+        assert session.answer(10)
+    until(lambda: any("live session closed: 1000" in record.message for record in caplog.records))
+    until(lambda: sessions(service) == 0)
+    assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
 def test_only_the_newest_frame_waits_and_what_it_replaced_is_told():

@@ -11,6 +11,7 @@ from service.cli.bench_evaluate import bench_evaluate
 from service.cli.bench_field import bench_field
 from service.cli.bench_gate import bench_gate
 from service.cli.bench_gpu import bench_gpu
+from service.cli.bench_live import bench_live
 from service.cli.bench_localize import bench_localize
 from service.cli.bench_paper import bench_paper
 from service.cli.bench_render import bench_render
@@ -20,6 +21,7 @@ from service.cli.bench_track import bench_track
 bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
 bench_app.command("localize")(bench_localize)
 bench_app.command("track")(bench_track)
+bench_app.command("live")(bench_live)
 bench_app.command("paper")(bench_paper)
 bench_app.command("gate")(bench_gate)
 bench_app.command("render")(bench_render)

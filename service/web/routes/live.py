@@ -98,8 +98,8 @@ class _Session:
                 "live session closed: %d %s; %.0f s, %d frames used, %d dropped",
                 *(end.code, end.reason, self._loop.time() - began, self._used, self._dropped),
             )
-            # RuntimeError: closed by the client already. A client that reads nothing isn't waited for.
-            with suppress(RuntimeError, OSError, TimeoutError):
+            # The client may have closed it already, or read nothing, for which nobody waits.
+            with suppress(RuntimeError, WebSocketDisconnect, TimeoutError):
                 async with asyncio.timeout(1.0):
                     await self._socket.close(end.code, end.reason)
 

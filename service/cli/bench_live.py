@@ -1,0 +1,52 @@
+"""`splatfix bench live`: live sessions with a service at a camera's rate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from service.cli.terminal import (
+    JsonFileOption,
+    counter,
+    print_machine,
+    progress_bar,
+    say,
+    settings_of,
+    short,
+    write_json,
+)
+
+
+def bench_live(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with training cameras.")],
+    seconds: Annotated[float, typer.Option(min=10, help="Length of the film without its pause.")] = 40,
+    sessions: Annotated[int, typer.Option(min=1, max=4, help="Sessions at once.")] = 1,
+    cores: Annotated[int, typer.Option(min=1, help="Processors of the service.")] = 1,
+    seed: int = 0,
+    intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    json_file: JsonFileOption = None,
+) -> None:
+    """Send a hand-held camera's film to a service as it is taken, and measure what comes back."""
+    from service.bench.live import run
+
+    print_machine()
+    with progress_bar() as progress:
+        outcome = run(
+            folder,
+            seconds=seconds,
+            sessions=sessions,
+            cores=cores,
+            seed=seed,
+            withheld=intrinsics == "withheld",
+            progress=counter(progress, "frames"),
+            cache_dir=settings_of({}).cache_dir,
+        )
+    write_json(json_file, outcome)
+    of_sessions = outcome.pop("sessions")
+    for name, value in outcome.items():
+        say(f"{name:28} {short(value)}")
+    for number, figures in enumerate(of_sessions):
+        for name, value in figures.items():
+            say(f"session {number} {name:28} {short(value)}")
