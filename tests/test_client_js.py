@@ -10,6 +10,10 @@ from api_server import ROOT, photo
 from fake_service import FakeService
 from node import node
 
+from service.live.live_values import LiveFrame
+from service.types import Intrinsics
+from service.web.schemas.frame_message import read_frame
+
 CLIENT = ROOT / "service" / "web" / "static" / "client.js"
 IMPORT = f'import {{ Client, ServiceError }} from "{CLIENT.as_uri()}";\n'
 
@@ -84,3 +88,16 @@ const server = http.createServer((request, response) => {
     assert told["told"] == [0, 1, "lost", "resumed", 2, 3]
     assert told["asked"] == [["", "Bearer a-key"], ["1.1", "Bearer a-key"], ["1.1", "Bearer a-key"]]
     assert (told["score"], told["base"]) == (0.93, "/splatfix/")
+
+
+def test_its_live_messages_are_read_as_frames():
+    module = f"""
+import {{ liveMessage }} from "{CLIENT.as_uri()}";
+const jpeg = Uint8Array.from(Buffer.from(process.argv[2], "base64")).buffer;
+const texts = [liveMessage(7, 1.25, jpeg), liveMessage(8, 2.5, jpeg, [500.5, 501, 320, 240])];
+console.log(JSON.stringify(texts.map(message => Buffer.from(message).toString("base64"))));
+"""
+    messages = [base64.b64decode(text) for text in json.loads(node(module, base64.b64encode(photo()).decode()))]
+    first = read_frame(messages[0], None)
+    assert first == LiveFrame(7, 1.25, photo())
+    assert read_frame(messages[1], first).intrinsics == Intrinsics(96, 64, 500.5, 501.0, 320.0, 240.0)

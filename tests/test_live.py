@@ -149,7 +149,7 @@ def test_advice_follows_what_can_be_used():
     told = [pace.used(k / 20, 0.05, k % 2, 640) for k in range(90)]
     assert [(hint.max_fps, hint.long_side_px) for hint in told if hint] == [(20, None)]
     told = [pace.used(5 + k / 15, 0.02, 0, 2000) for k in range(60)]
-    assert [(hint.max_fps, hint.long_side_px) for hint in told if hint] == [(50, 640)]
+    assert [(hint.max_fps, hint.long_side_px) for hint in told if hint] == [(30, 640), (45, 640)]
 
 
 BAD = {

@@ -51,7 +51,7 @@ class LiveConfig:
     """Of a frame; it is reduced to 832 pixels anyway, and decoding 4 megapixels takes 20 ms."""
     check_every_s: float = 1.0
     """Time between two verifications by the whole gate."""
-    search_after_s: float = 0.3
+    search_after_s: float = 0.15
     """Without a verified frame for so long, a search begins, even if the camera is still followed."""
     unverified_s: float = 1.0
     """A camera that is followed without a verified frame for longer has no pose: refinement may have gone astray."""
@@ -237,22 +237,22 @@ class LiveTracker:
         if followed is None or unverified_s > self._config.search_after_s or self._doubt is not None:
             if self._is_dark(query):
                 return
-            expected = self._past[-1][1] if self._past else query.prior
-            self._background.start(lambda cancel: self._searched(query, time_s, expected, cancel))
+            self._background.start(lambda cancel: self._searched(query, time_s, cancel))
         elif time_s - self._checked_s > self._config.check_every_s:
             self._background.start(lambda cancel: self._checked(followed, time_s))
 
     def _is_dark(self, query: Query) -> bool:
         return float(query.rgb[::8, ::8].std()) < self._config.min_contrast
 
-    def _searched(self, query: Query, time_s: float, expected: Pose | None, cancel: threading.Event) -> _Found | None:
+    def _searched(self, query: Query, time_s: float, cancel: threading.Event) -> _Found | None:
         query = self._through_lens(query)
         loaded = self._loaded.as_seen_by(query)
         seconds = self._config.search_s[self._searches % len(self._config.search_s)]
         task = self._task
         request = Request(task.estimator, seed=task.seed, budget_s=seconds, cancel=cancel, accuracy=task.accuracy)
+        # Without the last pose as a prior: there tracking looks for the camera itself.
         try:
-            estimate = localize_in_scene(replace(query, prior=expected or query.prior), loaded, request)
+            estimate = localize_in_scene(query, loaded, request)
         except Cancelled:
             return None
         return _Found(query, time_s, estimate, None, loaded)

@@ -10,6 +10,8 @@ _WINDOW = 30
 """Used frames between two looks at the rate."""
 _SLACK = 1.25
 """Ratio of rates up to which nothing is advised: queues fill and empty for other reasons, too."""
+_RISE = 1.5
+"""By what factor the advised rate rises at most at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +57,10 @@ class Pace:
         # What was advised stays until clearly more could be used: the client sends less because of it.
         if self.hint.max_fps is not None and possible < _SLACK * self.hint.max_fps:
             return self.hint.max_fps
-        return min(self.most_fps, round(possible)) if self.hint.max_fps is not None else None
+        if self.hint.max_fps is None:
+            return None
+        # In steps: how long frames take changes with what else the machine does.
+        return min(self.most_fps, round(min(possible, _RISE * self.hint.max_fps)))
 
     def _size(self) -> int | None:
         return GOOD_PX if not MIN_USEFUL_PX <= self._long_side <= MAX_USEFUL_PX else None

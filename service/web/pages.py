@@ -1,4 +1,4 @@
-"""The start page at `/`, its scripts and styles under `/ui`, and the JavaScript client at `/client.js`."""
+"""The start page at `/`, the live page at `/live`, their files under `/ui`, the JavaScript client at `/client.js`."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ _REVALIDATE = {"Cache-Control": "no-cache"}
 def add_pages(app: FastAPI) -> None:
     """Add the routes of the pages."""
     app.add_api_route("/", _start_page, include_in_schema=False)
+    app.add_api_route("/live", _live_page, include_in_schema=False)
     app.add_api_route("/client.js", _client, include_in_schema=False)
     # Public: without a key, too, the start page must be able to ask for one.
     app.mount("/ui", declare(_Files(directory=PAGES), RoutePolicy(role=None)), "ui")
@@ -27,6 +28,11 @@ def add_pages(app: FastAPI) -> None:
 @route_policy(role=None, key_in_address=True)
 async def _start_page() -> FileResponse:
     return FileResponse(PAGES / "index.html", media_type="text/html", headers=_REVALIDATE)
+
+
+@route_policy(role="localize", key_in_address=True)
+async def _live_page() -> FileResponse:
+    return FileResponse(PAGES / "live.html", media_type="text/html", headers=_REVALIDATE)
 
 
 @route_policy(role=None)

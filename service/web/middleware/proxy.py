@@ -106,7 +106,7 @@ class _Response:
         self.status = 499  # as in nginx: the client closed the connection before the response
         self.begun = self.dropped = False
         path = scope["path"].removeprefix(scope.get("root_path", ""))
-        self._own_page = path == "/" or path.startswith("/ui/")
+        self._own_page = path in ("/", "/live") or path.startswith("/ui/")
 
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":

@@ -35,6 +35,21 @@
  * @property {AbortSignal} [signal]  ends the call with an AbortError; the job goes on
  */
 
+/**
+ * @typedef {{id: number, time_s: number, mode: "tracking" | "relocalizing" | "lost",
+ *   status: "localized" | "uncertain" | "not_localized", reason: string | null, score: number | null,
+ *   world_from_camera: number[][] | null, covariance: number[][] | null, intrinsics: Intrinsics | null,
+ *   waited_ms: number, used_ms: number, dropped: number[]}} LiveAnswer
+ * @typedef {{max_fps: number | null, long_side_px: number | null}} LiveHint
+ * @typedef {object} LiveOptions
+ * @property {Record<string, any>} [intrinsics]  of the frames, as for `localize`; estimated where there are none
+ * @property {Record<string, any>} [prior]
+ * @property {Record<string, any>} [accuracy]
+ * @property {(answer: LiveAnswer) => void} [onAnswer]
+ * @property {(hint: LiveHint) => void} [onHint]  what had better be sent: frames a second, pixels of the long side
+ * @property {(code: number, reason: string) => void} [onClose]  the session has ended; docs/live.md lists the codes
+ */
+
 /** States of a job that has ended. */
 export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
 const RETRY_MS = 1000;
@@ -218,6 +233,93 @@ export class Client {
     const body = JSON.stringify({ pose, intrinsics, format: "jpeg" });
     return (await this.send(`scenes/${encodeURIComponent(id)}/render`, { method: "POST", headers, body })).blob();
   }
+
+  /**
+   * Begin a live session: a moving camera's frames go in, poses come out (docs/live.md). Rejects with a ServiceError
+   * where it doesn't begin.
+   * @param {string} scene
+   * @param {LiveOptions} [options]
+   * @returns {Promise<Live>}
+   */
+  async live(scene, options = {}) {
+    const address = new URL(`scenes/${encodeURIComponent(scene)}/live`, this.base);
+    address.protocol = address.protocol.replace("http", "ws");
+    if (this.headers.Authorization) {  // no browser sends a header with a WebSocket
+      address.searchParams.set("token", (await this.ask("tokens", { method: "POST" })).token);
+    }
+    const live = new Live(address, options);
+    await live.began;
+    return live;
+  }
+}
+
+/** A live session; `Client.live` makes it. */
+export class Live {
+  #socket; #options; #nextId = 0; #open = /** @type {Set<number>} */ (new Set());
+
+  /** @param {URL} address @param {LiveOptions} options */
+  constructor(address, { intrinsics, prior, accuracy, ...options }) {
+    this.#options = options;
+    this.#socket = new WebSocket(address);
+    this.#socket.binaryType = "arraybuffer";
+    /** @type {Promise<void>} Resolves when frames may be sent. */
+    this.began = new Promise((resolve, reject) => {
+      this.#socket.onopen = () => this.#socket.send(JSON.stringify({ type: "hello", version: 1, intrinsics, prior, accuracy }));
+      this.#socket.onmessage = event => this.#hear(JSON.parse(event.data), resolve);
+      this.#socket.onclose = ({ code, reason }) => {
+        reject(new ServiceError({ code: "live_closed", detail: `The live session ended (${code}). ${reason}`.trim() }, 0));
+        this.#options.onClose?.(code, reason);
+      };
+    });
+  }
+
+  /** How many frames were sent whose answer, or loss, isn't known yet: send none while there are two. */
+  get unanswered() { return this.#open.size; }
+
+  /**
+   * Send a frame; it may be dropped for a newer one.
+   * @param {ArrayBuffer} jpeg
+   * @param {number} timeS  when it was taken, by any clock
+   * @param {number[]} [lens]  fx, fy, cx, cy of this frame, for lenses that change
+   * @returns {number} its id
+   */
+  send(jpeg, timeS, lens) {
+    const id = this.#nextId++;
+    this.#open.add(id);
+    this.#socket.send(liveMessage(id, timeS, jpeg, lens));
+    return id;
+  }
+
+  /** End the session. */
+  close() { this.#socket.close(1000); }
+
+  /** @param {any} message @param {() => void} begin */
+  #hear(message, begin) {
+    if (message.type === "welcome") begin();
+    else if (message.type === "hint") this.#options.onHint?.(message);
+    else if (message.type === "answer") {
+      for (const id of [message.id, ...message.dropped]) this.#open.delete(id);
+      this.#options.onAnswer?.(message);
+    }
+  }
+}
+
+/**
+ * The binary message of a frame: a header, and the JPEG.
+ * @param {number} id
+ * @param {number} timeS
+ * @param {ArrayBuffer} jpeg
+ * @param {number[]} [lens]  fx, fy, cx, cy
+ */
+export function liveMessage(id, timeS, jpeg, lens) {
+  const length = lens ? 56 : 24, message = new Uint8Array(length + jpeg.byteLength), head = new DataView(message.buffer);
+  message.set([0x53, 0x46, 0x4c, 0x56, 1, lens ? 1 : 0]);  // SFLV, version, flags
+  head.setUint16(6, length, true);
+  head.setUint32(8, id, true);
+  head.setFloat64(16, timeS, true);
+  lens?.forEach((value, index) => head.setFloat64(24 + 8 * index, value, true));
+  message.set(new Uint8Array(jpeg), length);
+  return message;
 }
 
 /** @param {Response} response */

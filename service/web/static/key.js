@@ -3,7 +3,7 @@
 import { service, ServiceError } from "./service.js";
 import { h } from "./dom.js";
 
-const AFTER = /^viewer\/[\w/-]*$/;
+const AFTER = /^(viewer\/[\w/-]*|live)$/;
 
 /** `query` is what follows `?` in the address: `then`, a page of the service, or `back`, a view of
  * this one, to go on with; `refused`, if a key was wrong. */
