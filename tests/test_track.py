@@ -18,12 +18,15 @@ from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service import tracking as track
 from service.bench import track as bench
+from service.bench.live import Told, figures
+from service.bench.live_film import FilmConfig, Shot, make_film
 from service.bench.pose_metrics import Units
 from service.errors import InvalidImage, SceneNotFound
 from service.geometry import moved, pose_distance
 from service.live.background import Background
 from service.live.live_tracker import LiveTracker
 from service.live.live_values import LiveFrame, LiveTask
+from service.live_client import LiveAnswer
 from service.localize import Cancelled, LoadedScene, Request, render_and_verify
 from service.photos.camera_identity import CameraIdentity
 from service.photos.images import encode_image, query_of, read_query
@@ -304,3 +307,62 @@ def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():
         assert background.idle
     if sys.platform == "linux":
         assert nice > os.getpriority(os.PRIO_PROCESS, 0)
+
+
+def test_the_film_of_a_live_bench_has_its_parts_and_true_poses(room):
+    training = [named.camera for named in room.scene.cameras]
+    config = FilmConfig(fps=10.0, locked_s=5.0)
+    film = make_film(
+        [c.pose for c in training], LENS, room.rasterizer, Units(np.zeros(3), 1.0, False), 2.0, 3, None, config
+    )
+    assert [shot.part for shot in film] == [
+        *3 * ["steady"], *3 * ["exposure"], *3 * ["occluded"], *2 * ["dark"], *3 * ["blurred"], *3 * ["jumped"],
+        *3 * ["unlocked"],
+    ]  # fmt: skip
+    assert np.diff([shot.time_s for shot in film]).round(6).tolist() == [*16 * [0.1], 5.1, 0.1, 0.1]
+    assert [shot.truth is None for shot in film] == [shot.part == "dark" for shot in film]
+    seen = {shot.part: read_query(shot.jpeg).rgb.astype(float) for shot in reversed(film)}
+    assert seen["dark"].mean() < 10
+    first = film[0].truth
+    assert first is not None
+    plain = 255 * room.rasterizer.render([Camera(LENS, first)])[0].rgb
+    assert np.abs(seen["steady"] - np.clip(plain, 0, 255)).mean() < 8  # seen: 4, noise and JPEG
+    # What the service says of this frame is right.
+    assert close(Tracker(room).track(read_query(film[0].jpeg, intrinsics=LENS)).pose, first)
+
+
+def test_the_figures_of_a_live_bench_are_those_of_what_was_heard():
+    shots = [Shot("steady", k / 10, b"", Pose(np.eye(4))) for k in range(8)]
+    shots += [
+        Shot("dark", 0.8, b"", None),
+        Shot("jumped", 0.9, b"", Pose(np.eye(4))),
+        Shot("jumped", 1.0, b"", Pose(np.eye(4))),
+    ]
+    told = Told(shots)
+
+    def hear(number: int, at_s: float, off: float | None, status: str = "localized") -> None:
+        matrix = (
+            None if off is None else moved(Pose(np.eye(4)), np.array([0, 0, 0, off, 0, 0])).world_from_camera.tolist()
+        )
+        mode = "lost" if off is None else "tracking"
+        told.answers[number] = LiveAnswer(number, 0.0, mode, status, None, None, matrix, None, None, 5.0, 15.0, [])
+        told.heard_at[number] = at_s
+
+    for number, shot in enumerate(shots[:7] + shots[8:]):  # one is lost on the way
+        told.sent_at[number], told.shot_of[number] = shot.time_s, number + (number > 6)
+    for number in range(5):
+        hear(number, 0.1 + number / 10, 0.0)
+    hear(5, 0.6, 0.02, "uncertain")  # within a degree, beyond 0.01
+    hear(7, 0.9, 0.0, "uncertain")  # in the dark nothing can be right
+    hear(8, 1.0, None, "not_localized")
+    hear(9, 1.25, 0.06)  # wrong
+    found = figures(told, Units(np.zeros(3), 1.0, False))
+    assert (found["sent"], found["wrong_localized"]) == (10, 1)
+    assert found["right"] == 5 / 10
+    assert found["localized"] == 6 / 10
+    assert found["used_per_s"] == pytest.approx(10 * 8 / 10)
+    assert found["right_by_part"] == {"steady": 5 / 8, "jumped": 0.0}
+    assert found["arrival_to_answer_ms_p95"] == 20.0
+    assert found["back_s"]["steady"] == pytest.approx(0.1)
+    assert found["back_s"]["jumped"] == pytest.approx(0.35)
+    assert found["back_s"]["unlocked"] is None

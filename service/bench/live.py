@@ -104,6 +104,7 @@ def run(
         "cores": cores,
         "intrinsics": "withheld" if withheld else "given",
         "service_cpu_share": server_s / wall_s,
+        "service_cpu_ms_a_frame": 1e3 * server_s / max(1, sum(len(one.answers) for one in told)),
         "clients_cpu_share": own_s / wall_s,
         "sessions": [figures(one, units) for one in told],
     }

@@ -42,7 +42,7 @@ function build() {
     h("h1", {}, "Live"),
     h("p", { class: "lead" }, "Point a camera at the scene: this page shows where it is, as it moves. The video is not stored."),
     trouble,
-    h("p", { class: "buttons" }, h("label", { class: "joined" }, "Scene ", scenes), button),
+    h("p", { class: "buttons" }, h("label", { class: "live-scene" }, "Scene", scenes), button),
     h("div", { class: "columns" },
       h("div", {}, stack,
         h("label", { class: "slide" }, "Video", slider, "Scene"),

@@ -43,9 +43,15 @@ export class Plan {
     return this.#axes.map(axis => dot(axis, vector));
   }
 
+  /** A colour of the style sheet for the theme that is shown: a canvas doesn't know light-dark(). */
+  #colour(name) {
+    this.#canvas.style.color = `var(${name})`;
+    return getComputedStyle(this.#canvas).color;
+  }
+
   #draw() {
     const context = this.#canvas.getContext("2d"), { width, height } = this.#canvas;
-    const colour = name => getComputedStyle(this.#canvas).getPropertyValue(name);
+    const colour = name => this.#colour(name);
     const points = [...this.#cameras, ...this.#trail.filter(Boolean)];
     context.clearRect(0, 0, width, height);
     if (!points.length) return;
