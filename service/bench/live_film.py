@@ -133,7 +133,7 @@ def _seen(
     motion = se3_log(pose.camera_from_world @ ahead.world_from_camera)
     shares = config.shutter * (np.arange(config.blur_samples) / (config.blur_samples - 1) - 0.5)
     frames = rasterizer.render([Camera(camera, moved(pose, share * motion)) for share in shares])
-    return np.mean([frame.rgb for frame in frames], axis=0, dtype=np.float32)
+    return np.stack([frame.rgb for frame in frames]).mean(0, dtype=np.float32)
 
 
 def _altered(
