@@ -122,26 +122,36 @@ def test_frames_are_answered_in_messages_of_the_schema(service):
 
 
 class Heard(logging.Handler):
-    """Keeps what the service and its server log."""
+    """Keeps what some loggers are told."""
 
-    def __init__(self) -> None:
+    def __init__(self, *names: str) -> None:
         super().__init__()
         self.told: list[tuple[int, str]] = []
+        self._loggers = [logging.getLogger(name) for name in names]
+        self._levels = [logger.level for logger in self._loggers]
 
     def emit(self, record: logging.LogRecord) -> None:
         self.told.append((record.levelno, record.getMessage()))
 
+    def __enter__(self) -> Heard:
+        for logger in self._loggers:
+            logger.addHandler(self)
+            logger.setLevel(logging.INFO)
+        return self
 
-def test_a_client_that_leaves_is_no_error(service, monkeypatch):
-    heard = Heard()
-    for name in ("service.web.routes.live", "uvicorn.error"):
-        monkeypatch.setattr(logging.getLogger(name), "handlers", [heard])
-        monkeypatch.setattr(logging.getLogger(name), "level", logging.INFO)
-    with live(service) as session:
-        session.send(photo())
-        assert session.answer(10)
-    until(lambda: any(text.startswith("live session closed: 1000") for _, text in heard.told))
-    time.sleep(0.1)
+    def __exit__(self, *_: object) -> None:
+        for logger, level in zip(self._loggers, self._levels, strict=True):
+            logger.removeHandler(self)
+            logger.setLevel(level)
+
+
+def test_a_client_that_leaves_is_no_error(service):
+    with Heard("service.web.routes.live", "uvicorn.error") as heard:
+        with live(service) as session:
+            session.send(photo())
+            assert session.answer(10)
+        until(lambda: any(text.startswith("live session closed: 1000") for _, text in heard.told))
+        time.sleep(0.1)
     assert not [text for level, text in heard.told if level >= logging.ERROR]
 
 
