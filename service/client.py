@@ -21,6 +21,7 @@ from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import httpx
 import numpy as np
@@ -436,6 +437,14 @@ def _depth(data: bytes) -> np.ndarray:
     return np.load(io.BytesIO(data), allow_pickle=False)
 
 
+def _anchor_path(scene_id: str, name: str) -> str:
+    return f"/scenes/{scene_id}/anchors/{quote(name, safe='')}"
+
+
+def _anchors(raw: Json) -> dict[str, np.ndarray]:
+    return {anchor["name"]: np.array(anchor["position"], np.float64) for anchor in raw["anchors"]}
+
+
 def _scene_pause(scene: Scene, waiting: _Waiting) -> float:
     """Return the seconds until a scene is looked at again. Raises ServiceError if it won't be ready."""
     problem = scene.raw.get("error")
@@ -603,6 +612,18 @@ class Client:
         """Return a scene's coverage map as the API has it, or how far it is measured; `measure`: begin that."""
         return _document(self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
 
+    def anchors(self, scene_id: str) -> dict[str, np.ndarray]:
+        """Return the positions of a scene's named points in its world, by name; results tell where photos see them."""
+        return _anchors(self._json(f"/scenes/{scene_id}/anchors"))
+
+    def put_anchor(self, scene_id: str, name: str, position: Sequence[float]) -> None:
+        """Add a named point to a scene, or move the one of that name."""
+        self._send("PUT", _anchor_path(scene_id, name), json={"position": list(map(float, position))})
+
+    def delete_anchor(self, scene_id: str, name: str) -> None:
+        """Delete a named point of a scene."""
+        self._send("DELETE", _anchor_path(scene_id, name))
+
     def splats(self, scene_id: str, limit: int) -> bytes:
         """Return the most important Gaussians for drawing, in the binary form of GET /scenes/{id}/splats."""
         return self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit}).content
@@ -754,6 +775,15 @@ class AsyncClient:
 
     async def coverage(self, scene_id: str, *, measure: bool = False) -> Json:
         return _document(await self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
+
+    async def anchors(self, scene_id: str) -> dict[str, np.ndarray]:
+        return _anchors(await self._json(f"/scenes/{scene_id}/anchors"))
+
+    async def put_anchor(self, scene_id: str, name: str, position: Sequence[float]) -> None:
+        await self._send("PUT", _anchor_path(scene_id, name), json={"position": list(map(float, position))})
+
+    async def delete_anchor(self, scene_id: str, name: str) -> None:
+        await self._send("DELETE", _anchor_path(scene_id, name))
 
     async def splats(self, scene_id: str, limit: int) -> bytes:
         return (await self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit})).content

@@ -14,6 +14,7 @@
       |-- NoPose, NoGeoAnchor  what an export needs isn't there
       |-- PhotoGone          deleted after the job
       |-- LensNotFound       no such lens is remembered
+      |-- AnchorNotFound     the scene has no anchor of that name
       |-- RegistrationNotFound  the scene isn't registered
       |-- IdempotencyConflict  a key was used for another request
       |-- DeadlineExceeded, Interrupted  why a job ended without a result
@@ -133,6 +134,10 @@ class RecordNotFound(SplatfixError):
 
 class LensNotFound(SplatfixError):
     code = "lens_not_found"
+
+
+class AnchorNotFound(SplatfixError):
+    code = "anchor_not_found"
 
 
 class RegistrationNotFound(SplatfixError):

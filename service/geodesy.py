@@ -65,6 +65,18 @@ def enu_from_geographic(
     return (there - here) @ _ecef_from_enu(origin[0], origin[1])
 
 
+def utm_from_geographic(latitude_deg: float, longitude_deg: float) -> tuple[str, float, float]:
+    """Return a place on WGS84 in UTM: the zone with its hemisphere, e.g. 32N, easting and northing in metres.
+
+    Zones are six degrees wide everywhere: the exceptions of Norway and Svalbard are left out.
+    """
+    zone = int((longitude_deg + 180) % 360 // 6) + 1
+    north = latitude_deg >= 0
+    to_utm = Transformer.from_crs("EPSG:4326", f"EPSG:{326 if north else 327}{zone:02}")
+    easting, northing = to_utm.transform(latitude_deg, longitude_deg)
+    return f"{zone}{'N' if north else 'S'}", float(easting), float(northing)
+
+
 def _ecef_from_enu(latitude_deg: float, longitude_deg: float) -> Float64[np.ndarray, "3 3"]:
     """Return the unit vectors east, north and up at a position, as columns, in the Earth-centred frame."""
     (sin_lat, sin_lon), (cos_lat, cos_lon) = (f(np.radians([latitude_deg, longitude_deg])) for f in (np.sin, np.cos))

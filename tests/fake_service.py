@@ -263,6 +263,7 @@ class FakeService:
         self.unloaded = False
         """The scene isn't in memory yet."""
         self.coverage = CoverageStatus("none")
+        self.anchors: dict[str, list[float]] = {}
         self.photos_kept = True
         self.loading_s = 0.0
         """How long splats take."""
@@ -313,6 +314,9 @@ class FakeService:
             return httpx.Response(200, json=self._scene_out(name).model_dump(mode="json"))
         if kind == "scenes" and rest == ["render"]:
             return self._render(json.loads(request.content))
+        if kind == "scenes" and rest == ["anchors"]:
+            anchors = [{"name": name, "position": position} for name, position in self.anchors.items()]
+            return httpx.Response(200, json={"anchors": anchors})
         if kind == "scenes" and rest == ["coverage"]:
             answer = coverage_status_out(self.coverage, path)
             return httpx.Response(200, json=answer.model_dump(mode="json"))

@@ -10,7 +10,16 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from service.errors import Failure, IdempotencyConflict, JobNotFound, PhotoGone, SceneExists, SceneNotFound
+from service.errors import (
+    AnchorNotFound,
+    BadInput,
+    Failure,
+    IdempotencyConflict,
+    JobNotFound,
+    PhotoGone,
+    SceneExists,
+    SceneNotFound,
+)
 from service.jobs.model import (
     Batch,
     Ending,
@@ -23,6 +32,7 @@ from service.jobs.model import (
     StoredJob,
 )
 from service.scene_formats import load_scene
+from service.scene_manager.anchor_store import Anchor
 from service.scene_manager.scene_store import check_scene_id
 from service.scene_manager.status import StoredScene
 
@@ -315,3 +325,23 @@ class MemoryDraft:
             raise SceneExists(f"scene '{self._id}' already exists.", where="scene")
         self._scenes[self._id] = StoredScene(self._id, path, uploaded=True)
         return self._scenes[self._id]
+
+
+class MemoryAnchorStore:
+    """Implements `AnchorStore`."""
+
+    def __init__(self, scenes: set[str]) -> None:
+        self._anchors: dict[str, dict[str, Anchor]] = {scene: {} for scene in scenes}
+
+    def anchors(self, scene_id: str) -> tuple[Anchor, ...]:
+        found = self._anchors.get(scene_id, {})
+        return tuple(found[name] for name in sorted(found))
+
+    def put(self, scene_id: str, anchor: Anchor) -> None:
+        if scene_id not in self._anchors:
+            raise BadInput("the scene has no file to keep anchors with.", where="scene")
+        self._anchors[scene_id][anchor.name] = anchor
+
+    def delete(self, scene_id: str, name: str) -> None:
+        if self._anchors.get(scene_id, {}).pop(name, None) is None:
+            raise AnchorNotFound(f"anchor '{name}' not found.", where="name")

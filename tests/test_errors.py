@@ -243,6 +243,25 @@ def damaged_registration(s: SimpleNamespace, method: str) -> httpx.Response:
         path.unlink()
 
 
+POINT = {"position": [1, 2, 3]}
+
+
+def damaged_anchors(s: SimpleNamespace, method: str, path: str) -> httpx.Response:
+    file = s.folder / "scenes" / "good" / "anchors.json"
+    file.write_text("{")
+    try:
+        return s.client.request(method, f"/scenes/good/anchors{path}", json=POINT if method == "PUT" else None)
+    finally:
+        file.unlink()
+
+
+def delete_anchor_with_full_disk(s: SimpleNamespace) -> httpx.Response:
+    assert s.client.put("/scenes/good/anchors/a", json=POINT).status_code == 200
+    refused = with_full_disk(s, lambda: s.client.delete("/scenes/good/anchors/a"))
+    (s.folder / "scenes" / "good" / "anchors.json").unlink()
+    return refused
+
+
 def undo_with_full_disk(s: SimpleNamespace) -> httpx.Response:
     assert register(s).status_code == 201
     refused = with_full_disk(s, lambda: s.client.delete("/scenes/good/registration"))
@@ -329,6 +348,23 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("get_registration", "registration_not_found"): lambda s: s.client.get("/scenes/good/registration"),
     ("get_registration", "corrupt_scene"): lambda s: damaged_registration(s, "GET"),
     ("get_coverage", "scene_not_found"): lambda s: s.client.get("/scenes/none/coverage"),
+    ("list_anchors", "scene_not_found"): lambda s: s.client.get("/scenes/none/anchors"),
+    ("list_anchors", "corrupt_scene"): lambda s: damaged_anchors(s, "GET", ""),
+    ("put_anchor", "invalid_request"): lambda s: s.client.put("/scenes/good/anchors/a", json={"position": [1]}),
+    ("put_anchor", "bad_request"): lambda s: s.client.put(
+        "/scenes/good/anchors/a", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("put_anchor", "scene_not_found"): lambda s: s.client.put("/scenes/none/anchors/a", json=POINT),
+    ("put_anchor", "bad_input"): lambda s: fileless(s).client.put("/scenes/hall/anchors/a", json=POINT),
+    ("put_anchor", "corrupt_scene"): lambda s: damaged_anchors(s, "PUT", "/a"),
+    ("put_anchor", "storage_failed"): lambda s: with_full_disk(
+        s, lambda: s.client.put("/scenes/good/anchors/a", json=POINT)
+    ),
+    ("delete_anchor", "invalid_request"): lambda s: s.client.delete(f"/scenes/good/anchors/{65 * 'a'}"),
+    ("delete_anchor", "scene_not_found"): lambda s: s.client.delete("/scenes/none/anchors/a"),
+    ("delete_anchor", "anchor_not_found"): lambda s: s.client.delete("/scenes/good/anchors/none"),
+    ("delete_anchor", "corrupt_scene"): lambda s: damaged_anchors(s, "DELETE", "/a"),
+    ("delete_anchor", "storage_failed"): delete_anchor_with_full_disk,
     ("undo_registration", "scene_not_found"): lambda s: s.client.delete("/scenes/none/registration"),
     ("undo_registration", "registration_not_found"): lambda s: s.client.delete("/scenes/good/registration"),
     ("undo_registration", "corrupt_scene"): lambda s: damaged_registration(s, "DELETE"),
@@ -403,6 +439,7 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
         "scene_exists": "upload_scene",
         "no_keys": "make_token",
         "lens_not_found": "delete_lens",
+        "anchor_not_found": "delete_anchor",
         "registration_failed": "register_scene",
         "registration_not_found": "get_registration",
         "interrupted": "see test_durable",

@@ -657,3 +657,20 @@ def box_of(page: Page, kind: str) -> dict:
     box = page.locator(f"path.cell.{kind}").first.bounding_box()
     assert box
     return dict(box)
+
+
+def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -> None:
+    page = opened(browser, f"{url}/#/scenes/room?point=0.5,-0.25,1", 390, 844)
+    page.get_by_label("Name of the picked point").fill("lamp")
+    _audit(page)
+    page.get_by_role("button", name="Save").click()
+    expect(page.locator(".anchors li")).to_contain_text("lamp 0.5, -0.25, 1")
+    expect(page.locator("svg.plan text").filter(has_text="lamp")).to_have_count(1)
+    expect(page.get_by_label("Name of the picked point")).to_have_count(0)
+    kept = httpx.get(f"{url}/scenes/room/anchors", trust_env=False).json()
+    assert kept == {"anchors": [{"name": "lamp", "position": [0.5, -0.25, 1.0]}]}
+    assert _overflow(page) <= 0
+    page.get_by_role("button", name="Delete lamp").click()
+    expect(page.locator(".anchors li")).to_have_count(0)
+    assert httpx.get(f"{url}/scenes/room/anchors", trust_env=False).json() == {"anchors": []}
+    page.close()

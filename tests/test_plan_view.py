@@ -20,6 +20,7 @@ from service.types import Camera, Intrinsics
 from service.web.schemas.coverage import coverage_status_out
 from viewer.camera_views import scene_extent, view_from_above
 from viewer.colours import BLIND_COLOUR, COVERAGE_LEVELS, STATUS_COLOURS, coverage_colour
+from viewer.layers.anchor_layer import AnchorLayer
 from viewer.layers.coverage_layer import CoverageLayer
 from viewer.layers.floor_plan_layer import FloorPlanLayer, below_the_cut
 from viewer.layers.job_poses_layer import JobPosesLayer
@@ -124,7 +125,7 @@ def test_from_above_all_cameras_are_in_view_and_x_is_right(aspect: float) -> Non
 
 def display(client: Client) -> Any:
     controls, scene, scene_display = Mock(), Mock(), Mock(scene_id="ball")
-    names = ("splats", "floor plan", "training cameras", "poses of all jobs", "coverage")
+    names = ("splats", "floor plan", "training cameras", "poses of all jobs", "coverage", "anchors")
     controls.exact.value = True
     controls.layers = {name: Mock(value=name in ("splats", "training cameras")) for name in names}
     visible = {name: widget.value for name, widget in controls.layers.items()}
@@ -140,9 +141,8 @@ def test_the_plan_view_shows_the_jobs_and_leaves_all_as_it_was(fake: FakeService
     plan = display(client)
     before = dict(plan.visible)
     plan.set_plan_view(True)
-    assert plan.visible == {
-        **{"splats": False, "floor plan": True, "training cameras": True, "poses of all jobs": True, "coverage": False}
-    }
+    shown = {"floor plan", "training cameras", "poses of all jobs"}
+    assert {name for name, visible in plan.visible.items() if visible} == shown
     assert plan._scene.look_from_above.called
     plan._background.set_enabled.assert_called_with(False)
     assert [found.status for found in plan._scene.job_poses.show.call_args.args[0]] == ["localized"]
@@ -169,3 +169,25 @@ def test_coverage_is_requested_when_its_layer_is_shown(fake: FakeService, client
     plan.set_layer_visible("coverage", True)
     assert plan._scene.coverage.show.call_args.args[0].title.startswith("Coverage, upper bound")
     assert "upper bound" in plan._controls.coverage.content
+
+
+def test_anchors_are_drawn_with_their_names_and_a_picked_point_is_offered_to_be_named(
+    canvas: Canvas, fake: FakeService, client: Client
+) -> None:
+    fake.anchors = {"door": [1.0, 2.0, 3.0], "lamp": [0.0, 0.0, 1.0]}
+    layer = on(canvas, AnchorLayer)
+    layer.show(client.anchors("ball"))
+    assert [canvas.nodes[f"/anchors/name {k}"].text for k in range(2)] == ["door", "lamp"]
+    np.testing.assert_allclose(canvas.nodes["/anchors/points"].points, [[1, 2, 3], [0, 0, 1]])
+    layer.show({})
+    assert not canvas.nodes
+    plan = display(client)
+    plan._scene.surface.return_value = np.array([0.5, -1.25, 3.0])
+    plan.pick_point([0, 0, 0], [0, 0, 1])
+    assert "./#/scenes/ball?point=0.5,-1.25,3'" in plan._controls.anchor.content
+    plan._scene.surface.return_value = None
+    plan._controls.anchor.content = ""
+    plan.pick_point([0, 0, 0], [0, 0, 1])
+    assert plan._controls.anchor.content == ""
+    plan.set_layer_visible("anchors", True)
+    assert list(plan._scene.anchors.show.call_args.args[0]) == ["door", "lamp"]

@@ -139,8 +139,12 @@ class BrowserSession:
         command("Play or pause", hotkey="space").on_trigger(lambda _: post(partial(self._job.press, PLAY)))
 
     def _click(self, origin: Sequence[float], direction: Sequence[float]) -> None:
-        react = self._scene_display.measure if self._controls.measure.value else self._job.click
-        react(origin, direction)
+        if self._controls.name_point.value:
+            self._plan.pick_point(origin, direction)
+        elif self._controls.measure.value:
+            self._scene_display.measure(origin, direction)
+        else:
+            self._job.click(origin, direction)
 
     def _lists_changed(self) -> None:
         self._queue.post(self._selection.sync)

@@ -54,6 +54,8 @@ class Controls:
             "photo opacity", 0.0, 1.0, 0.05, 0.5, visible=False, hint="Of the photo over the view through its camera."
         )
         self.measure = gui.add_checkbox("measure distances", False, hint="Click two points of the scene.")
+        self.name_point = gui.add_checkbox("name a point", False, hint="Click a point of the scene: an anchor.")
+        self.anchor = gui.add_html("")
         self.plan_view = gui.add_checkbox(
             "plan view", False, hint="From above, cut open, with training cameras and the poses of all jobs."
         )

@@ -71,6 +71,12 @@ def prior_link_html(scene: str, prior: Mapping[str, object]) -> str:
     return _padded(f"<a href='/' data-splatfix='./#/?{escape(query)}'>Choose the photo for this prior</a>")
 
 
+def anchor_link_html(scene: str, point: Sequence[float]) -> str:
+    """Return a link to the scene's page, where a point is named."""
+    text = ",".join(f"{value:.6g}" for value in point)
+    return _padded(f"<a href='/' data-splatfix='./#/scenes/{escape(scene)}?point={text}'>Name the point {text}</a>")
+
+
 def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_unit: float | None = None) -> str:
     """Return a record's numbers as a table, with its errors where the true pose is given.
 

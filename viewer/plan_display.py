@@ -1,14 +1,15 @@
-"""What one browser shows of a whole scene: plan view, coverage map, and the cameras of all jobs."""
+"""What one browser shows of a whole scene: plan view, coverage map, the cameras of all jobs, and anchors."""
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 
 from service.client import Client, ServiceError
 from viewer.background_render import BackgroundRender
 from viewer.controls import Controls
 from viewer.layers.layer import LayerName
-from viewer.panel_html import coverage_html
+from viewer.panel_html import anchor_link_html, coverage_html
 from viewer.scene_3d import Scene3D
 from viewer.scene_display import SceneDisplay
 from viewer.service_values import FoundCamera, coverage_of, found_cameras
@@ -59,8 +60,15 @@ class PlanDisplay:
     def set_layer_visible(self, name: LayerName, visible: bool) -> None:
         """Show or hide a layer; what it shows is requested when it is first needed."""
         self._scene_display.set_layer_visible(name, visible)
-        if name in ("coverage", "poses of all jobs"):
+        if name in ("coverage", "poses of all jobs", "anchors"):
             self.refresh()
+
+    def pick_point(self, origin: Sequence[float], direction: Sequence[float]) -> None:
+        """Offer to name the point that a click's ray hits, on the page of its scene."""
+        point, scene_id = self._scene.surface(origin, direction), self._scene_display.scene_id
+        if point is not None and scene_id is not None:
+            self._scene.anchors.pick(point)
+            self._controls.anchor.content = anchor_link_html(scene_id, point.tolist())
 
     def follow_scene(self) -> None:
         """Show the layers of another scene if there is one now."""
@@ -72,6 +80,8 @@ class PlanDisplay:
         scene_id = self._shown = self._scene_display.scene_id
         if scene_id is None:
             return
+        if self._scene.is_visible("anchors"):
+            self._scene.anchors.show(self._client.anchors(scene_id))
         if self._scene.is_visible("poses of all jobs"):
             self._scene.job_poses.show(self._all_cameras(scene_id))
         if self._scene.is_visible("coverage"):

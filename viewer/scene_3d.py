@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from service.types import Camera, Pose
 from viewer.browser_camera import BrowserCamera
 from viewer.camera_views import initial_view, view_from_above, view_from_behind, view_through
+from viewer.layers.anchor_layer import AnchorLayer
 from viewer.layers.axes_layer import AxesLayer
 from viewer.layers.candidate_layer import CandidateLayer
 from viewer.layers.coverage_layer import CoverageLayer
@@ -39,8 +41,9 @@ class Scene3D:
         self.job_poses = JobPosesLayer(canvas, visible=False)
         self.coverage = CoverageLayer(canvas, visible=False)
         self._floor_plan = FloorPlanLayer(canvas, visible=False)
+        self.anchors = AnchorLayer(canvas)
         layers = self.splats, self.training_cameras, self.trajectory, self.candidates, self.matches
-        layers += self.axes, self.measured, self.job_poses, self.coverage, self._floor_plan
+        layers += self.axes, self.measured, self.job_poses, self.coverage, self._floor_plan, self.anchors
         self._layers: dict[LayerName, Layer] = {layer.name: layer for layer in layers}
         self._canvas = canvas
         self._camera = BrowserCamera(canvas)
@@ -71,7 +74,7 @@ class Scene3D:
         self._canvas.flush()
         self.training_cameras.show(cameras)
         self.axes.show(self.metres_per_unit)
-        for layer in (self.measured, self.job_poses, self.coverage, self._floor_plan):
+        for layer in (self.measured, self.job_poses, self.coverage, self._floor_plan, self.anchors):
             layer.clear()
         if self._floor_plan.visible:
             self._floor_plan.show(content)
@@ -99,13 +102,17 @@ class Scene3D:
         step = self.trajectory.hit(*ray)
         return self.training_cameras.hit(*ray) if step is None else step
 
+    def surface(self, origin: Sequence[float], direction: Sequence[float]) -> Float64[np.ndarray, "3"] | None:
+        """Return the point of the scene that a click's ray hits; None: it passes."""
+        if self._content is None:
+            return None
+        return first_surface(np.array(origin, np.float64), np.array(direction, np.float64), self._content.splats)
+
     def measure(self, origin: Sequence[float], direction: Sequence[float]) -> None:
         """Take what a click's ray hits as a point of the measured distance."""
-        if self._content is not None:
-            ray = np.array(origin, np.float64), np.array(direction, np.float64)
-            point = first_surface(*ray, self._content.splats)
-            if point is not None:
-                self.measured.add(point, self.metres_per_unit)
+        point = self.surface(origin, direction)
+        if point is not None:
+            self.measured.add(point, self.metres_per_unit)
 
     def look_through(self, camera: Camera) -> None:
         """Take the view of a camera."""

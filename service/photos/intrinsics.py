@@ -209,6 +209,21 @@ def undistorted(
     return straight, pinhole, inside
 
 
+def distorted_pixels(
+    points_in_camera: Float64[np.ndarray, "n 3"], intrinsics: Intrinsics
+) -> Float64[np.ndarray, "n 2"]:
+    """Return the pixels of points before the camera, seen through its lens."""
+    coefficients = _coefficients(intrinsics)
+    # OpenCV has the centre of the top-left pixel at (0, 0), this project at (0.5, 0.5).
+    matrix = np.array([[intrinsics.fx, 0, intrinsics.cx - 0.5], [0, intrinsics.fy, intrinsics.cy - 0.5], [0, 0, 1]])
+    points, still = points_in_camera.reshape(-1, 1, 3).astype(np.float64), np.zeros(3)
+    if "FISHEYE" in intrinsics.model:
+        px, _ = cv2.fisheye.projectPoints(points, still, still, matrix, coefficients)
+    else:
+        px, _ = cv2.projectPoints(points, still, still, matrix, coefficients)
+    return np.asarray(px, np.float64).reshape(-1, 2) + 0.5
+
+
 def undistorted_points(photo_px: Float32[np.ndarray, "n 2"], intrinsics: Intrinsics) -> Float32[np.ndarray, "n 2"]:
     """Return where pixels of a photo are in the image that `undistorted` makes of it.
 
@@ -283,8 +298,7 @@ def _undistortion(
 ) -> tuple[Float32[np.ndarray, "h w"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Return the photo's pixel (x, y) for each pixel of the pinhole, and whether it has one. Cached: cameras repeat."""
     pinhole, fisheye = replace(intrinsics, model="PINHOLE", distortion=()), "FISHEYE" in intrinsics.model
-    coefficients = np.zeros(4 if fisheye else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 k4 k5 k6
-    coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
+    coefficients = _coefficients(intrinsics)
     # OpenCV has the centre of the top-left pixel at (0, 0), this project at (0.5, 0.5).
     matrix = np.array([[pinhole.fx, 0, pinhole.cx - 0.5], [0, pinhole.fy, pinhole.cy - 0.5], [0, 0, 1]])
     make_maps = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
@@ -292,6 +306,12 @@ def _undistortion(
     x, y = make_maps(matrix, coefficients, np.eye(3), matrix, size, cv2.CV_32FC1)
     inside = (x > -0.5) & (y > -0.5) & (x < pinhole.width - 0.5) & (y < pinhole.height - 0.5)
     return x, y, inside & ~_folded(pinhole, coefficients, fisheye)
+
+
+def _coefficients(intrinsics: Intrinsics) -> Float64[np.ndarray, "k"]:
+    coefficients = np.zeros(4 if "FISHEYE" in intrinsics.model else 8)  # cv2's order is COLMAP's: k1 k2 p1 p2 k3 ... k6
+    coefficients[: len(intrinsics.distortion)] = intrinsics.distortion
+    return coefficients
 
 
 def _folded(pinhole: Intrinsics, coefficients: Float64[np.ndarray, "k"], fisheye: bool) -> Bool[np.ndarray, "h w"]:

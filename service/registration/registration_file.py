@@ -6,15 +6,14 @@ It is no part of the scene's digest: a registration changes no render, so no ind
 
 from __future__ import annotations
 
-import hashlib
-import os
 import threading
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from service.codec import decode, encode
-from service.errors import CorruptScene, RegistrationNotFound, StorageFailed
+from service.errors import CorruptScene, RegistrationNotFound
 from service.registration.registration import Registration
+from service.scene_formats.side_file import SideFile
 
 FILE = "registration.json"
 KEPT = 20
@@ -40,19 +39,13 @@ class RegistrationFile:
     """Where the file goes if it can't be written beside the scene."""
 
     @property
-    def beside(self) -> Path:
-        return self.scene / FILE if self.scene.is_dir() else self.scene.with_suffix(f".{FILE}")
-
-    @property
-    def elsewhere(self) -> Path | None:
-        place = hashlib.sha256(str(self.scene.resolve()).encode()).hexdigest()[:16]
-        return self.data_folder and self.data_folder / "registrations" / f"{place}.json"
-
-    @property
     def path(self) -> Path:
-        """Where the registrations are: once they were written to the data folder they stay there."""
-        elsewhere = self.elsewhere
-        return elsewhere if elsewhere is not None and elsewhere.is_file() else self.beside
+        """Where the registrations are."""
+        return self._file.path
+
+    @property
+    def _file(self) -> SideFile:
+        return SideFile(self.scene, FILE, self.data_folder)
 
     def current(self) -> Registration | None:
         """Return the registration in force. Raises CorruptScene."""
@@ -85,7 +78,7 @@ class RegistrationFile:
     def undo(self) -> Registration | None:
         """Drop the registration in force; return the one before it, if there is one.
 
-        Raises RegistrationNotFound, StorageFailed, CorruptScene.
+        Raises RegistrationNotFound, CorruptScene.
         """
         with _LOCK:
             before = self.history()
@@ -95,28 +88,4 @@ class RegistrationFile:
         return before.revisions[-2] if len(before.revisions) > 1 else None
 
     def _write(self, history: History) -> None:
-        text = encode(history) + "\n"
-        places = [self.path, *([self.elsewhere] if self.elsewhere else [])]
-        for number, path in enumerate(places, 1):
-            try:
-                _replace(path, text)
-            except OSError as error:
-                if number == len(places):
-                    raise StorageFailed(
-                        f"the registration can't be written to {path.name}: {error.strerror}."
-                    ) from error
-            else:
-                return
-
-
-def _replace(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+        self._file.write(encode(history) + "\n")

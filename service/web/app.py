@@ -33,6 +33,7 @@ from service.matchers import MATCHERS
 from service.operating_system import locked
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
+from service.scene_manager.anchor_store import FileAnchorStore
 from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.status import StoredScene
 from service.web.api_keys import VIEWER_KEY, KeyRing
@@ -144,7 +145,8 @@ async def _start(
     await to_thread.run_sync(jobs.start)
     limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
     _add_gauges(metrics, engine, jobs, settings.workers)
-    state = AppState(settings, engine, scene_store, jobs, lenses, keys, metrics, *limits)
+    anchors = FileAnchorStore(scene_store.find, settings.data_dir)
+    state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
     metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
     return state
 

@@ -71,6 +71,7 @@ _BY_CODE: Mapping[str, str] = {
     "invalid_request": "See the operation in /docs.",
     "job_not_found": "GET /jobs lists the jobs that are kept.",
     "job_not_ready": "Wait for the job: GET /jobs/ID/events, or send Prefer: wait=30.",
+    "anchor_not_found": "GET /scenes/{id}/anchors lists them.",
     "lens_not_found": "GET /lenses lists yours.",
     "method_not_allowed": "The header Allow has the methods of this path.",
     "no_geo_anchor": "Add geo_anchor to the scene's scene.json, and localize again.",

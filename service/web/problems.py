@@ -19,6 +19,7 @@ from starlette.routing import Match
 from starlette.types import Message, Receive, Scope, Send
 
 from service.errors import (
+    AnchorNotFound,
     BackendMissing,
     BadInput,
     DeadlineExceeded,
@@ -73,6 +74,7 @@ _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
     (JobNotFound, 404),
     (RecordNotFound, 404),
     (LensNotFound, 404),
+    (AnchorNotFound, 404),
     (RegistrationNotFound, 404),
     (JobNotReady, 409),
     (NoPose, 409),

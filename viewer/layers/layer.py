@@ -17,7 +17,7 @@ from viewer.frusta import viser_frustum
 
 LayerName = Literal[
     "splats", "training cameras", "trajectory", "candidates", "match vectors", "axes and scale", "measured distance",
-    "poses of all jobs", "coverage", "floor plan",
+    "poses of all jobs", "coverage", "floor plan", "anchors",
 ]  # fmt: skip
 
 _WIDTH_PX = 2.0

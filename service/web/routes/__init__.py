@@ -16,6 +16,7 @@ GET    /scenes/{id}/thumbnail.jpg             small JPEG
 GET    /scenes/{id}/splats?max=N              binary, see `service/scene_manager/splat_sample.py`
 POST   /scenes/{id}/render                    colour or depth from any pose
 GET    /scenes/{id}/coverage                  where a photo would be found; POST measures it
+GET    /scenes/{id}/anchors                   named points; PUT, DELETE .../anchors/{name}
 POST   /scenes/{id}/registration              where the scene is; GET, DELETE (undo)
 WS     /scenes/{id}/live                      a moving camera's frames to poses, see docs/live.md
 GET    /lenses                                DELETE /lenses, /lenses/{id}
@@ -27,8 +28,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.web.routes import coverage, geopose, jobs, lenses, live, localize, registrations, scenes, system
+from service.web.routes import anchors, coverage, geopose, jobs, lenses, live, localize, registrations, scenes, system
 
 router = APIRouter()
-for part in (localize, geopose, jobs, scenes, coverage, registrations, live, lenses, system):
+for part in (localize, geopose, jobs, scenes, anchors, coverage, registrations, live, lenses, system):
     router.include_router(part.router)

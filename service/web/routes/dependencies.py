@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -12,10 +13,12 @@ import anyio
 from anyio import to_thread
 from fastapi import Depends, Path, Request
 
+from service.errors import CorruptScene
 from service.jobs.engine import Engine
 from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
 from service.lenses.lens_store import LensStore
+from service.scene_manager.anchor_store import Anchor, AnchorStore
 from service.scene_manager.scene_store import SceneStore
 from service.web.api_keys import Caller, KeyRing
 from service.web.metrics import Metrics
@@ -23,6 +26,8 @@ from service.web.middleware.limits import client_of
 from service.web.schemas import resources
 from service.web.schemas.jobs import JobOut
 from service.web.settings import Settings
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +37,7 @@ class AppState:
     settings: Settings
     engine: Engine
     scene_store: SceneStore
+    anchors: AnchorStore
     jobs: Jobs
     lenses: LensStore
     keys: KeyRing
@@ -83,7 +89,17 @@ def job_document(app_state: AppState, job_id: str, root: str) -> JobOut:
     """Describe a job in full, as it stands. Not for the event loop: reads the disk. Raises JobNotFound."""
     job = app_state.jobs.get(job_id)
     result = app_state.jobs.result(job) if job.state == "succeeded" else None
-    return resources.job_out(job, result, root)
+    anchors = known_anchors(app_state, job.scene) if result else ()
+    return resources.job_out(job, result, root, anchors)
+
+
+def known_anchors(app_state: AppState, scene_id: str) -> Sequence[Anchor]:
+    """Return a scene's anchors; none where their file is damaged, which is logged: a result is there without."""
+    try:
+        return app_state.anchors.anchors(scene_id)
+    except CorruptScene as error:
+        _log.warning("scene %s: %s", scene_id, error)
+        return ()
 
 
 AppStateOf = Annotated[AppState, Depends(_app_state)]

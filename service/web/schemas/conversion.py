@@ -14,9 +14,11 @@ from service.jobs.model import JobResult, SequenceFrame
 from service.lenses.lens_memory import RecalledLens
 from service.lenses.lens_store import StoredLens
 from service.registration.registration import Registration
-from service.results import HINTS, IterationRecord, StageTiming
+from service.results import HINTS, IterationRecord, StageTiming, Status
 from service.scene_formats.similarity import moved_pose
+from service.scene_manager.anchor_store import Anchor
 from service.types import BoxPrior, Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, PriorRegion, SceneFrame
+from service.web.schemas.anchors import seen_anchors
 from service.web.schemas.job_results import (
     Alternative,
     AskedOut,
@@ -272,10 +274,12 @@ def timing_out(timing: StageTiming) -> Timing:
     return Timing(stage=timing.stage, wall_s=timing.wall_s, cpu_s=timing.cpu_s)
 
 
-def result_out(result: JobResult) -> Result:
-    """Convert a finished estimate. `decode` is the time to read the photo, `anchor` the scene's geo_anchor."""
+def result_out(result: JobResult, anchors: Sequence[Anchor] = ()) -> Result:
+    """Convert a finished estimate; `anchors` are those of the scene that the photo was localized in."""
     estimate, anchor = result.estimate, result.geo_anchor
     verdict, fitting = estimate.verdict, estimate.verdict.fitting_correction
+    # Of a pose that is not to be used there is nothing to see.
+    seen = anchors if verdict.status is not Status.NOT_LOCALIZED else ()
     return Result(
         status=verdict.status,
         reason=verdict.reason,
@@ -289,6 +293,7 @@ def result_out(result: JobResult) -> Result:
         alternatives=[Alternative(probability=p, pose=pose_out(pose)) for pose, p in estimate.alternatives],
         geopose=anchor and geopose_out(anchor, estimate.pose),
         registered=result.registration and registered_out(result.registration, estimate.pose, verdict.covariance),
+        anchors=seen_anchors(seen, estimate.pose, estimate.intrinsics, anchor),
         intrinsics=intrinsics_out(estimate.intrinsics),
         intrinsics_source=estimate.intrinsics_source,
         # Sent back, they are a start of an estimate, not a calibration.

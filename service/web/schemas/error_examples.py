@@ -91,6 +91,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         e.RecordNotFound("the job has 12 records and is succeeded.", where="iterations"),
         f"{_JOB}/iterations/12/render.jpg",
     ),
+    (e.AnchorNotFound("anchor 'door' not found.", where="name"), f"{_SCENE}/anchors/door"),
     (e.LensNotFound("lens '0123456789abcdef' not found.", where="lens"), "/lenses/0123456789abcdef"),
     (
         e.RegistrationFailed(

@@ -7,6 +7,7 @@ from pydantic import Field
 from service.results import Reason, Status
 from service.types import IntrinsicsSource
 from service.web.api_model import Model
+from service.web.schemas.anchors import SeenAnchor
 from service.web.schemas.poses import (
     CameraOut,
     Covariance,
@@ -165,6 +166,8 @@ class Result(Model):
     """The pose on Earth, for scenes that are registered there, or whose manifest has a `geo_anchor`."""
     registered: RegisteredOut | None = None
     """The pose in metres, for scenes that are registered."""
+    anchors: list[SeenAnchor] = Field(default_factory=list)
+    """The scene's anchors as the photo's camera sees them; none if the photo is not localized."""
     intrinsics: IntrinsicsOut
     """Camera model used for the whole upright photo."""
     intrinsics_source: IntrinsicsSource

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 
 from service.errors import JobNotReady, NoPose
@@ -13,6 +14,7 @@ from service.plugins import PluginRegistry
 from service.render import RASTERIZERS
 from service.results import Status
 from service.scene_formats import SCENE_FORMATS
+from service.scene_manager.anchor_store import Anchor
 from service.scene_manager.status import SceneContents, SceneStatus
 from service.web.problems import problem_of_failure
 from service.web.schemas.conversion import (
@@ -37,8 +39,8 @@ def job_summary_out(job: StoredJob, root: str) -> JobSummary:
     return JobSummary(**_summary(job, root))
 
 
-def job_out(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
-    """Convert a job, with its result or its error."""
+def job_out(job: StoredJob, result: JobResult | None, root: str, anchors: Sequence[Anchor] = ()) -> JobOut:
+    """Convert a job, with its result or its error; `anchors` are those of its scene."""
     summary, spec = _summary(job, root), job.spec
     return JobOut(
         **summary,
@@ -52,7 +54,7 @@ def job_out(job: StoredJob, result: JobResult | None, root: str) -> JobOut:
         prior=spec.prior and pose_out(spec.prior),
         prior_region=spec.region and region_out(spec.region),
         truth=spec.truth and pose_out(spec.truth),
-        result=result and result_out(result),
+        result=result and result_out(result, anchors),
         error=job.failure and problem_of_failure(job.failure, summary["links"].self),
     )
 

@@ -7,10 +7,10 @@ import { drawPlan, LEVELS, planAxes } from "./plan.js";
 const POLL_MS = 1000;
 const JOBS = 100;
 
-export function show(main, id) {
+export function show(main, id, query) {
   const plan = h("div", { class: "planbox" });
   const aside = h("div");
-  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], coverage: null, stopped: false, timer: 0 };
+  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], anchors: [], coverage: null, point: pointOf(query), stopped: false, timer: 0 };
   document.title = "scene – splatfix";
   const title = h("h1", {}, state.id);
   main.append(title, h("div", { class: "columns" }, plan, aside));
@@ -32,8 +32,56 @@ async function begin(state, title) {
   state.scene = scene;
   state.axes = planAxes(scene);
   await refresh(state);
-  state.jobs = await jobsOf(state.id);
+  [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), anchorsOf(state)]);
   draw(state);
+}
+
+/** The point of `?point=x,y,z`, as the viewer's link has it; null: none. */
+function pointOf(query) {
+  const point = (new URLSearchParams(query).get("point") ?? "").split(",").map(Number);
+  return point.length === 3 && point.every(Number.isFinite) ? point : null;
+}
+
+const anchorsPath = state => `scenes/${encodeURIComponent(state.id)}/anchors`;
+
+async function anchorsOf(state) {
+  return (await service.ask(anchorsPath(state))).anchors;
+}
+
+/** The anchors with a button to delete each, and a form for the point that was picked in the viewer. */
+function anchorParts(state) {
+  const change = async (name, init, done) => {
+    try {
+      await service.send(`${anchorsPath(state)}/${encodeURIComponent(name)}`, init);
+      state.anchors = await anchorsOf(state);
+      say(`${name}: ${done}`);
+      draw(state);
+    } catch (error) {
+      state.aside.prepend(trouble(error));
+    }
+  };
+  const rows = state.anchors.map(({ name, position }) => {
+    const remove = h("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
+    remove.addEventListener("click", () => change(name, { method: "DELETE" }, "deleted"));
+    return h("li", {}, h("span", {}, h("strong", {}, name), " ", h("span", { class: "quiet" }, position.map(x => Number(x.toPrecision(4))).join(", "))), remove);
+  });
+  const parts = [h("h2", {}, "Anchors"), rows.length
+    ? h("ul", { class: "anchors" }, rows)
+    : h("p", { class: "quiet" }, "Named points of the scene, which each result tells as its photo sees them. Tick “name a point” in the viewer and click one.")];
+  return state.point ? [...parts, namingForm(state, change)] : parts;
+}
+
+function namingForm(state, change) {
+  const name = h("input", { id: "anchorname", required: true, maxLength: 64, pattern: "[^/\\\\]+", autocomplete: "off" });
+  const form = h("form", { class: "joined" }, h("label", { for: "anchorname" }, "Name of the picked point"), name, h("button", { class: "primary" }, "Save"));
+  form.addEventListener("submit", event => {
+    event.preventDefault();
+    const { point } = state;
+    state.point = null;
+    name.blur();
+    change(name.value.trim(), { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ position: point }) }, "saved");
+  });
+  return form;
 }
 
 const path = state => `scenes/${encodeURIComponent(state.id)}/coverage`;
@@ -67,10 +115,12 @@ function draw(state) {
   const map = coverage?.map ?? null;
   const picture = drawPlan({
     axes, map, jobs, cameras: scene.training_cameras.map(camera => camera.world_from_camera),
-    anchors: [], metresPerUnit: scene.metres_per_unit,
+    anchors: state.point ? [...state.anchors, { name: "the picked point", position: state.point }] : state.anchors,
+    metresPerUnit: scene.metres_per_unit,
   });
   state.plan.replaceChildren(picture ?? h("p", { class: "note" }, "No cameras, no jobs and no coverage map yet: there is nothing to draw."));
-  state.aside.replaceChildren(...coverageParts(state, map), legend(map, jobs));
+  if (state.aside.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;  // who types
+  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, jobs, state.anchors));
 }
 
 function coverageParts(state, map) {
@@ -110,12 +160,12 @@ async function measure(state, button) {
   }
 }
 
-function legend(map, jobs) {
+function legend(map, jobs, anchors) {
   const row = (kind, text) => h("li", {}, h("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
   const statuses = ["localized", "uncertain"].filter(status => jobs.some(job => job.status === status));
   return h("ul", { class: "legend", "aria-label": "Legend" },
     map ? [...LEVELS.map(([, kind, text]) => row(kind, text)), row("blind", "nothing of the scene in view")] : [],
-    row("camera", "training camera"), statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
+    row("camera", "training camera"), anchors.length ? row("anchor", "anchor") : [], statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
     h("li", { class: "quiet" }, "Seen from above; each wedge and line points where its camera looks."));
 }
 
