@@ -398,7 +398,7 @@ def plainly(client: httpx.Client, name: str, job: str = "x", **headers: str) -> 
     method, pattern, _ = OPERATIONS[name]
     path = pattern.pattern.replace("[^/]+", "{}")
     fills = ("0",) if path.startswith("/scenes") else (job, "0" if "iterations" in path else "tum")
-    path = path.format(*(("good",) if path.startswith("/scenes") else fills))
+    path = path.format(*(("good", "a") if path.startswith("/scenes") else fills))
     return client.request(method, path, headers=headers)
 
 
