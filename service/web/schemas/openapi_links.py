@@ -10,7 +10,8 @@ from typing import Any
 _JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose")
 _SCENE = (
     *("get_scene", "scene_thumbnail", "scene_splats", "render_scene", "load_scene", "unload_scene", "delete_scene"),
-    *("get_registration", "register_scene", "undo_registration", "get_coverage", "measure_coverage", "list_anchors"),
+    *("get_registration", "register_scene", "undo_registration", "get_coverage", "measure_coverage"),
+    *("list_anchors", "put_anchor", "delete_anchor"),
 )
 
 # (operation, status) -> parameter, where the response has it, the operations that take it.
