@@ -561,6 +561,10 @@ class Client:
         """Cancel a job; without effect if it has ended."""
         return parse_job(_document(self._send("DELETE", f"/jobs/{job_id}")))
 
+    def trace(self, job_id: str) -> Json:
+        """Return a job's steps with everything that is on record of them, as the API has them."""
+        return self._json(f"/jobs/{job_id}/trace")
+
     def photo(self, job_id: str) -> bytes:
         """Return a job's photo as a JPEG: upright, undistorted, reduced if large."""
         return self._send("GET", f"/jobs/{job_id}/photo").content
@@ -736,6 +740,9 @@ class AsyncClient:
 
     async def cancel(self, job_id: str) -> Job:
         return parse_job(_document(await self._send("DELETE", f"/jobs/{job_id}")))
+
+    async def trace(self, job_id: str) -> Json:
+        return await self._json(f"/jobs/{job_id}/trace")
 
     async def photo(self, job_id: str) -> bytes:
         return (await self._send("GET", f"/jobs/{job_id}/photo")).content

@@ -17,6 +17,7 @@ from service.cli.keys import keys_app
 from service.cli.localize import localize
 from service.cli.openapi import openapi
 from service.cli.render import render
+from service.cli.report import report
 from service.cli.scenes import scenes_app
 from service.cli.serve import serve
 from service.cli.terminal import err
@@ -27,7 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize photos in 3D Gaussian scenes.",
 )
-for command in (serve, demo, localize, render, doctor):
+for command in (serve, demo, localize, render, doctor, report):
     app.command()(command)
 app.command(hidden=True)(openapi)
 app.add_typer(bench_app, name="bench")

@@ -45,6 +45,12 @@ class Finding:
     needed: bool = True
     """Whether localizing depends on it: then `doctor` fails without it."""
 
+    @property
+    def line(self) -> str:
+        """As it is printed."""
+        mark = "ok  " if self.ok else "FAIL" if self.needed else "no  "
+        return f"{mark} {self.subject:24} {self.detail}"
+
 
 def findings() -> Iterator[Finding]:
     """Examine the machine, yielding each finding as it is made: some take seconds."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from typing import Annotated
 
 import typer
@@ -15,7 +16,6 @@ def doctor(
 ) -> None:
     """Print what runs on this machine, and why the rest doesn't. Exit code 1 if localizing can't work."""
     from service.cli.diagnostics import compile_kernels, findings
-    from service.web.settings import unknown_variables
 
     if warm:
         with err.status("compiling"):
@@ -23,12 +23,19 @@ def doctor(
     healthy = True
     with err.status("examining"):
         for finding in findings():
-            mark = "ok  " if finding.ok else "FAIL" if finding.needed else "no  "
-            say(f"{mark} {finding.subject:24} {finding.detail}")
+            say(finding.line)
             healthy &= finding.ok or not finding.needed
-    for name, value in settings_of({}).model_dump().items():
-        say(f"     SPLATFIX_{name.upper():22} {value}")
-    for line in unknown_variables(os.environ):
-        say(f"no   {line}")
+    for line in settings_lines():
+        say(line)
     if not healthy:
         raise typer.Exit(1)
+
+
+def settings_lines() -> Iterator[str]:
+    """Yield the settings in force, and the names of unknown ones."""
+    from service.web.settings import unknown_variables
+
+    for name, value in settings_of({}).model_dump().items():
+        yield f"     SPLATFIX_{name.upper():22} {value}"
+    for line in unknown_variables(os.environ):
+        yield f"no   {line}"
