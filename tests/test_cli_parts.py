@@ -233,6 +233,7 @@ def test_tables_have_a_row_for_each_photo_and_time_in_milliseconds(tmp_path: Pat
 
 def facts(**changes: Any) -> dict[str, Any]:
     index = {"placed_by": "the scene itself", "views": 40, "coverage": 0.875}
+    expected = {"title": "upper bound", "found": 0.934, "median_rotation_deg": 0.123, "median_position_units": 0.02}
     searched = {"candidates": 300, "good_candidates": 90, "typical_distance": 2.3456, "interior": True}
     return {
         "name": "Room", "id": "room", "format": "ply", "render_mode": "default", "gaussians": 1234567, "sh_degree": 3,
@@ -242,6 +243,7 @@ def facts(**changes: Any) -> dict[str, Any]:
         "metres_per_unit": 0.5, "on_earth": True, "registration": 3, "training_cameras": 12,
         "training_size": {"px": 800, "source": "manifest"}, "index": index | searched, "sha256": "0" * 64,
         "warnings": ["first", "second"], "background": [0, 0, 0], "frames": [],
+        "expected_accuracy": expected,
     } | changes  # fmt: skip
 
 
@@ -254,6 +256,8 @@ def test_facts_are_told_with_units() -> None:
     assert lines["bounds"] == "(-1, -2, -3) to (1, 2, 3.142)"
     assert lines["middle 98 %"] == "(0, 0, 0) to (3, 4, 0); diagonal 5"
     assert lines["floaters"] == "none"
+    # 0.02 units of half a metre.
+    assert lines["expected accuracy"] == "median 0.12 degrees, 0.01 m; 93% of photos are found (upper bound)"
     assert lines["up"] == "(0, 0, 1)"
     assert lines["metres per unit"] == "0.5"
     assert (lines["geo anchor"], lines["registration"]) == ("yes", "revision 3")
@@ -288,6 +292,7 @@ def test_what_is_unknown_is_told_as_such() -> None:
         "metres_per_unit": None,
         "on_earth": False,
         "registration": None,
+        "expected_accuracy": None,
         "render_mode": "antialiased",
         "warnings": [],
     }
@@ -296,6 +301,7 @@ def test_what_is_unknown_is_told_as_such() -> None:
     assert lines["up"] == lines["metres per unit"] == "unknown"
     assert (lines["geo anchor"], lines["registration"]) == ("no", "none")
     assert lines["format"] == "ply, antialiased"
+    assert lines["expected accuracy"].startswith("not measured")
     assert lines["training size"] == size["source"]
     assert lines["index"] == "12 views, placed by training cameras"
     assert not any(label.startswith("warning") for label in lines)
