@@ -474,7 +474,7 @@ def _cautions(query: Query, verdict: Verdict) -> tuple[str, ...]:
         shear, stretch = verdict.shutter_motion
         cautions.append(
             f"the camera turned while the photo was read row by row (rolling shutter: shear {shear:+.3f}, stretch "
-            f"{stretch:+.3f}), which moves the pose; the covariance allows for it. Hold the camera still."
+            f"{stretch:+.3f}); the pose is that of the middle row. Hold the camera still for a more exact one."
         )
     return tuple(cautions)
 

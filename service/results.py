@@ -198,7 +198,7 @@ class Verdict:
     """Whether exact intrinsics can't be confirmed by the photo: its covariance then allows for some error of them."""
     shutter_motion: tuple[float, float] | None = None
     """Of a photo taken while the camera turned, row by row: shear (sideways) and stretch (up or down), in normalized
-    units per normalized unit down. None: it shows none."""
+    units per normalized unit down; the pose is that of the middle row. None: it shows none."""
     fitting_correction: IntrinsicsCorrection | None = None
     """Of exact intrinsics that the photo contradicts: what would make them fit it."""
     signals: Mapping[str, float] = field(default_factory=dict)

@@ -3,7 +3,8 @@
     photo's features -> retrieval scores of rendered views -> matches with the best of them -> scene points -> PnP
     -> while few agree, or the gate refuses what few led to: render there, match again, solve decoupled
     -> refine photometrically on a small render, then on larger ones
-    -> verification gate -> is the photo mirrored? Do many matches agree on another pose that is as good?
+    -> verification gate -> did another lens take the photo, or a camera that turned? Is it mirrored? Do many matches
+       agree on another pose that is as good?
 
 At first a small copy of the photo is compared, rotated as its corners suggest if no view is much like it. Only if the
 gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; views
@@ -37,6 +38,7 @@ from service.estimators.search_state import (
     check_mirror,
     run_stage,
 )
+from service.estimators.shutter_check import check_shutter
 from service.interfaces import Answer, Tools
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
@@ -85,6 +87,7 @@ def run(
     if query.prior:
         yield from run_stage(state, _refine_from_prior(state))
         if state.finished:
+            state = yield from check_shutter(state)
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
             return state.answer()
@@ -96,6 +99,7 @@ def run(
         if state.finished:
             break
     state = yield from check_lens(state)
+    state = yield from check_shutter(state)
     yield from changed(_doubts(state), state.with_answer)
     return state.answer()
 

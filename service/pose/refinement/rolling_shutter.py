@@ -29,6 +29,8 @@ class ShutterMotion:
     """Normalized units down per normalized unit down."""
     motion: Float64[np.ndarray, "6"]
     """Twist (rad, scene units) by which the pose moves if they are estimated."""
+    covariance: Float64[np.ndarray, "6 6"]
+    """What is added to that of the twist if they are unknown."""
 
 
 def with_shutter_rows(level: PyramidLevel, jacobian: Float32[np.ndarray, "14 n"]) -> Float32[np.ndarray, "16 n"]:
@@ -51,11 +53,12 @@ def shutter_motion(
     """
     known = np.r_[0 : CORRECTION.stop] if estimates_lens else np.r_[0 : CORRECTION.start]
     keep = np.r_[known, SHUTTER]
-    inverse = inverse_spd(information[np.ix_(keep, keep)])
-    if inverse is None:
+    inverse, if_known = (inverse_spd(information[np.ix_(kept, kept)]) for kept in (keep, known))
+    if inverse is None or if_known is None:
         return None
     step, sigma = (inverse @ score[keep])[-2:], np.sqrt(scale * inverse.diagonal()[-2:])
     if not np.any((np.abs(step) > config.min_motion) & (np.abs(step) > config.min_sigmas * sigma)):
         return None
     # The step of refinement moves the render, as everywhere; its size is what matters here.
-    return ShutterMotion(float(step[0]), float(step[1]), (inverse @ score[keep])[TWIST])
+    added = scale * (inverse[TWIST, TWIST] - if_known[TWIST, TWIST])
+    return ShutterMotion(float(step[0]), float(step[1]), (inverse @ score[keep])[TWIST], added)

@@ -113,7 +113,10 @@ def pose_uncertainty(
     # After the lens: where that is estimated it takes up a part of the motion.
     shutter = shutter_motion(information, score, scale, lens_prior is not None, config.shutter)
     found = replace(found, last_step=last_step, shutter=shutter, loss=loss)
-    return found if shutter is None else _with_shutter(found, config.shutter.uncertainty_factor * shutter.motion)
+    if shutter is None:
+        return found
+    motion = config.shutter.uncertainty_factor * shutter.motion
+    return _with_shutter(found, np.outer(motion, motion) + shutter.covariance)
 
 
 def _with_exact_lens(
@@ -192,9 +195,8 @@ def _pose_if_cropped(
     return PoseIfCropped(scale * inverse[TWIST, TWIST], step[TWIST], float(step @ pull) / scale)
 
 
-def _with_shutter(found: PoseUncertainty, motion: Float64[np.ndarray, "6"]) -> PoseUncertainty:
-    """Return the uncertainty with a standard deviation of the pose along this twist added."""
-    added = np.outer(motion, motion)
+def _with_shutter(found: PoseUncertainty, added: Float64[np.ndarray, "6 6"]) -> PoseUncertainty:
+    """Return the uncertainty with this covariance of the twist added."""
     covariance = found.covariance.copy()
     covariance[:6, :6] += added
     known, untested = found.given_lens, found.untested_lens
