@@ -15,6 +15,7 @@ import asyncio
 import io
 import json
 import os
+import ssl
 import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
@@ -383,13 +384,25 @@ def _file(photo: Photo) -> tuple[str, bytes]:
     return ("photo", photo) if isinstance(photo, bytes) else (Path(photo).name, Path(photo).read_bytes())
 
 
-def _settings(key: str | None, timeout_s: float) -> Json:
+def _settings(key: str | None, timeout_s: float, certificate: str | os.PathLike[str] | None) -> Json:
     """Return httpx' arguments. Raises ValueError for a key that no header can carry."""
     key = (key or "").strip()
     if not key.isascii() or any(c.isspace() for c in key):
         raise ValueError("an API key is printable ASCII without spaces, as `splatfix keys add` printed it.")
     # An empty key is none: "Bearer " is no header that HTTP allows.
-    return {"headers": {"Authorization": f"Bearer {key}"} if key else {}, "timeout": timeout_s}
+    found: Json = {"headers": {"Authorization": f"Bearer {key}"} if key else {}, "timeout": timeout_s}
+    return found if certificate is None else {**found, "verify": _trusting(Path(certificate))}
+
+
+def _trusting(certificate: Path) -> ssl.SSLContext:
+    """Return a context that accepts one certificate: the first of a PEM file. Raises OSError, ValueError."""
+    end = "-----END CERTIFICATE-----"
+    first, found, _ = certificate.read_text("utf-8").partition(end)
+    context = ssl.create_default_context(cadata=first + found)
+    # The certificate itself is trusted, not its authority; then its name says nothing more.
+    context.verify_flags |= ssl.VERIFY_X509_PARTIAL_CHAIN
+    context.check_hostname = False
+    return context
 
 
 def _checked(response: httpx.Response) -> httpx.Response:
@@ -469,9 +482,13 @@ class Client:
         timeout_s: float = 60.0,
         transport: httpx.BaseTransport | None = None,
         use_proxy: bool = True,
+        certificate: str | os.PathLike[str] | None = None,
     ) -> None:
-        """`key` is needed where the service has keys; `use_proxy` is whether the environment's proxy is used."""
-        arguments = _settings(key, timeout_s)
+        """`key` is needed where the service has keys; `use_proxy` is whether the environment's proxy is used.
+
+        `certificate` is a PEM file: only the service that has it is spoken with, whatever name it was made for.
+        """
+        arguments = _settings(key, timeout_s, certificate)
         self._http = httpx.Client(base_url=url, transport=transport, trust_env=use_proxy, **arguments)
 
     def __enter__(self) -> Client:
@@ -662,8 +679,9 @@ class AsyncClient:
         timeout_s: float = 60.0,
         transport: httpx.AsyncBaseTransport | None = None,
         use_proxy: bool = True,
+        certificate: str | os.PathLike[str] | None = None,
     ) -> None:
-        arguments = _settings(key, timeout_s)
+        arguments = _settings(key, timeout_s, certificate)
         self._http = httpx.AsyncClient(base_url=url, transport=transport, trust_env=use_proxy, **arguments)
 
     async def __aenter__(self) -> AsyncClient:

@@ -111,6 +111,8 @@ WRAPPED = {
     "websockets": {"service/web/viewer_relay.py", "service/live_client.py"},
     "httpx": {"service/web/viewer_relay.py", "service/client.py"},
     "uvicorn": {"service/cli/server.py"},
+    "cryptography": {"service/cli/local_certificate.py"},
+    "segno": {"service/cli/qr_code.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
     "filelock": {"service/operating_system.py"},
     "typer": {"service/cli"},

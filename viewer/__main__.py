@@ -22,6 +22,7 @@ def main() -> None:
     parser.add_argument("--service", required=True, help="base URL of the splatfix service")
     parser.add_argument("--port", type=int, required=True, help="port to serve browsers on")
     parser.add_argument("--host", default="127.0.0.1", help="address to serve browsers on (default: %(default)s)")
+    parser.add_argument("--certificate", help="PEM file of the service's certificate, if it serves HTTPS")
     parser.add_argument("--end-with-stdin", action="store_true", help="end when standard input does")
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
@@ -33,7 +34,8 @@ def main() -> None:
     # By the environment, since any user of the machine can read the command line.
     key = os.environ.get("SPLATFIX_VIEWER_KEY", "")
     # No proxy from the environment, since the service is on loopback; a render takes seconds on a busy machine.
-    service = Client(arguments.service, key, timeout_s=30.0, use_proxy=False)
+    certificate = arguments.certificate
+    service = Client(arguments.service, key, timeout_s=30.0, use_proxy=False, certificate=certificate)
     with redirect_stdout(io.StringIO()):  # viser prints its address, which only the relay uses
         viewer = Viewer(service, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())

@@ -17,6 +17,7 @@ def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on.")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on; 0: any free one.", min=0, max=65535)] = None,
     viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
+    https: Annotated[bool, typer.Option("--https", help="HTTPS, with a local certificate unless one is set.")] = False,
     open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
     browser: BrowserOption = False,
 ) -> None:
@@ -27,5 +28,6 @@ def serve(
     from service.cli.server import run
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
+    given |= {"https": https or None}
     # None stands for an option that was not given: the environment's or the file's value holds.
     run(settings_of({name: value for name, value in given.items() if value is not None}), out, err, browser)

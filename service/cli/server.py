@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+import ssl
 import threading
 import time
 import webbrowser
@@ -15,11 +16,13 @@ from rich.console import Console
 
 from service import __version__
 from service.cli.example_request import curl_line
+from service.cli.local_certificate import fingerprint, local_addresses, local_certificate
+from service.cli.qr_code import qr_lines
 from service.errors import InvalidRequest
 from service.logs import json_handler
 from service.web.api_keys import KeyRing
 from service.web.app import create_app, data_folder
-from service.web.settings import DATA_HOME, Settings, is_loopback, unknown_variables
+from service.web.settings import CONFIG_HOME, DATA_HOME, Settings, is_loopback, unknown_variables
 
 _CONNECTIONS_S = 3
 """Time for open connections after SIGTERM, before the running jobs get their own."""
@@ -36,6 +39,8 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
         settings = settings.model_copy(update={"data_dir": DATA_HOME / f"port-{settings.port}"})
     for line in unknown_variables(os.environ):
         err.print(f"warning: {line}", style="yellow", markup=False, highlight=False, soft_wrap=True)
+    if settings.https:
+        settings = _with_certificate(settings)
     keys = KeyRing(settings.keys_file)
     # Beyond this machine nobody may come in without a key, so one is made where there is none.
     key = "" if keys or settings.open or is_loopback(settings.host) else keys.make_temporary("start", "admin")
@@ -58,6 +63,8 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
                 ws_max_size=2**26,
                 ws_per_message_deflate=False,  # scenes are sent whole: compressing them costs more than it saves
                 timeout_graceful_shutdown=_CONNECTIONS_S,
+                ssl_certfile=settings.certificate if settings.https else None,
+                ssl_keyfile=settings.certificate_key if settings.https else None,
             )
         )
         logging.getLogger("service").setLevel(logging.INFO)
@@ -68,12 +75,43 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
         server.run(sockets=[listener])
 
 
+def _with_certificate(settings: Settings) -> Settings:
+    """Return the settings with a certificate: their own, else the local one. Raises InvalidRequest, BackendMissing."""
+    given = (settings.certificate, settings.certificate_key)
+    if given == (None, None):
+        found = local_certificate(CONFIG_HOME / "https", local_addresses())
+        given = (found.certificate, found.key)
+    certificate, key = given
+    if certificate is None or key is None:
+        raise InvalidRequest("a certificate needs its key, and a key its certificate.", where="certificate_key")
+    try:
+        ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(certificate, key)
+    except (OSError, ValueError) as error:  # ssl's errors are OSErrors
+        raise InvalidRequest(f"not a PEM certificate with its key: {error}.", where=str(certificate)) from error
+    return settings.model_copy(update={"certificate": certificate, "certificate_key": key})
+
+
 def _listener(host: str, port: int) -> socket.socket:
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
+
+
+def _https_lines(settings: Settings, query: str) -> list[str]:
+    """Return what to open on a phone, as text and QR code, and what its browser will ask."""
+    addresses = [] if is_loopback(settings.host) else local_addresses()
+    lines = [f"  live page   {settings.loopback_url}/live{query}"]
+    for address in addresses:
+        page = f"https://{address}:{settings.port}/live{query}"
+        lines += [f"  on a phone  {page}", *([code] if (code := qr_lines(page)) else [])]
+    if settings.certificate and settings.certificate.parent == CONFIG_HOME / "https":
+        lines += [
+            "The certificate is this machine's own: browsers warn once. Accept it only if they show this fingerprint:",
+            f"  SHA-256 {fingerprint(settings.certificate)}",
+        ]
+    return lines
 
 
 def _announce(
@@ -108,6 +146,8 @@ def _announce(
         *([f"  viewer      {url}/viewer/{query}"] if settings.viewer else []),
         f"  API         {url}/docs",
     ]
+    if settings.https:
+        lines += _https_lines(settings, query)
     scenes = app_state.engine.scenes()
     ready = [scene.id for scene in scenes if scene.state == "ready"]
     if key:

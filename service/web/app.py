@@ -68,7 +68,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     for scene in named:
         engine.add(scene, required=settings.preload is None or scene.id in settings.preload)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
-    viewer = ViewerChild(settings.loopback_url, keys.make_temporary(VIEWER_KEY, "read")) if settings.viewer else None
+    viewer = _viewer(settings, keys) if settings.viewer else None
     relay = Relay(viewer) if viewer else None
 
     @asynccontextmanager
@@ -102,6 +102,11 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     # Last, when all routes are there: one without a policy stops the start.
     require_policies(app.routes)
     return app
+
+
+def _viewer(settings: Settings, keys: KeyRing) -> ViewerChild:
+    certificate = settings.certificate if settings.https else None
+    return ViewerChild(settings.loopback_url, keys.make_temporary(VIEWER_KEY, "read"), certificate)
 
 
 def _check_plugins(settings: Settings) -> None:

@@ -82,6 +82,12 @@ class Settings(BaseSettings):
     """Address to listen on."""
     port: int = Field(default=8000, ge=0, lt=65536)
     """Port to listen on; 0: any free one."""
+    https: bool = False
+    """Serve HTTPS: with `certificate`, else with a local one that is made, which browsers ask about once."""
+    certificate: Path | None = None
+    """PEM file of the certificate, followed by those between it and its authority."""
+    certificate_key: Path | None = None
+    """PEM file of its private key."""
     root_path: str = ""
     """Sub-path under which a proxy serves the service, e.g. /fix; the header `X-Forwarded-Prefix` overrides it."""
     estimator: str = DEFAULT_ESTIMATOR
@@ -200,4 +206,4 @@ class Settings(BaseSettings):
         # Addresses that listen on all interfaces can't be connected to on every system.
         everywhere = self.host in ("0.0.0.0", "::", "")
         host = "127.0.0.1" if everywhere else f"[{self.host}]" if ":" in self.host else self.host
-        return f"http://{host}:{self.port}"
+        return f"{'https' if self.https else 'http'}://{host}:{self.port}"

@@ -14,6 +14,7 @@ import secrets
 import socket
 import sys
 import time
+from pathlib import Path
 
 _log = logging.getLogger(__name__)
 
@@ -25,8 +26,11 @@ _GRACE_S = 3.0
 class ViewerChild:
     """Supervises one viewer process."""
 
-    def __init__(self, service_url: str, key: str) -> None:
-        """`key` is the viewer's API key. It is passed in the environment: other users can see a process's arguments."""
+    def __init__(self, service_url: str, key: str, certificate: Path | None = None) -> None:
+        """`key` is the viewer's API key. It is passed in the environment: other users can see a process's arguments.
+
+        `certificate` is the service's, if it serves HTTPS.
+        """
         # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
         # It finds modules where this process does, and not (-P) in a working directory that has a `viewer` of its own.
         self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ
@@ -35,6 +39,7 @@ class ViewerChild:
         self.run = ""
         self.command = [sys.executable, "-P", "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--end-with-stdin"]
+        self.command += ["--certificate", str(certificate)] if certificate else []
 
     async def supervise(self) -> None:
         """Start the viewer, and start it again whenever it ends, until this is cancelled."""
