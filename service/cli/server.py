@@ -9,6 +9,7 @@ import ssl
 import threading
 import time
 import webbrowser
+from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI
@@ -99,6 +100,12 @@ def _listener(host: str, port: int) -> socket.socket:
         raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
 
 
+def _local_certificate(settings: Settings) -> Path | None:
+    """Return the certificate if it is this machine's own, which no client knows."""
+    certificate = settings.certificate if settings.https else None
+    return certificate if certificate and certificate.parent == CONFIG_HOME / "https" else None
+
+
 def _https_lines(settings: Settings, query: str) -> list[str]:
     """Return what to open on a phone, as text and QR code, and what its browser will ask."""
     addresses = [] if is_loopback(settings.host) else local_addresses()
@@ -106,10 +113,10 @@ def _https_lines(settings: Settings, query: str) -> list[str]:
     for address in addresses:
         page = f"https://{address}:{settings.port}/live{query}"
         lines += [f"  on a phone  {page}", *([code] if (code := qr_lines(page)) else [])]
-    if settings.certificate and settings.certificate.parent == CONFIG_HOME / "https":
+    if certificate := _local_certificate(settings):
         lines += [
             "The certificate is this machine's own: browsers warn once. Accept it only if they show this fingerprint:",
-            f"  SHA-256 {fingerprint(settings.certificate)}",
+            f"  SHA-256 {fingerprint(certificate)}",
         ]
     return lines
 
@@ -158,6 +165,8 @@ def _announce(
         # With one scene a request need not name it: a shorter example.
         named = ready[0] if len(scenes) > 1 else ""
         example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=shell_key)
+        if certificate := _local_certificate(settings):
+            example = example.replace("curl ", f"curl --cacert {certificate} ", 1)
         hint = " (SPLATFIX_KEY: a key from `splatfix keys add NAME`)" if shell_key and not key else ""
         lines += [f"Try it{hint}:", f"  {example}"]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
