@@ -314,6 +314,11 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("export_pose", "job_not_ready"): lambda s: s.client.get(f"/jobs/{s.running}/export/tum"),
     ("export_pose", "no_pose"): lambda s: s.client.get(f"/jobs/{s.done}/export/tum"),
     ("export_pose", "no_geo_anchor"): lambda s: s.client.get(f"/jobs/{localized(s)}/export/geopose"),
+    ("share_job", "invalid_request"): lambda s: s.client.post(f"/jobs/{s.done}/share", json={"expires_in_s": 0}),
+    ("share_job", "bad_request"): lambda s: s.client.post(
+        f"/jobs/{s.done}/share", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("share_job", "job_not_found"): lambda s: s.client.post("/jobs/none/share", json={}),
     ("get_scene", "scene_not_found"): lambda s: s.client.get("/scenes/none"),
     ("load_scene", "scene_not_found"): lambda s: s.client.post("/scenes/none/load"),
     ("unload_scene", "scene_not_found"): lambda s: s.client.post("/scenes/none/unload"),

@@ -674,3 +674,28 @@ def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -
     expect(page.locator(".anchors li")).to_have_count(0)
     assert httpx.get(f"{url}/scenes/room/anchors", trust_env=False).json() == {"anchors": []}
     page.close()
+
+
+def test_a_job_is_shared_by_a_link(browser: Browser, page: Page, url: str) -> None:
+    page.set_input_files("#photo", PHOTO)
+    page.locator(".verdict .badge").wait_for()
+    page.get_by_role("button", name="Share link").click()
+    link = page.locator(".curl a")
+    expect(link).to_contain_text(f"{url}/shared/")
+    _audit(page)
+    address = link.inner_text()
+    for scheme in ("light", "dark"):
+        stranger = browser.new_context(viewport={"width": 390, "height": 844}, color_scheme=scheme)  # type: ignore[arg-type]
+        shared = stranger.new_page()
+        shared.set_default_timeout(PATIENCE_MS)
+        shared.goto(address)
+        expect(shared.locator(".badge.localized")).to_be_visible()
+        expect(shared.locator(".stack img")).to_have_count(2)
+        expect(shared.get_by_label("Step", exact=True)).to_be_visible()
+        loaded = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
+        shared.wait_for_function(loaded)
+        assert _overflow(shared) <= 0
+        _audit(shared)
+        stranger.close()
+    page.goto(f"{url}/shared/nothing")
+    expect(page.get_by_role("alert")).to_contain_text("the link is not valid")

@@ -27,6 +27,8 @@ VIEWER_KEY = "viewer"
 _PREFIX = "sfx_"
 """Marks a key for people and for secret scanners."""
 _SECRET_BYTES = 32
+_SHARED = "share:"
+"""Before what is signed of a share token: no session's token passes for one, nor the other way round."""
 _RECHECK_S = 1.0
 """Time between two checks of the file."""
 
@@ -127,6 +129,27 @@ class KeyRing:
         living = {(key.name, key.role, _key_id(key)) for key in (*self._stored, *self._temporary)}
         named = caller.name, caller.role, claim["key"]
         return caller if claim["until"] > time.time() and named in living else None
+
+    def share_token(self, job_id: str, seconds: float, caller: Caller | None) -> str:
+        """Return a signed token that shows a job to whoever has it, for that time, but no longer than the caller's key.
+
+        `caller` is None where the service has no keys.
+        """
+        key = [caller.name, caller.role, self.key_id(caller)] if caller else None
+        claim = json.dumps({"job": job_id, "key": key, "until": time.time() + seconds})
+        text = base64.urlsafe_b64encode(claim.encode()).decode().rstrip("=")
+        return f"{text}.{self._signature(_SHARED + text)}"
+
+    def shared_job(self, token: str) -> str | None:
+        """Return the id of the job that a share token shows; None if it is forged, expired, or its key was removed."""
+        text, _, signature = token.partition(".")
+        if not hmac.compare_digest(self._signature(_SHARED + text).encode(), signature.encode()):
+            return None
+        claim = json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
+        self._refresh()
+        living = [[key.name, key.role, _key_id(key)] for key in (*self._stored, *self._temporary)]
+        key_lives = claim["key"] is None or claim["key"] in living
+        return claim["job"] if claim["until"] > time.time() and key_lives else None
 
     def _signature(self, text: str) -> str:
         return hmac.new(self._secret, text.encode(), "sha256").hexdigest()

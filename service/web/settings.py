@@ -158,6 +158,8 @@ class Settings(BaseSettings):
     """Accepted host names, e.g. a proxy's; empty: any with API keys, only this machine's without."""
     cors_origins: list[str] = []
     """Origins of other sites whose pages may use the service (CORS), e.g. https://example.org."""
+    embed_origins: list[str] = []
+    """Origins of sites that may show the pages of share links in a frame, e.g. https://example.org; empty: none."""
     log_json: bool | None = None
     """Log in JSON; None: unless the log goes to a terminal."""
     viewer: bool = True

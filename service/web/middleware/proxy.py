@@ -114,7 +114,9 @@ class _Response:
             headers = MutableHeaders(scope=message)
             headers[REQUEST_ID] = self.request_id
             for name, value in _HEADERS.items():
-                headers.setdefault(name, value)
+                # A policy of its own says by whom the page may be framed.
+                if name != "X-Frame-Options" or "content-security-policy" not in headers:
+                    headers.setdefault(name, value)
             headers.setdefault("Cache-Control", "private, no-cache")
             if self._own_page:
                 headers["Content-Security-Policy"] = _PAGES_POLICY

@@ -10,6 +10,7 @@ GET    /jobs/{id}/photo                       JPEG, upright
 GET    /jobs/{id}/trace                       all records
 GET    /jobs/{id}/iterations/{k}/render.jpg   record k's pose (or `last`), photo's size
 GET    /jobs/{id}/export/{format}             the pose for COLMAP, nerfstudio, TUM tools or GeoPose
+POST   /jobs/{id}/share                       a link for who has no key; GET /shared/{token}...
 GET    /scenes                                GET /scenes/{id}
 PUT    /scenes/{id}                           upload; POST .../load, .../unload; DELETE
 GET    /scenes/{id}/thumbnail.jpg             small JPEG
@@ -28,8 +29,20 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from service.web.routes import anchors, coverage, geopose, jobs, lenses, live, localize, registrations, scenes, system
+from service.web.routes import (
+    anchors,
+    coverage,
+    geopose,
+    jobs,
+    lenses,
+    live,
+    localize,
+    registrations,
+    scenes,
+    shared,
+    system,
+)
 
 router = APIRouter()
-for part in (localize, geopose, jobs, scenes, anchors, coverage, registrations, live, lenses, system):
+for part in (localize, geopose, jobs, shared, scenes, anchors, coverage, registrations, live, lenses, system):
     router.include_router(part.router)

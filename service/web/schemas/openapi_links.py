@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-_JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose")
+_JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_render", "export_pose", "share_job")
 _SCENE = (
     *("get_scene", "scene_thumbnail", "scene_splats", "render_scene", "load_scene", "unload_scene", "delete_scene"),
     *("get_registration", "register_scene", "undo_registration", "get_coverage", "measure_coverage"),

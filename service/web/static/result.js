@@ -117,8 +117,28 @@ function taking(job) {
   return h("section", {}, h("h2", {}, "Export"),
     h("p", { class: "buttons" }, file("JSON", job.links.self), file("Trace", job.links.trace),
       ...exports(job).map(([name, format]) => file(name, `${job.links.export}/${format}`))),
-    h("h3", {}, "Repeat with curl"),
+    sharing(job), h("h3", {}, "Repeat with curl"),
     h("div", { class: "poserow" }, curl, copyButton(() => curl.textContent, "the curl line")));
+}
+
+/** A link that shows this job to who has no key. */
+function sharing(job) {
+  const place = h("div");
+  const button = h("button", { type: "button" }, "Share link");
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    try {
+      const init = { method: "POST", headers: { "Content-Type": "application/json" }, body: "{}" };
+      const { link, expires_in_s: valid } = await service.ask(`jobs/${job.id}/share`, init);
+      const address = new URL(link, location.href).href;
+      place.replaceChildren(h("p", { class: "quiet" }, `Shows photo and result to whoever has it, for ${Math.round(valid / 86400)} days.`),
+        h("div", { class: "poserow" }, h("pre", { class: "curl", tabIndex: 0 }, h("a", { href: address }, address)), copyButton(() => address, "the share link")));
+    } catch (error) {
+      button.disabled = false;
+      place.replaceChildren(h("p", { class: "trouble", role: "alert" }, error.message));
+    }
+  });
+  return h("div", {}, h("p", { class: "buttons" }, button), place);
 }
 
 function exports({ result }) {
