@@ -693,7 +693,7 @@ def test_a_job_is_shared_by_a_link(browser: Browser, page: Page, url: str) -> No
         expect(shared.locator(".stack img")).to_have_count(2)
         expect(shared.get_by_label("Step", exact=True)).to_be_visible()
         loaded = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
-        shared.wait_for_function(loaded)
+        until(lambda shared=shared: shared.evaluate(loaded))
         assert _overflow(shared) <= 0
         _audit(shared)
         stranger.close()
