@@ -676,6 +676,9 @@ def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -
     page.close()
 
 
+LOADED = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
+
+
 def test_a_job_is_shared_by_a_link(browser: Browser, page: Page, url: str) -> None:
     page.set_input_files("#photo", PHOTO)
     page.locator(".verdict .badge").wait_for()
@@ -692,8 +695,7 @@ def test_a_job_is_shared_by_a_link(browser: Browser, page: Page, url: str) -> No
         expect(shared.locator(".badge.localized")).to_be_visible()
         expect(shared.locator(".stack img")).to_have_count(2)
         expect(shared.get_by_label("Step", exact=True)).to_be_visible()
-        loaded = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
-        until(lambda shared=shared: shared.evaluate(loaded))
+        until(lambda shared=shared: shared.evaluate(LOADED))
         assert _overflow(shared) <= 0
         _audit(shared)
         stranger.close()

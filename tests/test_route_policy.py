@@ -24,8 +24,7 @@ from service.web.viewer_relay import Relay
 # What anybody may do without a key. Whatever is missing here must be refused.
 PUBLIC = {
     ("GET", "/"), ("GET", "/livez"), ("GET", "/readyz"), ("GET", "/docs"), ("GET", "/openapi.json"), ("GET", "/ui/x"),
-    ("GET", "/shared/x"), ("GET", "/shared/x/job"), ("GET", "/shared/x/photo"), ("GET", "/shared/x/trace"),
-    ("GET", "/shared/x/iterations/x/render.jpg"),
+    *(("GET", f"/shared/token{rest}") for rest in ("", "/job", "/photo", "/trace", "/iterations/index/render.jpg")),
     ("GET", "/client.js"), ("GET", "/docs/swagger-ui-bundle.js"), ("GET", "/docs/swagger-ui.css"),
 }  # fmt: skip
 UNKNOWN = [

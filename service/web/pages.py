@@ -1,10 +1,10 @@
-"""The start page at `/`, the live page at `/live`, their files under `/ui`, the JavaScript client at `/client.js`."""
+"""The start page at `/`, the live page, the page of a share link, their files under `/ui`, and `/client.js`."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
@@ -12,6 +12,10 @@ from starlette.responses import Response
 from service.web.route_policy import RoutePolicy, declare, route_policy
 
 PAGES = Path(__file__).parent / "static"
+_SHARED_POLICY = (
+    "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors {}"
+)
 _REVALIDATE = {"Cache-Control": "no-cache"}
 """Browsers may cache the file, but must ask each time whether it changed: after an upgrade it has."""
 
@@ -20,6 +24,7 @@ def add_pages(app: FastAPI) -> None:
     """Add the routes of the pages."""
     app.add_api_route("/", _start_page, include_in_schema=False)
     app.add_api_route("/live", _live_page, include_in_schema=False)
+    app.add_api_route("/shared/{token}", _shared_page, include_in_schema=False)
     app.add_api_route("/client.js", _client, include_in_schema=False)
     # Public: without a key, too, the start page must be able to ask for one.
     app.mount("/ui", declare(_Files(directory=PAGES), RoutePolicy(role=None)), "ui")
@@ -33,6 +38,14 @@ async def _start_page() -> FileResponse:
 @route_policy(role="localize", key_in_address=True)
 async def _live_page() -> FileResponse:
     return FileResponse(PAGES / "live.html", media_type="text/html", headers=_REVALIDATE)
+
+
+@route_policy(role=None)
+async def _shared_page(token: str, request: Request) -> FileResponse:
+    """Return the page of a share link, which says so itself if the link isn't valid; framed by who may do so only."""
+    framing = " ".join(request.app.state.app_state.settings.embed_origins) or "'none'"
+    headers = _REVALIDATE | {"Content-Security-Policy": _SHARED_POLICY.format(framing)}
+    return FileResponse(PAGES / "shared.html", media_type="text/html", headers=headers)
 
 
 @route_policy(role=None)

@@ -1,7 +1,7 @@
 """`POST /jobs/{id}/share`, and what a share link shows: one job, read-only, to whoever has the link, until it expires.
 
 The token in the link is signed with the secret of the sessions, so it outlives a restart; it ends with the key that
-made it, and with its job. The page may be framed by the sites of the setting `embed_origins`, by default by none.
+made it, and with its job. `service/web/pages.py` has the page.
 """
 
 from __future__ import annotations
@@ -9,12 +9,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from fastapi import APIRouter, Depends, Path, Query, Response
-from fastapi.responses import FileResponse
 from pydantic import Field
 
 from service.errors import JobNotFound
 from service.jobs.model import StoredJob
-from service.web.pages import PAGES
 from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import AppState, AppStateOf, CallerOf, JobOf, RootOf, job_document
 from service.web.routes.jobs import job_photo, job_render
@@ -24,10 +22,6 @@ from service.web.schemas.jobs import JobLinks, JobOut, Trace
 from service.web.schemas.shared import SharedJob, ShareIn, ShareLink
 
 router = APIRouter()
-_PAGE_POLICY = (
-    "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors {}"
-)
 
 
 @router.post(
@@ -51,15 +45,6 @@ def _shared(app_state: AppStateOf, token: Annotated[str, Path(max_length=1000)])
 
 
 SharedOf = Annotated[StoredJob, Depends(_shared)]
-
-
-@router.get("/shared/{token}", include_in_schema=False)
-@route_policy(role=None)
-async def shared_page(token: str, app_state: AppStateOf) -> FileResponse:
-    """Return the page that shows a shared job; it says so itself if the link is not valid."""
-    framing = " ".join(app_state.settings.embed_origins) or "'none'"
-    headers = {"Content-Security-Policy": _PAGE_POLICY.format(framing), "Cache-Control": "no-cache"}
-    return FileResponse(PAGES / "shared.html", media_type="text/html", headers=headers)
 
 
 @router.get("/shared/{token}/job", include_in_schema=False)
