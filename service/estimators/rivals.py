@@ -24,24 +24,26 @@ from service.estimators.search_state import (
     mirror_image_of,
     only_colours_doubt,
     refine_ambiguous,
+    refined_in_other_light,
     seen_from,
 )
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.mirrored_query import mirrored_intrinsics
+from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.refinement.refine_stage import RefinedPose, rematch_and_refine
-from service.pose.retrieval.ambiguous_hypotheses import PoseAtDistance, ambiguous_hypotheses
+from service.pose.retrieval.ambiguous_hypotheses import PoseAtDistance, ambiguous_hypotheses, shifted_hypotheses
 from service.pose.retrieval.scores import retrieval_scores, top_indices
 from service.pose.verification.mirror_images import dissimilarity
-from service.results import IterationRecord
+from service.results import IterationRecord, Reason
 
 
 def check_rivals(state: SearchState) -> Generator[IterationRecord, None, bool]:
     """Accept an answer that only colours speak against if they speak more against each rival; return whether it was."""
     answer, config = state.best, state.config
-    if answer is None or not only_colours_doubt(answer.verdict, config.verification):
+    if answer is None or not only_colours_doubt(state, answer.refined, answer.verdict):
         return False
     limit = dissimilarity(answer.verdict.signals) / config.max_rival_ratio
     if state.tools.prepared.like_its_mirror_image:
@@ -56,9 +58,21 @@ def check_rivals(state: SearchState) -> Generator[IterationRecord, None, bool]:
             continue
         if _fits_as_well(state, found, limit):
             return False
-    state.best = replace(answer, verdict=state.verify(answer.refined, is_unique=True))
-    yield state.best.record("check_rivals")
+    yield from _accept(state, answer)
     return True
+
+
+def _accept(state: SearchState, answer: VerifiedPose) -> Generator[IterationRecord, None, None]:
+    """Verify the answer whatever its colours; refine it in other light where that leaves its position uncertain.
+
+    Colours that are not the scene's are residuals of refinement, and make the covariance greater.
+    """
+    state.best = replace(answer, verdict=state.verify(answer.refined, is_unique=True))
+    if state.best.verdict.reason is Reason.POSITION_UNCERTAIN:
+        again = yield from refined_in_other_light(state, answer.refined, is_unique=True)
+        if again is not None and again[1].rank > state.best.verdict.rank:
+            state.best = replace(answer, refined=again[0], verdict=again[1])
+    yield state.best.record("check_rivals")
 
 
 def _fits_as_well(state: SearchState, rival: RefinedPose, limit: float) -> bool:
@@ -111,4 +125,15 @@ def _rivals(state: SearchState, answer: VerifiedPose, seen: PoseAtDistance) -> I
     alike = ambiguous_hypotheses(
         view.features, camera, seen, views, scores, images.matcher, error_px, config.min_inliers, config
     )
-    return chain(alike, hypotheses_of_photo(state, images, seen, whole=False))
+    return chain(alike, hypotheses_of_photo(state, images, seen, whole=False), _shifted(state, images, seen))
+
+
+def _shifted(state: SearchState, images: QueryImages, seen: PoseAtDistance) -> Iterator[AbsolutePose]:
+    """Yield poses near the answer that show other things in the places of those that it shows."""
+    assert state.best is not None
+    retrieval, variant, camera = state.retrieval, state.best.variant, images.query.intrinsics
+    error_px = variant.max_error_px * camera.long_side / PHOTO_PX
+    features, scores = retrieval.features(variant), retrieval.scores(variant)
+    return shifted_hypotheses(
+        features, camera, seen, retrieval.index.views, scores, images.matcher, error_px, state.config.ambiguity
+    )

@@ -74,6 +74,10 @@ class SearchConfig:
     """Doubts that don't speak against a fisheye's answer."""
     ambiguity_photo_px: int = 256
     """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
+    min_colour_edges: float = 0.72
+    """Correlation of the edges in colour without which a pose that only colours speak against is neither compared with
+    its rivals nor taken for the end of the search: right poses have 0.78 and more in a scene by another trainer, poses
+    that are off by one thing of a row 0.66 and less, whose local colours correlate as well."""
     max_rival_ratio: float = 0.9
     """Dissimilarity of photo and render at a pose that only colours speak against, relative to that at its mirror image
     and at places that look like it: with less it is accepted. Of photos of a scene by another trainer right poses have

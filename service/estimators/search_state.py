@@ -34,8 +34,8 @@ from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
 from service.pose.verification.ambiguity import explains_whole_photo, rank_answers
-from service.pose.verification.appearance import appearance
-from service.pose.verification.gate import VerificationConfig, downgraded, verify
+from service.pose.verification.appearance import appearance, colour_edge_correlation
+from service.pose.verification.gate import downgraded, verify
 from service.pose.verification.mirror_images import dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import IntrinsicsCorrection, Query
@@ -150,6 +150,13 @@ class SearchState:
         size = rendered.camera.intrinsics
         return appearance(images.resized(size), rendered.frame, images.valid_mask(size))
 
+    def colour_edges_at(self, found: RefinedPose) -> float:
+        """Return the correlation of the edges in colour of photo and render at a pose."""
+        images = self.images.corrected(found.correction)
+        rendered, _ = found.view_at_pose(images, self.renderer)
+        size = rendered.camera.intrinsics
+        return colour_edge_correlation(images.resized(size), rendered.frame, images.valid_mask(size))
+
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""
         if self.best is None:
@@ -188,30 +195,32 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
     pixels_may_decide = stage.expected or (found.num_inliers or 0) >= least
     verdict = state.verify(found, pixels_may_decide)
     if _may_be_in_other_light(state, verdict):
-        again = yield from _refined_in_other_light(state, found)
+        again = yield from refined_in_other_light(state, found)
         if again is not None and again[1].rank > verdict.rank:
             found, verdict = again
     # A later, costlier stage doesn't always lead to a better pose.
     if state.best is None or verdict.rank > state.best.verdict.rank:
         state.best = VerifiedPose(found, verdict, stage.variant)
     # Poses are verified in one size, whatever led to them; refinement from few matches may not have arrived.
-    conclusive = verdict.reason in CONCLUSIVE_DOUBTS or only_colours_doubt(verdict, state.config.verification)
+    conclusive = verdict.reason in CONCLUSIVE_DOUBTS or only_colours_doubt(state, found, verdict)
     state.finished = verdict.status is Status.LOCALIZED or (conclusive and outcome.unmatched is None)
     loss = 1.0 - state.best.verdict.score
     yield state.with_answer(IterationRecord("verify", found.pose, loss=loss, num_inliers=verdict.inliers))
 
 
-def only_colours_doubt(verdict: Verdict, config: VerificationConfig) -> bool:
-    """Return whether matches and gradients support a refused pose, so that another search would find the same.
+def only_colours_doubt(state: SearchState, found: RefinedPose, verdict: Verdict) -> bool:
+    """Return whether matches, gradients and edges in colour support a refused pose: another search finds the same.
 
     That is a pose which is accepted where the light may be another; in a scene that repeats itself colours are needed.
     """
-    signals, model = verdict.signals, config.model
+    signals, config = verdict.signals, state.config.verification
     if verdict.status is Status.LOCALIZED or verdict.reason is not Reason.RENDER_MISMATCH:
         return False
-    if signals["local_colour_correlation"] < config.min_repeated_colour:
+    if config.model.probability(signals) < config.min_localized:
         return False
-    return model.probability(signals) >= config.min_localized and not model.below_floor(signals, light_may_differ=True)
+    if config.model.below_floor(signals, light_may_differ=True):
+        return False
+    return state.colour_edges_at(found) >= state.config.min_colour_edges
 
 
 def _may_be_in_other_light(state: SearchState, verdict: Verdict) -> bool:
@@ -226,10 +235,13 @@ def _may_be_in_other_light(state: SearchState, verdict: Verdict) -> bool:
     return verdict.signals["gradients_half"] >= state.config.min_gradients_other_light
 
 
-def _refined_in_other_light(
-    state: SearchState, found: RefinedPose
+def refined_in_other_light(
+    state: SearchState, found: RefinedPose, is_unique: bool = False
 ) -> Generator[IterationRecord, None, tuple[RefinedPose, Verdict] | None]:
-    """Refine a pose with local light taken out of photo and renders, and verify the result; None: it diverged."""
+    """Refine a pose with local light taken out of photo and renders, and verify the result; None: it diverged.
+
+    `is_unique`: as in `SearchState.verify`.
+    """
     config = state.config
     start = AbsolutePose(found.pose, np.ones(found.num_inliers or 0, bool), found.correction)
     stage = refine_stage(
@@ -238,7 +250,7 @@ def _refined_in_other_light(
     again = (yield from changed(stage, state.with_answer)).refined
     if again is None:
         return None
-    verdict = state.verify(again, refinement_config=config.other_light)
+    verdict = state.verify(again, refinement_config=config.other_light, is_unique=is_unique)
     # Residuals of evened images don't compare with those of other answers.
     return replace(again, loss=found.loss), verdict
 

@@ -42,6 +42,9 @@ class AmbiguityConfig:
     """Matches that agree on a hypothesis; by chance up to 9 do."""
     min_inliers_if_explained: int = 40
     """The same where the answer explains the whole photo."""
+    parts: int = 4
+    """Along each side of the photo, of which each is matched with what the answer puts elsewhere: things of a row in
+    half a photo lie a third of its width apart."""
     trials: int = 200
     """Of RANSAC, for each hypothesis."""
     distinct_deg: float = 5.0
@@ -88,6 +91,49 @@ def ambiguous_hypotheses(
         return
     strong = _strongest(image, config.features)
     found = [correspondences(strong, _strongest_of(views[i], config.features), matcher) for i in chosen]
+    yield from _hypotheses(found, intrinsics, answer, max_error_px, min_inliers, config)
+
+
+def shifted_hypotheses(
+    image: Features,
+    intrinsics: Intrinsics,
+    answer: PoseAtDistance,
+    views: Sequence[View],
+    scores: np.ndarray,
+    matcher: Matcher,
+    max_error_px: float,
+    config: AmbiguityConfig = AMBIGUITY,
+) -> Iterator[AbsolutePose]:
+    """Yield poses that show other things in the places of those that the answer shows, most matches first.
+
+    One thing further along a row the camera is near the answer, and the views that show the place show the answer's,
+    too: features match there. So each part of the image is matched only with what the answer puts elsewhere.
+    """
+    strong = _strongest(image, config.features)
+    size = np.array([intrinsics.width, intrinsics.height]) / config.parts
+    place = np.clip(strong.points_px // size, 0, config.parts - 1)
+    parts = [(size * (corner + 0.5), (place == corner).all(1)) for corner in np.unique(place, axis=0)]
+    found = []
+    for i in top_indices(scores, config.views):
+        view = _strongest_of(views[i], config.features)
+        for centre, within in parts:
+            distance = reprojection_error_px(centre, view.points_in_world, intrinsics, answer.pose)
+            elsewhere = distance > 0.5 * np.linalg.norm(size)
+            other = View(view.camera, _selected(view.features, elsewhere), view.points_in_world[elsewhere])
+            found.append(correspondences(_selected(strong, within), other, matcher))
+    if found:
+        yield from _hypotheses(found, intrinsics, answer, max_error_px, config.min_inliers, config)
+
+
+def _hypotheses(
+    found: Sequence[Correspondences],
+    intrinsics: Intrinsics,
+    answer: PoseAtDistance,
+    max_error_px: float,
+    min_inliers: int,
+    config: AmbiguityConfig,
+) -> Iterator[AbsolutePose]:
+    """Yield poses that many of the matches agree on which the answer doesn't explain."""
     # Wider than an inlier's error: what the answer nearly explains is no evidence for another pose.
     explained_px = config.explained_factor * max_error_px
     left = _unexplained(Correspondences.pooled(found), intrinsics, answer.pose, explained_px)
@@ -111,7 +157,10 @@ def _shows_the_same(view: View, answer: Pose, config: AmbiguityConfig) -> bool:
 
 
 def _strongest(features: Features, count: int) -> Features:
-    keep = np.argsort(-features.scores, kind="stable")[:count]
+    return _selected(features, np.argsort(-features.scores, kind="stable")[:count])
+
+
+def _selected(features: Features, keep: np.ndarray) -> Features:
     return Features(features.points_px[keep], features.scores[keep], features.descriptors[keep])
 
 

@@ -58,6 +58,10 @@ class AppearanceConfig:
     """Blocks or pixels; fewer are no evidence."""
     fits: int = 3
     """Alternations of fitting gains and leaving out the pixels that fit worst."""
+    edge_sigma_px: float = 1.5
+    """Gaussian blur before colours' edges are compared: JPEG files have less detail in colours."""
+    dark: float = 12.0
+    """Added to a channel (0..255) before its logarithm: in the dark colours are noise."""
 
     @property
     def min_energy(self) -> float:
@@ -140,6 +144,24 @@ def appearance(
     blocks = BlockStatistics.of(pair)
     agreements = gradient_correlation(blocks) + colour_correlation(pair)
     return dict(zip(GLOBAL_SIGNALS, agreements, strict=True)) | {LOCAL_COLOUR: local_colour_correlation(blocks)}
+
+
+def colour_edge_correlation(
+    photo: UInt8[np.ndarray, "h w 3"], frame: Frame, valid: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Return the correlation of the edges of photo and frame in colour, -1..1; `valid` are the photo's valid pixels.
+
+    Compared are the gradients of the logarithms of red to green and of yellow to blue: ratios of neighbouring pixels,
+    which depend neither on the light's colour nor on its brightness, also where these differ within the photo (Funt and
+    Finlayson, "Color constant color indexing", IEEE PAMI 17, 1995). Where the scene has no colours, the value is low.
+    """
+    pair = ImagePair.of(photo, frame, valid)
+    pixels = (pair.photo, pair.render)
+    images = [cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), APPEARANCE.edge_sigma_px) for rgb in pixels]
+    # Square roots: each pair of gradients then weighs by the brightness of its pixel in the darker image.
+    weight = np.sqrt(np.minimum(*(image.mean(2) for image in images)))
+    weight *= cv2.erode(pair.opaque, np.ones((3, 3), np.uint8)) > APPEARANCE.min_alpha
+    return _cosine(*(_colour_gradients(image) * weight[..., None] for image in images))
 
 
 def gradient_correlation(blocks: BlockStatistics) -> tuple[float, float]:
@@ -253,6 +275,12 @@ def _blocks(image: np.ndarray) -> Float32[np.ndarray, "rows columns channels"]:
 
 def _correlations(ab: np.ndarray, aa: np.ndarray, bb: np.ndarray) -> Float64[np.ndarray, "n"]:
     return (ab / np.sqrt(np.maximum(aa * bb, 0.0) + APPEARANCE.min_energy)).ravel()
+
+
+def _colour_gradients(rgb: Float32[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 4"]:
+    red, green, blue = cv2.split(np.log(rgb + np.float32(APPEARANCE.dark)))
+    opponents = cv2.merge([red - green, 0.5 * (red + green) - blue])
+    return np.concatenate([cv2.Sobel(opponents, cv2.CV_32F, *along, ksize=1) for along in ((1, 0), (0, 1))], 2)
 
 
 def _gradients(rgb: UInt8[np.ndarray, "h w 3"]) -> Float32[np.ndarray, "h w 2"]:

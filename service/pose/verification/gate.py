@@ -81,9 +81,6 @@ class VerificationConfig:
     it has not settled may still be a tenth of the distance off, for distance and focal length move along together."""
     min_lens_matches: int = 50
     """Matches with which exact intrinsics are tested: ten unknowns with ten times as many equations."""
-    min_repeated_colour: float = 0.9
-    """Local colour correlation without which a pose is neither compared with its rivals nor taken for the end of the
-    search: poses that are off by one thing of a row have 0.87 and less."""
     max_inlier_scale: float = 10.0
     """Inliers of a partly invalid photo are scaled up to those of a whole one, at most by this factor."""
 
