@@ -74,10 +74,11 @@ class SearchConfig:
     """Doubts that don't speak against a fisheye's answer."""
     ambiguity_photo_px: int = 256
     """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
+    min_repeated_colour: float = 0.9
     min_colour_edges: float = 0.72
-    """Correlation of the edges in colour without which a pose that only colours speak against is neither compared with
-    its rivals nor taken for the end of the search: right poses have 0.78 and more in a scene by another trainer, poses
-    that are off by one thing of a row 0.66 and less, whose local colours correlate as well."""
+    """Local colour correlation, or correlation of the edges in colour, of which a pose that only colours speak against
+    needs one to be compared with its rivals and taken for the end of the search: poses that are off by one thing of a
+    row have 0.89 and 0.66 at most, right ones in a scene by another trainer 0.55 to 0.95 and 0.78 to 0.90."""
     max_rival_ratio: float = 0.9
     """Dissimilarity of photo and render at a pose that only colours speak against, relative to that at its mirror image
     and at places that look like it: with less it is accepted. Of photos of a scene by another trainer right poses have

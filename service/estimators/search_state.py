@@ -220,6 +220,8 @@ def only_colours_doubt(state: SearchState, found: RefinedPose, verdict: Verdict)
         return False
     if config.model.below_floor(signals, light_may_differ=True):
         return False
+    if signals["local_colour_correlation"] >= state.config.min_repeated_colour:
+        return True
     return state.colour_edges_at(found) >= state.config.min_colour_edges
 
 

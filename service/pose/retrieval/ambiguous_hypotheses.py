@@ -117,7 +117,8 @@ def shifted_hypotheses(
     for i in top_indices(scores, config.views):
         view = _strongest_of(views[i], config.features)
         for centre, within in parts:
-            distance = reprojection_error_px(centre, view.points_in_world, intrinsics, answer.pose)
+            middle = np.broadcast_to(centre, (len(view.points_in_world), 2))
+            distance = reprojection_error_px(middle, view.points_in_world, intrinsics, answer.pose)
             elsewhere = distance > 0.5 * np.linalg.norm(size)
             other = View(view.camera, _selected(view.features, elsewhere), view.points_in_world[elsewhere])
             found.append(correspondences(_selected(strong, within), other, matcher))
