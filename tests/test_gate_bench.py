@@ -109,8 +109,20 @@ def test_colours_count_unless_matches_and_gradients_support_another_light(tmp_pa
     assert SHIPPED_MODEL.below_floor(alone, light_may_differ=True) == colours
     # A fit keeps the rule, and so does its file.
     write_model(fit_model(scene_samples("a", 4, np.random.default_rng(4)), SHIPPED_MODEL, {}), tmp_path / "m.json")
-    read = load_model(tmp_path / "m.json")
-    assert (read.other_light, read.less_detail) == (SHIPPED_MODEL.other_light, SHIPPED_MODEL.less_detail)
+    read, ours = load_model(tmp_path / "m.json"), SHIPPED_MODEL
+    assert (read.other_light, read.less_detail) == (ours.other_light, ours.less_detail)
+    assert read.poor_model == ours.poor_model
+
+
+def test_less_support_is_enough_for_colours_that_are_nearly_right() -> None:
+    right = sample("a", "clean", True, 0.97).signals
+    support = {"inliers": 210.0, "inlier_share": 0.56, "inlier_spread": 0.7, "gradients_half": 0.87}
+    nearly = {**right, **support, "colours_half": 0.92, "local_colour_correlation": 0.82}
+    assert SHIPPED_MODEL.below_floor(nearly) == ["local_colour_correlation"]
+    assert SHIPPED_MODEL.below_floor(nearly, light_may_differ=True) == []
+    less = {"inliers": 190.0, "inlier_share": 0.54, "inlier_spread": 0.55, "gradients_half": 0.84}
+    for name, value in (less | {"colours_half": 0.88, "local_colour_correlation": 0.78}).items():
+        assert "local_colour_correlation" in SHIPPED_MODEL.below_floor({**nearly, name: value}, light_may_differ=True)
 
 
 def test_gradients_count_unless_matches_and_colours_support_the_pose() -> None:

@@ -28,6 +28,7 @@ from service.pose.verification.appearance import (
     BlockStatistics,
     ImagePair,
     colour_correlation,
+    colour_edge_correlation,
     gradient_correlation,
     local_colour_correlation,
 )
@@ -490,6 +491,34 @@ def test_local_colours_distinguish_like_things_whatever_the_light_and_with_a_par
     assert (
         local_colour_correlation(BlockStatistics.of(ImagePair.of(np.zeros((320, 384, 3), np.uint8), frame))) == 1.0
     )  # nothing agrees
+
+
+def test_edges_in_colour_agree_in_any_light_and_not_between_like_things() -> None:
+    """Chequers of ten colours, which are then exchanged; edges in brightness are the same."""
+    rng = np.random.default_rng(0)
+    colours = rng.uniform(0.2, 0.9, (10, 3))
+    colours *= 0.5 / (colours @ [0.299, 0.587, 0.114])[:, None]
+    number, brightness = rng.integers(0, 10, (12, 16)), rng.uniform(0.4, 1.0, (12, 16, 1))
+
+    def chequers(colour: np.ndarray) -> np.ndarray:
+        return np.kron(brightness * colour[number], np.ones((20, 20, 1))).astype(np.float32)
+
+    flat = np.ones((240, 320), np.float32)
+    frame = Frame(chequers(colours), flat, flat, flat)
+
+    def correlation(photo: np.ndarray) -> float:
+        return colour_edge_correlation(to_uint8(photo), frame)
+
+    assert correlation(frame.rgb) > 0.999
+    down, across = np.mgrid[-1:1:240j, -1:1:320j]
+    lamps = np.exp(0.6 * np.stack([across, down, -across], 2)).astype(np.float32)
+    assert correlation(np.clip(lamps * frame.rgb, 0, 1)) > 0.9  # seen: 0.96
+    assert correlation(0.3 * frame.rgb) > 0.9
+    assert abs(correlation(chequers(np.roll(colours, 1, axis=0)))) < 0.3
+    gray = np.repeat(frame.rgb @ np.array([[0.299], [0.587], [0.114]], np.float32), 3, axis=2)
+    assert abs(correlation(gray)) < 0.3
+    nothing = Frame(frame.rgb, 0 * flat, flat, flat)
+    assert colour_edge_correlation(to_uint8(frame.rgb), nothing) == 0.0
 
 
 def test_pixels_are_enough_only_where_local_colours_agree_too() -> None:

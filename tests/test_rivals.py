@@ -11,13 +11,20 @@ from small_room import HALF_TURN, write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.estimators.search_config import SEARCH
+from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance, project, transformed
 from service.interfaces import Features, Matcher
 from service.jobs.model import JobResult
 from service.localize import LoadedScene, Request, localize
+from service.matchers.mutual import mutual_nearest
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.rendered_views import View
-from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
+from service.pose.retrieval.ambiguous_hypotheses import (
+    AMBIGUITY,
+    PoseAtDistance,
+    ambiguous_hypotheses,
+    shifted_hypotheses,
+)
 from service.pose.verification.ambiguity import rank_answers
 from service.results import PoseEstimate, Reason, StageTiming, Status
 from service.tracking import Tracker
@@ -120,6 +127,32 @@ def test_other_colours_are_accepted_where_the_mirror_image_fits_less(symmetric: 
     assert (other.verdict.status, other.verdict.reason) == (Status.UNCERTAIN, Reason.MIRRORED)
 
 
+def lit_by_lamps(photo: Query) -> Query:
+    """Each channel is brighter on another side, by up to a factor of 2.7 across the photo."""
+    height, width = photo.rgb.shape[:2]
+    down, across = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
+    light = np.exp(0.5 * np.stack([across * down, -across, across - down], 2))
+    return replace(photo, rgb=np.clip(light * photo.rgb, 0, 255).astype(np.uint8))
+
+
+def test_colours_whose_edges_agree_are_accepted_in_any_light(symmetric: LoadedScene) -> None:
+    truth = unseen_pose()
+    photo = photo_at(symmetric, truth)
+    found = localize(lit_by_lamps(photo), symmetric)
+    # Below what decides without the edges; seen: 0.83, and edges of 0.99.
+    assert found.verdict.signals["local_colour_correlation"] < SEARCH.min_repeated_colour
+    assert found.verdict.status is Status.LOCALIZED
+    assert_near(found.pose, truth)
+    assert "check_rivals" in stages(found)
+
+    # The same place in other colours: red where it is green; edges of -0.48.
+    fast = Request(options=Options(effort="fast"))
+    painted = localize(recoloured(photo, 1.0), symmetric, fast)
+    assert_near(painted.pose, truth)
+    assert (painted.verdict.status, painted.verdict.reason) == (Status.UNCERTAIN, Reason.RENDER_MISMATCH)
+    assert "check_rivals" not in stages(painted)
+
+
 def test_other_colours_are_refused_where_the_mirror_image_fits_nearly_as_well(symmetric: LoadedScene) -> None:
     config = replace(SEARCH, max_rival_ratio=0.5)
     photo = recoloured(photo_at(symmetric, unseen_pose()))
@@ -191,6 +224,32 @@ def test_at_most_three_hypotheses_are_looked_for_the_largest_first() -> None:
     photo, views, _ = planted([60, 50, 40, 30, 20], [shifted(5.0)])
     assert hypotheses(photo, views) == [60, 50, 40]
     assert hypotheses(photo, views, max_hypotheses=9) == [60, 50, 40, 30, 20]
+
+
+class ByDescriptor(ByNumber):
+    def match(self, a: Features, b: Features) -> np.ndarray:
+        return mutual_nearest(a.descriptors, b.descriptors, 0.5)
+
+
+def test_one_thing_further_is_found_from_a_view_that_shows_both() -> None:
+    """Three like things in a row, 2 units apart. The photo is of the right one, the answer has the middle one there.
+
+    The middle one looks exactly as in the photo, the others less so: from another side.
+    """
+    rng = np.random.default_rng(0)
+    thing, looks = rng.uniform((-0.8, -1.0, 5.0), (0.8, 1.0, 7.0), (40, 3)), np.eye(40, dtype=np.float32)
+    row = np.concatenate([thing + np.array([x, 0, 0]) for x in (-2, 0, 2)])
+    descriptors = np.concatenate([0.8 * looks, looks, 0.9 * looks])
+    strengths = np.ones(120, np.float32)
+    seen = Features(project(row, CAMERA).astype(np.float32), strengths, descriptors)
+    view = View(Camera(CAMERA, ANSWER), seen, row.astype(np.float32))
+    photo = Features(project(thing, CAMERA).astype(np.float32), strengths[:40], looks)
+
+    given = (photo, CAMERA, PoseAtDistance(ANSWER, 6.0), [view], np.ones(1), ByDescriptor(), 4.0)
+    assert not list(ambiguous_hypotheses(*given, 15))
+    (found,) = shifted_hypotheses(*given)
+    assert found.num_inliers >= 30
+    assert pose_distance(found.pose, shifted(2.0))[1] < 0.01  # seen: 1e-7
 
 
 @pytest.mark.parametrize(("agree", "found"), [(15, [15]), (14, [])])

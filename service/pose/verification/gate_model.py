@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 MODEL_FILE = Path(__file__).with_name("model.json")
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +90,9 @@ class GateModel:
     other_light: FloorException | None = None
     """For colours, where the light may be another than the scene's. Exceptions are kept by a fit, too; None: there is
     none."""
+    poor_model: FloorException | None = None
+    """For colours that are nearly right, with less support than those of another light need: the scene's model is poor
+    there. Where the light may be another, too."""
     less_detail: FloorException | None = None
     """For gradients: a photo that was enlarged after it was cropped, or is sharper than the scene's model."""
     fitted_on: Mapping[str, Any] = field(default_factory=dict)
@@ -105,10 +108,11 @@ class GateModel:
     def below_floor(self, signals: Mapping[str, float], light_may_differ: bool = False) -> list[str]:
         """Return the names of the signals that are below their floors.
 
-        The exception `other_light` is made with `light_may_differ` only.
+        The exceptions `other_light` and `poor_model` are made with `light_may_differ` only.
         """
         below = self._below(signals, self.floors)
-        for exception in (self.other_light if light_may_differ else None, self.less_detail):
+        of_colours = (self.other_light, self.poor_model) if light_may_differ else ()
+        for exception in (*of_colours, self.less_detail):
             if exception and exception.floors.keys() <= signals.keys() and not self._below(signals, exception.floors):
                 below = [name for name in below if name not in exception.ignored]
         return below
@@ -130,6 +134,7 @@ def model_from_json(content: Mapping[str, Any]) -> GateModel:
         floors=MappingProxyType(content["floors"] | {name: entry.floor for name, entry in set_by_hand.items()}),
         set_by_hand=MappingProxyType(set_by_hand),
         other_light=_exception(content["other_light"]),
+        poor_model=_exception(content["poor_model"]),
         less_detail=_exception(content["less_detail"]),
         fitted_on=MappingProxyType(content["fitted_on"]),
     )
@@ -170,6 +175,7 @@ def model_to_json(model: GateModel) -> dict[str, Any]:
         "floors": {name: floor for name, floor in model.floors.items() if name not in model.set_by_hand},
         "set_by_hand": {name: asdict(entry) for name, entry in model.set_by_hand.items()},
         "other_light": _exception_to_json(model.other_light),
+        "poor_model": _exception_to_json(model.poor_model),
         "less_detail": _exception_to_json(model.less_detail),
     }
 
