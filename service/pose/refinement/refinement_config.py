@@ -96,7 +96,9 @@ class LensTestConfig:
     """Motion of the pose beyond which wrong intrinsics matter: about half of what counts as right where the scene is
     two to three times as far away as its training cameras' focus."""
     max_loss_ratio: float = 0.96
-    """Residual that is left, at most, if the given intrinsics are wrong."""
+    """Residual that is left, at most, if the given intrinsics are wrong..."""
+    max_loss_ratio_with_matches: float = 0.99
+    """...and if the pixels agree with matches that contradict them."""
     untestable_share: float = 0.005
     """Standard deviation of the position with free intrinsics, as a share of the median depth, from which on the photo
     doesn't tell whether the given ones are right..."""
@@ -109,6 +111,9 @@ class LensTestConfig:
     min_cost_drop: float = 6.5
     """Of matches (`LensEvidence`): from which on they contradict the intrinsics. Of 14 answers with the right ones it
     is 4.5 at most, of 41 with wrong ones that put the pose off by more than the limit of what is right 7.5 at least."""
+    min_cost_drop_alone: float = 13.0
+    """The same where the pixels fit no better with free intrinsics: in poor models right answers have 7.2 at most, and
+    one with a wrong focal length 13.4."""
 
     @property
     def prior(self) -> LensPrior:

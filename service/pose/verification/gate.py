@@ -159,17 +159,22 @@ def _with_evidence_of_matches(
     pose: Pose,
     config: VerificationConfig,
 ) -> PoseUncertainty:
-    """Return the uncertainty with what the matches say against exact intrinsics, if these put the pose off."""
-    test = config.refinement.lens_test
-    if len(found.photo_px) < config.min_lens_matches or (uncertainty.lens_fit and uncertainty.lens_fit.contradicts):
+    """Return the uncertainty with what the matches say against exact intrinsics, if these put the pose off.
+
+    Where a scene's model is poor, matches err together, as with a wrong lens: without the pixels they have to say more.
+    """
+    test, fit = config.refinement.lens_test, uncertainty.lens_fit
+    if len(found.photo_px) < config.min_lens_matches or (fit and fit.contradicts):
         return uncertainty
+    are_alone = fit is not None and fit.loss_ratio > test.max_loss_ratio_with_matches
+    least = test.min_cost_drop_alone if are_alone else test.min_cost_drop
     error_px = SIGNALS.max_error_px * query.intrinsics.long_side / size.long_side
     start = AbsolutePose(pose, np.zeros(len(found.photo_px), bool))
     given = (found.photo_px, found.points_in_world, query.intrinsics)
     evidence = evidence_against_lens(*given, start, test.prior, error_px)
     depth = float(np.median(np.linalg.norm(found.points_in_world - pose.position_in_world, axis=1)))
     moves = moves_pose(evidence.motion, depth, test.contradicting_deg, test.contradicting_share)
-    if not moves or evidence.cost_drop < test.min_cost_drop:
+    if not moves or evidence.cost_drop < least:
         return uncertainty
     return replace(uncertainty, lens_fit=LensFit(evidence.correction, evidence.motion, 1.0, True))
 
