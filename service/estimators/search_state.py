@@ -139,9 +139,11 @@ class SearchState:
         # A pose refined from a prior has no matches behind it.
         matches, unique = found.num_inliers or 0, is_unique or not self.tools.prepared.repeats_itself
         verdict = verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
-        # Distance and focal length still move along together, however little one step of it says.
-        moves = images.query.lens_prior is not None and not found.settled
-        return downgraded(verdict, Reason.FOCAL_UNCERTAIN) if moves else verdict
+        if found.settled:
+            return verdict
+        # It still moves, however little one step of it says: with an estimated lens, along with the focal length.
+        is_exact = images.query.lens_prior is None
+        return downgraded(verdict, Reason.POSITION_UNCERTAIN if is_exact else Reason.FOCAL_UNCERTAIN)
 
     def appearance_at(self, found: RefinedPose) -> dict[str, float]:
         """Return how alike photo and render are at a pose."""
