@@ -7,6 +7,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
@@ -23,15 +24,18 @@ from service.bench.live_film import FilmConfig, Shot, make_film
 from service.bench.pose_metrics import Units
 from service.errors import InvalidImage, SceneNotFound
 from service.geometry import moved, pose_distance
+from service.live import live_tracker
 from service.live.background import Background
-from service.live.live_tracker import LiveTracker
+from service.live.live_tracker import LIVE, LiveTracker
+from service.live.live_values import LiveAnswer as Live
 from service.live.live_values import LiveFrame, LiveTask
 from service.live_client import LiveAnswer
 from service.localize import Cancelled, LoadedScene, Request, render_and_verify
 from service.photos.camera_identity import CameraIdentity
 from service.photos.images import encode_image, query_of, read_query
 from service.photos.sequence import SequencePhoto
-from service.results import Status
+from service.pose.verification.gate import doubted
+from service.results import Reason, Status
 from service.tracking import Tracker, TrackingConfig, localize_sequence
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -242,6 +246,8 @@ def test_a_photo_and_its_file_are_the_same_query(room):
 
 # ------------------------------------------------------------------ live
 
+SHORT = replace(LIVE, search_s=(0.2, 0.2, 5.0), check_every_s=0.2)
+
 
 def test_a_live_camera_is_searched_beside_followed_and_found_again(room):
     """Frames as they come from a camera; a lens that was covered for a while; the camera elsewhere afterwards."""
@@ -285,6 +291,69 @@ def test_a_live_lens_is_estimated_once_and_kept_for_frames_of_any_size(room):
     assert small.pose is not None
     assert close(small.pose, place(1.02, 0.1), 0.2, 0.05)
     assert own.intrinsics == LENS
+
+
+def used_until(tracker: LiveTracker, frames: Iterator[LiveFrame], done: Callable[[Live], bool]) -> Live:
+    """Give frames to a tracker until an answer is as wanted; return that."""
+    for _, frame in zip(range(400), frames, strict=False):
+        answer = tracker.use(frame)
+        if done(answer):
+            return answer
+        time.sleep(0.02)
+    raise AssertionError("never")
+
+
+def standing(room: LoadedScene, pose: Pose, start_s: float = 0.0, hidden: float = 0.0) -> Iterator[LiveFrame]:
+    """Frames of a camera that stands still, 30 a second; a part of them is hidden by something striped."""
+    rgb = photo(room, pose)
+    rgb[:, : round(hidden * WIDTH)] = 255 * (np.arange(HEIGHT) // 8 % 2)[:, None, None]
+    jpeg = encode_image(rgb)
+    return (LiveFrame(round(1000 * (start_s + k / 30)), start_s + k / 30, jpeg) for k in range(10_000))
+
+
+def test_what_the_whole_gate_refuses_is_uncertain_until_a_search_confirms_it(room, monkeypatch):
+    seen, refusing = [], threading.Event()
+
+    def verify(images, pose, rasterizer):
+        verdict = render_and_verify(images, pose, rasterizer)
+        seen.append(verdict.status)
+        return doubted(verdict, Reason.FEW_INLIERS) if refusing.is_set() else verdict
+
+    monkeypatch.setattr(live_tracker, "verify_whole", verify)
+    with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room, SHORT)) as tracker:
+        frames = standing(room, place(1.0, 0.1))
+        used_until(tracker, frames, lambda answer: answer.mode == "tracking")
+        used_until(tracker, frames, lambda _: bool(seen))
+        assert seen[0] is Status.LOCALIZED
+        assert tracker.use(next(frames)).verdict.status is Status.LOCALIZED
+        refusing.set()
+        doubt = used_until(tracker, frames, lambda answer: answer.verdict.status is Status.UNCERTAIN)
+        assert (doubt.mode, doubt.verdict.reason) == ("tracking", Reason.FEW_INLIERS)
+        assert close(doubt.pose, place(1.0, 0.1))
+        refusing.clear()
+        again = used_until(tracker, frames, lambda answer: answer.verdict.status is Status.LOCALIZED)
+        assert close(again.pose, place(1.0, 0.1))
+
+
+def test_a_camera_that_is_hidden_more_and_more_is_followed_rightly_or_not_at_all(room):
+    pose = place(1.0, 0.1)
+    with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room, SHORT)) as tracker:
+        used_until(tracker, standing(room, pose), lambda answer: answer.mode == "tracking")
+        shares = [0.2, 0.4, 0.6, 0.7, 0.8, 0.95]
+        answers = [tracker.use(next(standing(room, pose, 0.1 + share / 10, hidden=share))) for share in shares]
+        assert answers[0].verdict.status is Status.LOCALIZED
+        assert answers[-1].mode == "relocalizing"
+        for answer in answers:
+            assert (answer.pose is None) == (answer.verdict is None) == (answer.mode != "tracking")
+            # What was asked for: 5 degrees, 2 % of some 3 units. Seen: 0.9 degrees, 0.04, where 70 % are hidden.
+            assert answer.pose is None or close(answer.pose, pose, 5.0, 0.06)
+        # Nothing but stripes: no pose, whatever was found before.
+        covered = standing(room, pose, 0.3, hidden=1.0)
+        lost = used_until(tracker, covered, lambda answer: answer.mode == "lost")
+        assert (lost.pose, lost.verdict, lost.intrinsics) == (None, None, None)
+        elsewhere = place(1.3, 0.2)
+        found = used_until(tracker, standing(room, elsewhere, 30.0), lambda answer: answer.mode == "tracking")
+        assert close(found.pose, elsewhere)
 
 
 def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():
