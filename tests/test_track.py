@@ -335,7 +335,7 @@ def test_what_the_whole_gate_refuses_is_uncertain_until_a_search_confirms_it(roo
         assert close(again.pose, place(1.0, 0.1))
 
 
-def test_a_camera_that_is_hidden_more_and_more_is_followed_rightly_or_not_at_all(room):
+def test_a_camera_that_is_hidden_more_and_more_is_never_localized_wrongly(room):
     pose = place(1.0, 0.1)
     with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room, SHORT)) as tracker:
         used_until(tracker, standing(room, pose), lambda answer: answer.mode == "tracking")
@@ -345,8 +345,9 @@ def test_a_camera_that_is_hidden_more_and_more_is_followed_rightly_or_not_at_all
         assert answers[-1].mode == "relocalizing"
         for answer in answers:
             assert (answer.pose is None) == (answer.verdict is None) == (answer.mode != "tracking")
-            # What was asked for: 5 degrees, 2 % of some 3 units. Seen: 0.9 degrees, 0.04, where 70 % are hidden.
-            assert answer.pose is None or close(answer.pose, pose, 5.0, 0.06)
+            # Where most is hidden refinement goes astray, by up to 1.5 degrees here, and says so.
+            is_right = answer.pose is not None and close(answer.pose, pose)
+            assert is_right or answer.verdict is None or answer.verdict.status is Status.UNCERTAIN
         # Nothing but stripes: no pose, whatever was found before.
         covered = standing(room, pose, 0.3, hidden=1.0)
         lost = used_until(tracker, covered, lambda answer: answer.mode == "lost")
