@@ -244,7 +244,7 @@ def test_an_idle_session_ends(stepping_module):
 def test_the_handshake_is_refused_by_http_status(stepping_module, tmp_path):
     file = tmp_path / "keys.json"
     keys = {role: add_key(file, role, role) for role in ("read", "localize")}
-    app = create_app(settings(keys_file=file, rate_limit="4/hour"), {"room": make_scene()})
+    app = create_app(settings(keys_file=file, rate_limit="5/hour"), {"room": make_scene()})
     with serving(app) as client:
         until(lambda: client.get("/readyz").status_code == 200)
         for key, status, code in (
@@ -261,6 +261,18 @@ def test_the_handshake_is_refused_by_http_status(stepping_module, tmp_path):
         ):
             pass
         assert foreign.value.response.status_code == 403
+        # A person at the page is asked for a key, and has a cookie afterwards, which the socket takes.
+        asked = client.get("/live", headers={"Accept": "text/html"})
+        assert (asked.status_code, asked.headers["location"]) == (303, "/#/key?then=live")
+        signed_in = client.get("/live", params={"key": keys["localize"]})
+        assert (signed_in.status_code, signed_in.headers["location"]) == (303, "/live")
+        cookie = signed_in.headers["set-cookie"].partition(";")[0]
+        client.cookies.clear()
+        page = client.get("/live", headers={"Cookie": cookie})
+        assert "default-src 'self'" in page.headers["content-security-policy"]
+        with connect(address(client), additional_headers={"Cookie": cookie}, proxy=None) as by_cookie:
+            by_cookie.send(json.dumps(HELLO))
+            assert json.loads(by_cookie.recv(10))["type"] == "welcome"
         token = client.post("/tokens", headers={"Authorization": f"Bearer {keys['localize']}"}).json()["token"]
         with connect(f"{address(client)}?token={token}", proxy=None) as by_token:
             by_token.send(json.dumps(HELLO))
