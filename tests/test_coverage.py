@@ -327,7 +327,7 @@ def test_a_broken_list_of_held_out_photos_is_named(tmp_path):
     assert held_out_photos(tmp_path / "none.ply") == []
 
 
-def test_the_api_measures_in_the_background_and_returns_the_map(monkeypatch, plugins):
+def test_the_api_measures_in_the_background_and_tells_what_went_wrong(monkeypatch, plugins, tmp_path):
     go_on = threading.Event()
 
     def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
@@ -337,7 +337,13 @@ def test_the_api_measures_in_the_background_and_returns_the_map(monkeypatch, plu
         return replace(plan_of([trial(True, 1.0)]), scene_sha256=loaded.scene.info.sha256)
 
     monkeypatch.setattr("service.scene_manager.scene_coverage.measured_coverage", measured)
-    with serving(create_app(settings(), {"room": make_scene()})) as client:
+    folder = tmp_path / "hall"
+    folder.mkdir()
+    (folder / "scene.ply").write_bytes(ply(50))
+    (folder / "transforms.json").write_text(json.dumps(TRANSFORMS))
+    (folder / "truth.json").write_text("{}")
+    app = create_app(settings(scenes=[folder], cache_dir=None), {"room": make_scene()})
+    with serving(app) as client:
         path = "/scenes/room/coverage"
         assert client.get(path).json() == {"state": "none", "done": 0, "total": 0, "map": None, "error": None}
         assert client.post(path).status_code == 202
@@ -350,20 +356,9 @@ def test_the_api_measures_in_the_background_and_returns_the_map(monkeypatch, plu
         assert answer["headings_deg"] == [0, 180]
         assert answer["cells"][0]["probabilities"][1] is None
         assert answer["found"] > 0.8
-        assert client.get("/scenes/room").json()["jobs"] == 0
+        until(lambda: client.get("/scenes/room").json()["jobs"] == 0, 30)
         assert client.get("/scenes/none/coverage").status_code == 404
-
-
-def test_a_measurement_that_fails_says_why(tmp_path, plugins):
-    folder = tmp_path / "hall"
-    folder.mkdir()
-    (folder / "scene.ply").write_bytes(ply(50))
-    (folder / "transforms.json").write_text(json.dumps(TRANSFORMS))
-    (folder / "truth.json").write_text("{}")
-    with serving(create_app(settings(scenes=[folder], cache_dir=None))) as client:
-        until(lambda: client.get("/readyz").json()["ready"], 100)
-        assert client.get("/scenes/hall/coverage").json()["state"] == "none"
-        client.post("/scenes/hall/coverage")
+        until(lambda: client.post("/scenes/hall/coverage").status_code == 202, 30)
         until(lambda: client.get("/scenes/hall/coverage").json()["state"] == "failed", 30)
         assert "truth.json" in str(client.get("/scenes/hall/coverage").json()["error"])
 
