@@ -43,6 +43,7 @@ NOT_IN_A_SUBPROCESS = {
     "test_a_scene_still_loading_is_not_ready": "holds a matcher by an event of the test's process",
     "test_a_bug_in_a_route_is_a_problem_document_without_details": "breaks a rasterizer in the test's process",
     "test_a_stopped_service_finishes_or_puts_back_what_runs": "lets a job go on from the test's process",
+    "test_the_api_measures_in_the_background_and_tells_what_went_wrong": "measures in the test's process",
     "test_errors.py": "brings parts of the service into states by changing them in the test's process",
 }
 """Tests of the API, or files of them, that reach around HTTP into the engine, and how."""
