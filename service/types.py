@@ -407,6 +407,8 @@ class Query:
     """Poses outside are refused."""
     accuracy: Accuracy = DEFAULT_ACCURACY
     """What a pose must be certain within; without metres."""
+    rows_are_columns: bool = False
+    """Whether EXIF turned the photo by 90 degrees: what the sensor read row by row are its columns."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))

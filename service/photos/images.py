@@ -153,7 +153,9 @@ def _query(
         if valid_mask is not None:
             inside = inside & (undistorted(valid_mask.astype(np.uint8), camera)[0] > 0)
         valid_mask = inside
-    return Query(rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask, lens_prior)
+    turned = decoded.upright_from_stored[0]
+    given = rgb, pinhole, source, intrinsics, prior, tuple(warnings), valid_mask, lens_prior
+    return Query(*given, rows_are_columns=turned)
 
 
 def _assumed_intrinsics(

@@ -21,16 +21,21 @@ def without_row_motion(query: Query, camera: Intrinsics, shear: float, stretch: 
     """Return the query with its rows turned back to the middle one; `camera` is its pinhole, as far as it is known.
 
     `shear` and `stretch` are shifts of a row in normalized units per normalized unit down (positive: right, down), at
-    the principal point. Pixels that no row saw are invalid.
+    the principal point. Of a photo whose columns are the sensor's rows they are those that remain beside another roll
+    and distance: shifts of a column down by the shear, and right by the negative stretch, per unit to the right. Pixels
+    that no row saw are invalid.
     """
     height, width = query.rgb.shape[:2]
     row, column = np.mgrid[:height, :width].astype(np.float32) + np.float32(0.5)
     x, y = (column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy
+    middle_x, middle_y = (0.5 * width - camera.cx) / camera.fx, (0.5 * height - camera.cy) / camera.fy
     seen_x, seen_y = x, y
-    middle = (0.5 * height - camera.cy) / camera.fy
     for _ in range(_ITERATIONS):
         # Angles about the vertical and the horizontal axis; a normalized unit is the tangent of an angle.
-        turn, tilt = shear * (seen_y - middle), stretch * (seen_y - middle)
+        if query.rows_are_columns:
+            turn, tilt = -stretch * (seen_x - middle_x), shear * (seen_x - middle_x)
+        else:
+            turn, tilt = shear * (seen_y - middle_y), stretch * (seen_y - middle_y)
         ahead = 1 - turn * x - tilt * y
         seen_x, seen_y = (x + turn) / ahead, (y + tilt) / ahead
     # OpenCV has the centre of the top-left pixel at (0, 0).
