@@ -27,8 +27,8 @@ except ImportError:  # Windows
     resource = None
 
 _CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-_LOWER_BY = 5
-"""Nice values: a thread gets about a third of what one of normal priority gets on the same core."""
+_LOWER_BY = 3
+"""Nice values: a thread gets about half of what one of normal priority gets on the same core."""
 _CHILD_ENVIRONMENT = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "SYSTEMROOT", "TEMP", "TMP")
 """What a process needs to find its libraries; without SYSTEMROOT Python doesn't start on Windows."""
 

@@ -246,7 +246,7 @@ def test_a_photo_and_its_file_are_the_same_query(room):
 
 # ------------------------------------------------------------------ live
 
-SHORT = replace(LIVE, search_s=(0.2, 0.2, 5.0), check_every_s=0.2)
+SHORT = replace(LIVE, search_s=(0.2, 2.0), check_every_s=0.2)
 
 
 def test_a_live_camera_is_searched_beside_followed_and_found_again(room):
@@ -348,13 +348,30 @@ def test_a_camera_that_is_hidden_more_and_more_is_never_localized_wrongly(room):
             # Where most is hidden refinement goes astray, by up to 1.5 degrees here, and says so.
             is_right = answer.pose is not None and close(answer.pose, pose)
             assert is_right or answer.verdict is None or answer.verdict.status is Status.UNCERTAIN
-        # Nothing but stripes: no pose, whatever was found before.
-        covered = standing(room, pose, 0.3, hidden=1.0)
-        lost = used_until(tracker, covered, lambda answer: answer.mode == "lost")
-        assert (lost.pose, lost.verdict, lost.intrinsics) == (None, None, None)
-        elsewhere = place(1.3, 0.2)
-        found = used_until(tracker, standing(room, elsewhere, 30.0), lambda answer: answer.mode == "tracking")
-        assert close(found.pose, elsewhere)
+
+
+def test_a_camera_that_moves_on_while_it_is_searched_for_is_followed_to_the_present(room, monkeypatch):
+    """However long the search takes: what is kept of the way is thinned out, its beginning stays."""
+    go_on, searches, search = threading.Event(), [], live_tracker.localize_in_scene
+
+    def waiting(*arguments):
+        searches.append(arguments)
+        assert go_on.wait(20)
+        return search(*arguments)
+
+    monkeypatch.setattr(live_tracker, "localize_in_scene", waiting)
+    way = path(45)  # 50 degrees
+    jpegs = [encode_image(photo(room, pose, k)) for k, pose in enumerate(way)]
+    few = replace(SHORT, kept=20, search_s=(10.0,))
+    with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room, few)) as tracker:
+        for number, jpeg in enumerate(jpegs):
+            assert tracker.use(LiveFrame(number, number / 10, jpeg)).mode == "relocalizing"
+        go_on.set()
+        last = (LiveFrame(100 + k, 4.5 + k / 1000, jpegs[-1]) for k in range(1000))
+        found = used_until(tracker, last, lambda answer: answer.mode == "tracking")
+    assert len(searches) == 1
+    assert found.verdict.status is Status.LOCALIZED
+    assert close(found.pose, way[-1])
 
 
 def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():

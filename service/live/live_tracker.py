@@ -61,15 +61,15 @@ class LiveConfig:
     """For so long a lost camera is looked for where it was last, too: a hand over the lens goes away."""
     retry_every_s: float = 0.1
     """Time between two such tries."""
-    search_s: tuple[float, ...] = (0.6, 0.6, 2.0)
-    """Wall times of one search after another, from the start when they are through: most frames that can be found are
-    found soon, and the next search has a newer frame."""
+    search_s: tuple[float, ...] = (2.0, 6.0)
+    """Wall times of one search after another, from the start when they are through. A search takes 0.05 to 0.4 s of a
+    core; more where others use the core, too."""
     min_contrast: float = 6.0
     """Standard deviation of a frame's values, 0..255, below which nothing is searched for: a dark or covered lens."""
     kept_every_s: float = 0.06
     """Time between the frames that are kept while a search runs."""
     kept: int = 40
-    """Frames; as they came, hence about 2 MB."""
+    """Frames, as they came, hence about 2 MB; when there are more, every second one is dropped."""
 
 
 LIVE = LiveConfig()
@@ -114,7 +114,8 @@ class LiveTracker:
         """What the whole gate had against the last frame that it saw."""
         self._searches = 0
         """That ended without an answer since the camera was verified last."""
-        self._kept: deque[LiveFrame] = deque(maxlen=config.kept)
+        self._kept: list[LiveFrame] = []
+        self._kept_every_s = config.kept_every_s
         self._tried_s = -1e9
         self._background: Background[_Found | None] = Background()
 
@@ -184,8 +185,13 @@ class LiveTracker:
         """Keep some frames while a search runs, to follow the camera from its answer to now."""
         if self._background.idle:
             self._kept.clear()
-        elif not self._kept or frame.time_s - self._kept[-1].time_s >= self._config.kept_every_s:
+            self._kept_every_s = self._config.kept_every_s
+        elif not self._kept or frame.time_s - self._kept[-1].time_s >= self._kept_every_s:
             self._kept.append(frame)
+        if len(self._kept) > self._config.kept:
+            # The chain from the search's frame on must not break.
+            del self._kept[1::2]
+            self._kept_every_s *= 2
 
     # ------------------------------------------------------------------ following
 
