@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -191,3 +192,26 @@ def test_anchors_are_drawn_with_their_names_and_a_picked_point_is_offered_to_be_
     assert plan._controls.anchor.content == ""
     plan.set_layer_visible("anchors", True)
     assert list(plan._scene.anchors.show.call_args.args[0]) == ["door", "lamp"]
+
+
+def test_coverage_is_asked_for_each_second_while_it_is_measured_and_shown(
+    fake: FakeService, client: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr("viewer.plan_display.time", clock)
+    plan = display(client)
+    assert plan.due_in_s is None
+    fake.coverage = CoverageStatus("running", 3, 10)
+    plan.set_layer_visible("coverage", True)
+    assert plan.due_in_s == 1.0
+    assert "3 of 10" in plan._controls.coverage.content
+    clock.now += 0.75
+    assert plan.due_in_s == 0.25
+    clock.now += 2
+    assert plan.due_in_s == 0.0
+    plan.set_layer_visible("coverage", False)
+    assert plan.due_in_s is None
+    fake.coverage = CoverageStatus("ready", found=coverage_map())
+    plan.set_layer_visible("coverage", True)
+    assert plan.due_in_s is None
+    assert plan._scene.coverage.show.call_args.args[0] is not None

@@ -82,16 +82,20 @@ class BrowserSession:
         """Return how long to wait for an action before `_idle`; None: without end."""
         if self._job.step.due_in_s is not None:
             return self._job.step.due_in_s
-        return 0.0 if self._scene.splats.pending else self._job.tick_in_s
+        if self._scene.splats.pending:
+            return 0.0
+        return min((due for due in (self._job.tick_in_s, self._plan.due_in_s) if due is not None), default=None)
 
     def _idle(self) -> None:
-        """Do what waits until there are no actions: the rest of a step, the splats, playback; in this order."""
+        """Do what waits until there are no actions: the rest of a step, splats, playback, coverage; in this order."""
         if self._job.step.due_in_s is not None:
             self._job.step.run_next()
         elif self._scene.splats.pending:
             self._scene_display.send_splats()
-        elif self._job.tick_in_s is not None:
+        elif self._job.tick_in_s == 0.0:
             self._job.tick()
+        elif self._plan.due_in_s == 0.0:
+            self._plan.refresh()
 
     def _try(self, action: Action) -> None:
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Sequence
 
 from service.client import Client, ServiceError
@@ -17,6 +18,7 @@ from viewer.service_values import FoundCamera, coverage_of, found_cameras
 log = logging.getLogger(__name__)
 
 _JOBS_SHOWN = 200
+_POLL_S = 1.0
 _IN_PLAN: dict[LayerName, bool] = {"splats": False, "floor plan": True, "training cameras": True}
 """Layers that the plan view shows or hides."""
 
@@ -34,12 +36,21 @@ class PlanDisplay:
     ) -> None:
         self._controls, self._scene, self._background = controls, scene, background
         self._scene_display, self._client = scene_display, client
+        self._measuring, self._asked = False, 0.0
+        """Whether the coverage map was being measured when it was asked for last, and when that was."""
         self._shown: str | None = None
         """Scene of the layers."""
         self._cameras: dict[str, tuple[FoundCamera, ...]] = {}
         """Of jobs that have ended, by id."""
         self._before: dict[LayerName, bool] = {}
         """Which layers were shown before the plan view."""
+
+    @property
+    def due_in_s(self) -> float | None:
+        """Time until the coverage map is asked for again, while it is measured and its layer is shown; None: not."""
+        if not self._measuring or not self._scene.is_visible("coverage"):
+            return None
+        return max(0.0, self._asked + _POLL_S - time.monotonic())
 
     def set_plan_view(self, shown: bool) -> None:
         """Look at the scene from above, cut open, or as before again."""
@@ -86,6 +97,7 @@ class PlanDisplay:
             self._scene.job_poses.show(self._all_cameras(scene_id))
         if self._scene.is_visible("coverage"):
             answer = coverage_of(self._client.coverage(scene_id))
+            self._measuring, self._asked = answer.state == "running", time.monotonic()
             self._scene.coverage.show(answer.found)
             self._controls.coverage.content = coverage_html(answer)
         self._controls.coverage.visible = self._controls.layers["coverage"].value

@@ -23,7 +23,10 @@ _BLIND, _CAMERA, _INK, _PAPER = (205, 205, 205), (190, 40, 40), (30, 30, 30), (2
 
 
 def drawn_plan(
-    found: CoverageMap, surfaces_in_world: Float[np.ndarray, "n 3"], cameras_in_world: Float[np.ndarray, "k 3"]
+    found: CoverageMap,
+    surfaces_in_world: Float[np.ndarray, "n 3"],
+    cameras_in_world: Float[np.ndarray, "k 3"],
+    metres_per_unit: float | None = None,
 ) -> bytes:
     """Return a PNG: each cell a disc of wedges, one a heading; the scene's surfaces grey, its training cameras red."""
     cells, cameras = (points @ found.plan_from_world.T for points in (found.positions_in_world, cameras_in_world))
@@ -45,7 +48,7 @@ def drawn_plan(
             _wedge(image, middle, radius, heading, half, level_colour(probability) if seen else _BLIND)
     for at in pixels(cameras):
         cv2.circle(image, tuple(np.rint(at).astype(int).tolist()), 3, _CAMERA, -1, cv2.LINE_AA)
-    _legend(image, height, found, scale)
+    _legend(image, height, found, scale / (metres_per_unit or 1.0), "m" if metres_per_unit else "units")
     return encode_image(image, "png")
 
 
@@ -75,7 +78,7 @@ def _wedge(
     cv2.fillPoly(image, [np.rint(corners * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
 
 
-def _legend(image: np.ndarray, top: int, found: CoverageMap, scale: float) -> None:
+def _legend(image: np.ndarray, top: int, found: CoverageMap, scale: float, unit: str) -> None:
     _text(image, found.title, (_MARGIN, top + 22), 0.6)
     rows = [*((colour, words) for _, colour, words in LEVELS), (_BLIND, "nothing of the scene in view")]
     for number, (colour, words) in enumerate(rows):
@@ -87,7 +90,7 @@ def _legend(image: np.ndarray, top: int, found: CoverageMap, scale: float) -> No
     length = round_length(100 / scale)
     end = _MARGIN + round(length * scale)
     cv2.line(image, (_MARGIN, top + 140), (end, top + 140), _INK, 2)
-    _text(image, f"{length:g} units; each wedge points where the camera looks", (end + 12, top + 145), 0.5)
+    _text(image, f"{length:g} {unit}; each wedge points where the camera looks", (end + 12, top + 145), 0.5)
     _text(image, f"{len(found.trials)} renders made as photos are, seen from above", (_MARGIN, top + 175), 0.5)
 
 
