@@ -252,36 +252,42 @@ def test_without_splats_in_the_browser_the_service_renders(visible: bool, pendin
 # ------------------------------------------------------------------ a session
 
 
-def session(due: float | None = None, pending: bool = False, tick: float | None = None) -> Any:
+def session(
+    due: float | None = None, pending: bool = False, tick: float | None = None, plan: float | None = None
+) -> Any:
     """A session without a browser: what it does when nothing was asked of it."""
     found: Any = object.__new__(BrowserSession)
     found._job = Mock(tick_in_s=tick, step=Mock(due_in_s=due))
-    found._scene, found._scene_display = Mock(), Mock()
+    found._scene, found._scene_display, found._plan = Mock(), Mock(), Mock(due_in_s=plan)
     found._scene.splats.pending = pending
     found._controls, found._queue = Mock(), Mock(closed=False)
     return found
 
 
 @pytest.mark.parametrize(
-    ("due", "pending", "tick", "waits", "done"),
+    ("due", "pending", "tick", "plan", "waits", "done"),
     [
-        (0.2, True, 1.0, 0.2, "step"),  # the rest of a step first
-        (None, True, 1.0, 0.0, "splats"),
-        (None, False, 1.0, 1.0, "tick"),
-        (0.0, False, None, 0.0, "step"),
-        (None, False, None, None, None),
+        (0.2, True, 1.0, 0.1, 0.2, "step"),  # the rest of a step first
+        (None, True, 1.0, 0.1, 0.0, "splats"),
+        (None, False, 1.0, None, 1.0, "tick"),
+        (None, False, 0.5, 0.7, 0.5, "tick"),
+        (None, False, 0.5, 0.3, 0.3, "plan"),
+        (None, False, None, 0.3, 0.3, "plan"),
+        (0.0, False, None, None, 0.0, "step"),
+        (None, False, None, None, None, None),
     ],
 )
-def test_idle_time_is_for_the_step_then_the_splats_then_playback(
-    due: float | None, pending: bool, tick: float | None, waits: float | None, done: str | None
+def test_idle_time_is_for_the_step_then_the_splats_then_playback_and_coverage(
+    due: float | None, pending: bool, tick: float | None, plan: float | None, waits: float | None, done: str | None
 ) -> None:
-    found = session(due, pending, tick)
+    found = session(due, pending, tick, plan)
     assert found._idle_in_s() == waits
     found._idle()
     called = {
         "step": found._job.step.run_next.called,
         "splats": found._scene_display.send_splats.called,
         "tick": found._job.tick.called,
+        "plan": found._plan.refresh.called,
     }
     assert [name for name, was in called.items() if was] == ([done] if done else [])
 

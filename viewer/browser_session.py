@@ -92,10 +92,10 @@ class BrowserSession:
             self._job.step.run_next()
         elif self._scene.splats.pending:
             self._scene_display.send_splats()
-        elif self._job.tick_in_s == 0.0:
-            self._job.tick()
-        elif self._plan.due_in_s == 0.0:
+        elif (due := self._plan.due_in_s) is not None and due < (self._job.tick_in_s or np.inf):
             self._plan.refresh()
+        elif self._job.tick_in_s is not None:
+            self._job.tick()
 
     def _try(self, action: Action) -> None:
         try:
