@@ -273,6 +273,7 @@ def session(
         (None, False, 0.5, 0.7, 0.5, "tick"),
         (None, False, 0.5, 0.3, 0.3, "plan"),
         (None, False, None, 0.3, 0.3, "plan"),
+        (None, False, 0.0, 0.0, 0.0, "tick"),
         (0.0, False, None, None, 0.0, "step"),
         (None, False, None, None, None, None),
     ],

@@ -92,10 +92,12 @@ class BrowserSession:
             self._job.step.run_next()
         elif self._scene.splats.pending:
             self._scene_display.send_splats()
-        elif (due := self._plan.due_in_s) is not None and due < (self._job.tick_in_s or np.inf):
-            self._plan.refresh()
-        elif self._job.tick_in_s is not None:
-            self._job.tick()
+        else:
+            tick, plan = self._job.tick_in_s, self._plan.due_in_s
+            if plan is not None and (tick is None or plan < tick):
+                self._plan.refresh()
+            elif tick is not None:
+                self._job.tick()
 
     def _try(self, action: Action) -> None:
         try:
