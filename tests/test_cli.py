@@ -32,6 +32,8 @@ from service import jit
 from service.accuracy import Accuracy
 from service.cli.render import render
 from service.geometry import moved, pose_distance
+from service.scene_manager.anchor_store import Anchor, FileAnchorStore
+from service.scene_manager.status import StoredScene
 from service.types import Pose
 from service.web.app import data_folder
 from service.web.settings import unknown_variables
@@ -92,6 +94,8 @@ def test_render_draws_the_scene_as_a_training_camera_sees_it(photo):
 def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo, tmp_path):
     table = tmp_path / "poses.csv"
     given = ("--scene", room, "--intrinsics", json.dumps(INTRINSICS), "--seed", 5)
+    ahead = TRUTH.position_in_world + 2 * TRUTH.axis_in_world
+    FileAnchorStore(lambda _: StoredScene("room", room), None).put("room", Anchor("ahead", ahead))
     code, told, _ = splatfix("localize", photo, *given, "--json", "--csv", table)
     assert code == 0
     (result,) = json.loads(told)
@@ -101,6 +105,10 @@ def test_localize_finds_the_photo_and_tells_it_three_ways(splatfix, room, photo,
     # Seen: 0.02 degrees, 0.0002 units.
     assert degrees < 0.2
     assert units < 0.005
+    (anchor,) = result["anchors"]
+    # In the middle of the photo, as far as the pose is right: 0.1 px seen.
+    assert anchor["pixel"] == pytest.approx([INTRINSICS["cx"], INTRINSICS["cy"]], abs=1.0)
+    (room / "anchors.json").unlink()
     (row,) = csv.DictReader(table.read_text().splitlines())
     assert [float(row[c]) for c in "xyz"] == pytest.approx(found.position_in_world.tolist())
     assert row["status"] == "localized"

@@ -20,6 +20,7 @@ from service.cli.terminal import (
     print_json,
     read_file,
     say,
+    scene_anchors,
     scene_registrations,
 )
 from service.errors import InvalidRequest
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from service.localize import LoadedScene
     from service.registration.registration import Registration
     from service.results import Status
+    from service.scene_manager.anchor_store import Anchor
     from service.web.schemas.job_results import Result
     from service.web.schemas.request_body import Body
     from service.web.schemas.requests import LocalizeFields
@@ -102,13 +104,14 @@ def localize(
         _require_one_scene(paths)
     # Last: faults of photos and fields are reported without waiting for it.
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
-    registrations = scene_registrations(paths, loaded)
+    registrations, anchors = scene_registrations(paths, loaded), scene_anchors(paths)
     output = _Output(as_json, csv_file, tum_file, smooth)
     if track_camera:
-        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], registrations, output)
+        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], registrations, anchors[0], output)
     else:
         bodies = [Body(data, name, {}) for name, data in files]
-        statuses = _localize_each(bodies, fields, loaded, registrations, output, learn_lenses=learn_lenses)
+        known = list(zip(loaded, registrations, anchors, strict=True))
+        statuses = _localize_each(bodies, fields, known, output, learn_lenses=learn_lenses)
     if fail and any(status != Status.LOCALIZED for status in statuses):
         raise typer.Exit(1)
 
@@ -140,13 +143,15 @@ def _require_one_scene(paths: list[Path]) -> None:
 def _localize_each(
     bodies: list[Body],
     fields: LocalizeFields,
-    loaded: list[LoadedScene],
-    registrations: list[Registration | None],
+    known: list[tuple[LoadedScene, Registration | None, tuple[Anchor, ...]]],
     output: _Output,
     *,
     learn_lenses: bool,
 ) -> list[Status]:
-    """Localize every photo by itself, in the one scene or in each of several; return their statuses."""
+    """Localize every photo by itself, in the one scene or in each of several; return their statuses.
+
+    `known`: each scene, with its registration and its anchors.
+    """
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
@@ -155,16 +160,18 @@ def _localize_each(
     from service.web.schemas.conversion import result_out
     from service.web.schemas.job_spec import job_spec
 
+    loaded, registrations = [scene for scene, _, _ in known], [registration for _, registration, _ in known]
     lenses = LensMemory(MemoryLensStore(len(bodies))) if learn_lenses else None
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         spec = job_spec(fields)
         recall = partial(lenses.recall, "", None) if lenses else None
         photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb, recall=recall)
-        result, _ = run_task(photo.task(spec), loaded, registrations=registrations)
+        result, shown = run_task(photo.task(spec), loaded, registrations=registrations)
         if lenses:
             lenses.learn("", None, photo.camera, photo.recalled, result.estimate)
-        results.append((body.name, result_out(result)))
+        anchors = next((anchors for scene, _, anchors in known if scene is shown), ())
+        results.append((body.name, result_out(result, anchors)))
         if not output.as_json:
             # At once, not in the end: a photo may take seconds.
             say(result_tables.photo_line(*results[-1]))
@@ -177,7 +184,12 @@ def _localize_each(
 
 
 def _localize_sequence(
-    body: Body, fields: LocalizeFields, loaded: LoadedScene, registrations: list[Registration | None], output: _Output
+    body: Body,
+    fields: LocalizeFields,
+    loaded: LoadedScene,
+    registrations: list[Registration | None],
+    anchors: tuple[Anchor, ...],
+    output: _Output,
 ) -> list[Status]:
     """Track the camera of a video, or of photos in their order, through a scene; return the frames' statuses."""
     from service.cli import result_tables
@@ -199,7 +211,7 @@ def _localize_sequence(
             say(result_tables.frame_line(frame_out(record.frame)))
 
     found, _ = run_task(photo.task(spec), [loaded], show, registrations=registrations)
-    result = result_out(found)
+    result = result_out(found, anchors)
     if output.as_json:
         print_json({"photo": body.name, **result.model_dump(mode="json")})
     if output.csv_file:

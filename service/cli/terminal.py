@@ -16,6 +16,7 @@ from service.errors import InvalidRequest
 if TYPE_CHECKING:
     from service.localize import LoadedScene
     from service.registration.registration import Registration
+    from service.scene_manager.anchor_store import Anchor
     from service.web.settings import Settings
 
 out, err = Console(), Console(stderr=True)
@@ -91,6 +92,16 @@ def scene_registrations(paths: Sequence[Path], loaded: Sequence[LoadedScene]) ->
 
     known = SceneRegistrations(registrations_folder())
     return [known.of(path, scene.scene.info) for path, scene in zip(paths, loaded, strict=True)]
+
+
+def scene_anchors(paths: Sequence[Path]) -> list[tuple[Anchor, ...]]:
+    """Return the anchors of scenes. Raises CorruptScene."""
+    from service.scene_manager.anchor_store import FileAnchorStore
+    from service.scene_manager.status import StoredScene
+
+    stored = {str(path): StoredScene(str(path), path) for path in paths}
+    store = FileAnchorStore(stored.get, registrations_folder())
+    return [store.anchors(scene_id) for scene_id in map(str, paths)]
 
 
 def registrations_folder() -> Path:
