@@ -91,6 +91,9 @@ class LensTestConfig:
     suspicious_loss: float = 0.03
     """Mean absolute residual (0..1) from which on matches are asked, too: most right answers with the right intrinsics
     have less."""
+    suspicious_loss_ratio: float = 0.98
+    """Residual that is left with other intrinsics, up to which matches are asked, too, where these move the pose: of 58
+    right answers with the right ones one has less."""
     contradicting_deg: float = 1.25
     contradicting_share: float = 0.0025
     """Motion of the pose beyond which wrong intrinsics matter: about half of what counts as right where the scene is

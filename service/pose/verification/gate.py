@@ -112,8 +112,8 @@ def verify(
     asked = AskedBounds.of(query.accuracy, typical_depth(frame))
     signals, uncertainty = _photometric_signals(images, pose, rendered, refinement, config)
     # Fresh matches cost most of a verification, but where the scene's model is poor only they show wrong intrinsics.
-    large_loss = uncertainty is None or uncertainty.loss > config.refinement.lens_test.suspicious_loss
-    if pixels_may_decide and not large_loss and photometric_suffices(signals, config):
+    undecided = uncertainty is None or _lens_is_undecided(uncertainty, asked.distance, config)
+    if pixels_may_decide and not undecided and photometric_suffices(signals, config):
         verdict = verdict_of(signals, uncertainty, asked, config=config)
         return _within_prior(replace(verdict, inliers=supporting_matches), images, pose)
     features, valid = images.features(), images.valid_mask(size)
@@ -149,6 +149,16 @@ def _photometric_signals(
             photo, frame, rendered.camera, answer, images.query.lens_prior, valid, refinement, config.refinement
         )
     return signals | geometry_signals(frame, size, uncertainty), uncertainty
+
+
+def _lens_is_undecided(uncertainty: PoseUncertainty, distance: float, config: VerificationConfig) -> bool:
+    """Return whether the pixels don't tell if exact intrinsics are right: matches may."""
+    fit, test = uncertainty.lens_fit, config.refinement.lens_test
+    if uncertainty.loss > test.suspicious_loss:
+        return True
+    if fit is None or fit.contradicts or fit.loss_ratio > test.suspicious_loss_ratio:
+        return False
+    return moves_pose(fit.motion, distance, test.contradicting_deg, test.contradicting_share)
 
 
 def _with_evidence_of_matches(
