@@ -88,14 +88,14 @@ def make_film(
     """
     rng = np.random.default_rng(seed)
     count = round(seconds * config.fps)
-    # Two walks in one: the jump leads to the far end of a longer path.
-    path = smooth_path(stations, units, 2 * count, SequenceConfig())
-    tremor = _tremor(2 * count, units, rng, config)
+    path = smooth_path(stations, units, count, SequenceConfig())
+    tremor = _tremor(count, units, rng, config)
     path = [moved(pose, twist) for pose, twist in zip(path, tremor, strict=True)]
     shots: list[Shot] = []
     later_s, where = 0.0, 0
     for part, share in config.parts:
-        where += count // 2 if part == "jumped" else 0
+        # Back: the way ahead may lead through what nobody captured.
+        where -= count // 2 if part == "jumped" else 0
         later_s += config.locked_s if part == "unlocked" else 0.0
         for number in range(round(share * count)):
             time_s = len(shots) / config.fps + later_s

@@ -6,6 +6,7 @@ import logging
 import os
 import socket
 import ssl
+import sys
 import threading
 import time
 import webbrowser
@@ -73,6 +74,9 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
         shell_key = key or ("$SPLATFIX_KEY" if keys else "")
         arguments = server, application, settings, (key, shell_key), out, err, browser
         threading.Thread(target=_announce, args=arguments, daemon=True).start()
+        # A thread that waits for the interpreter asks for it after 0.5 ms instead of 5: tracking is many short kernels,
+        # and behind another session each of them would wait for so long.
+        sys.setswitchinterval(0.0005)
         server.run(sockets=[listener])
 
 
