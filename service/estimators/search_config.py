@@ -79,6 +79,11 @@ class SearchConfig:
     """Local colour correlation, or correlation of the edges in colour, of which a pose that only colours speak against
     needs one to be compared with its rivals and taken for the end of the search: poses that are off by one thing of a
     row have 0.89 and 0.66 at most, right ones in a scene by another trainer 0.55 to 0.95 and 0.78 to 0.90."""
+    sure_local_colour: float = 0.97
+    least_colour_edges: float = 0.6
+    """Local colour correlation below which an accepted pose in a scene that repeats itself needs edges in colour that
+    correlate by this much: grey things of a row have 0.96 and 0.5, where the thing itself is missing; of 230 right
+    poses none is below both."""
     max_rival_ratio: float = 0.9
     """Dissimilarity of photo and render at a pose that only colours speak against, relative to that at its mirror image
     and at places that look like it: with less it is accepted. Of photos of a scene by another trainer right poses have

@@ -34,8 +34,8 @@ from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
 from service.pose.verification.ambiguity import explains_whole_photo, rank_answers
-from service.pose.verification.appearance import appearance, colour_edge_correlation
-from service.pose.verification.gate import downgraded, verify
+from service.pose.verification.appearance import LOCAL_COLOUR, appearance, colour_edge_correlation
+from service.pose.verification.gate import doubted, downgraded, verify
 from service.pose.verification.mirror_images import dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
 from service.types import IntrinsicsCorrection, Query
@@ -139,11 +139,21 @@ class SearchState:
         # A pose refined from a prior has no matches behind it.
         matches, unique = found.num_inliers or 0, is_unique or not self.tools.prepared.repeats_itself
         verdict = verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
+        if not unique and self._shows_other_colours(found, verdict):
+            verdict = doubted(verdict, Reason.RENDER_MISMATCH)
         if found.settled:
             return verdict
         # It still moves, however little one step of it says: with an estimated lens, along with the focal length.
         is_exact = images.query.lens_prior is None
         return downgraded(verdict, Reason.POSITION_UNCERTAIN if is_exact else Reason.FOCAL_UNCERTAIN)
+
+    def _shows_other_colours(self, found: RefinedPose, verdict: Verdict) -> bool:
+        """Return whether edges in colour speak against a place that the gate accepts, by less than sure colours."""
+        config, is_sure = self.config, verdict.signals[LOCAL_COLOUR] >= self.config.sure_local_colour
+        is_place = verdict.place_probability >= config.verification.min_localized
+        if is_sure or not is_place or verdict.status is Status.NOT_LOCALIZED:
+            return False
+        return self.colour_edges_at(found) < self.config.least_colour_edges
 
     def appearance_at(self, found: RefinedPose) -> dict[str, float]:
         """Return how alike photo and render are at a pose."""
@@ -220,9 +230,10 @@ def only_colours_doubt(state: SearchState, found: RefinedPose, verdict: Verdict)
         return False
     if config.model.probability(signals) < config.min_localized:
         return False
-    if config.model.below_floor(signals, light_may_differ=True):
+    # Without a signal below its floor the edges in colour are what speaks against the pose.
+    if config.model.below_floor(signals, light_may_differ=True) or not config.model.below_floor(signals):
         return False
-    if signals["local_colour_correlation"] >= state.config.min_repeated_colour:
+    if signals[LOCAL_COLOUR] >= state.config.min_repeated_colour:
         return True
     return state.colour_edges_at(found) >= state.config.min_colour_edges
 
