@@ -26,7 +26,7 @@ from service.pose.retrieval.ambiguous_hypotheses import (
     shifted_hypotheses,
 )
 from service.pose.verification.ambiguity import rank_answers
-from service.results import PoseEstimate, Reason, StageTiming, Status
+from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.tracking import Tracker
 from service.types import Camera, Intrinsics, Pose, Query
 from service.web.schemas.conversion import result_out
@@ -151,6 +151,21 @@ def test_colours_whose_edges_agree_are_accepted_in_any_light(symmetric: LoadedSc
     assert_near(painted.pose, truth)
     assert (painted.verdict.status, painted.verdict.reason) == (Status.UNCERTAIN, Reason.RENDER_MISMATCH)
     assert "check_rivals" not in stages(painted)
+
+
+def test_accepted_colours_need_edges_in_colour_unless_they_are_sure(symmetric: LoadedScene) -> None:
+    photo = recoloured(photo_at(symmetric, unseen_pose()), 0.4)
+
+    def verdict(**changed: float) -> Verdict:
+        config = replace(SEARCH, **changed)
+        return localize(photo, symmetric, Request(options=Options(effort="fast"), config=config)).verdict
+
+    # Seen: local colours of 0.943, edges of 0.73.
+    assert verdict().status is Status.LOCALIZED
+    other = verdict(least_colour_edges=0.8)
+    assert (other.status, other.reason) == (Status.UNCERTAIN, Reason.RENDER_MISMATCH)
+    assert other.covariance is not None
+    assert verdict(least_colour_edges=0.8, sure_local_colour=0.93).status is Status.LOCALIZED
 
 
 def test_other_colours_are_refused_where_the_mirror_image_fits_nearly_as_well(symmetric: LoadedScene) -> None:
