@@ -4,7 +4,8 @@ This is the composition root, where names of plug-ins become objects. Its driver
 clock, the budget and the cancel flag, stamps the records, and applies the same verification gate to every method. Jobs,
 CLI, bench and tests call `localize`; nothing else iterates an estimator.
 
-    from service.localize import LoadedScene, localize
+    from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+    from service.localize import localize
     from service.photos.images import read_query
     scene = LoadedScene.load(Path("scenes/studio"))
     estimate = localize(read_query(Path("photo.jpg").read_bytes()), scene)
@@ -18,199 +19,31 @@ import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
-from service.errors import BackendMissing, EstimatorFault, InvalidOptions
+from service.errors import EstimatorFault, InvalidOptions
 from service.estimators import ESTIMATORS
-from service.interfaces import Answer, ImageMatcher, Matcher, Rasterizer, RenderTally, Tools
-from service.matchers import MATCHERS
+from service.interfaces import Answer, Rasterizer, RenderTally, Tools
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.photos.intrinsics import taken_through
 from service.pose.absolute_pose.lens_prior import at_bounds
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
-from service.pose.features.untold_background import WHITE, has_white_border, shows_background
-from service.pose.retrieval.floaters import without_floaters
 from service.pose.retrieval.index import ViewIndex
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.captured_volume import is_outside
 from service.pose.verification.gate import VERIFICATION, doubted, downgraded, verify
-from service.render import RASTERIZERS
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
-from service.scene_formats import load_scene
-from service.scene_formats.cache import mapped_scene, release
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world
-from service.types import GaussianScene, Pose, Query
-
-DEFAULT_ESTIMATOR = "view_index"
-RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
-"""Where no rasterizer is named, the first one that can run here is used."""
-DEFAULT_MATCHER = "xfeat"
-WHITE_ASSUMED = (
-    "no file says which background the scene was trained on: white is assumed, for the photo's border is white; say "
-    '"background" in scene.json.'
-)
+from service.types import Pose, Query
 
 
 class Cancelled(Exception):
     """Raised by `localize` between two records after `Request.cancel` was set; the estimator is closed."""
-
-
-@dataclass(slots=True)
-class LoadedScene:
-    """A scene in memory with the tools bound to it. Shared by all jobs on it; safe from several threads."""
-
-    scene: GaussianScene
-    """As its file has it."""
-    rasterizer: Rasterizer
-    """Of the scene that photos are localized in: without floaters that veil it."""
-    matcher: Matcher
-    """The gate's, too; beside an `image_matcher` it is the default one."""
-    image_matcher: ImageMatcher | None = None
-    cache_dir: Path | None = None
-    """Folder in which view indexes and mapped scenes are kept between runs; None: nowhere."""
-    skipped_rasterizers: str = ""
-    """Why the rasterizer isn't an earlier one of RASTERIZER_ORDER."""
-    warnings: tuple[str, ...] = ()
-    """For every result."""
-    without_floaters: GaussianScene | None = None
-    """The scene that photos are localized in; None: it is all of `scene`."""
-    _prepared: dict[str, Any] = field(default_factory=dict)
-    _whole: Rasterizer | None = None
-    _over_white: LoadedScene | None = None
-    _lock: threading.Lock = field(default_factory=threading.Lock)
-
-    @classmethod
-    def load(
-        cls,
-        folder: Path,
-        *,
-        cache_dir: Path | None = None,
-        rasterizer: str | None = None,
-        matcher: str = DEFAULT_MATCHER,
-    ) -> LoadedScene:
-        """Read a scene folder (or a bare scene file) and bind tools to it.
-
-        Raises SceneError, UnknownName, and BackendMissing if the rasterizer that was named can't run.
-        """
-        scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
-        loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
-        release(scene)  # the rasterizer has its own copy
-        return loaded
-
-    @classmethod
-    def of(
-        cls,
-        scene: GaussianScene,
-        *,
-        cache_dir: Path | None = None,
-        rasterizer: str | None = None,
-        matcher: str = DEFAULT_MATCHER,
-    ) -> LoadedScene:
-        """Bind tools to a scene in memory. Raises UnknownName, and BackendMissing as `load`."""
-        features = images = MATCHERS.load(matcher).create()
-        if isinstance(images, ImageMatcher):
-            # Views are retrieved by features of single images, which a matcher of pairs does not have.
-            features = MATCHERS.load(DEFAULT_MATCHER).create()
-        else:
-            # It extracts features, which every method can use.
-            images = None
-        searched = without_floaters(scene)
-        renderer, skipped_rasterizers, warnings = _renderer(searched, rasterizer)
-        part = None if searched is scene else searched
-        return cls(scene, renderer, features, images, cache_dir, skipped_rasterizers, warnings, part)
-
-    @property
-    def searched(self) -> GaussianScene:
-        """The scene that photos are localized in."""
-        return self.without_floaters or self.scene
-
-    @property
-    def nbytes(self) -> int:
-        """Memory of the scene and its renderer; a mapped scene's is the kernel's to take back."""
-        whole = 0 if self._whole is None else self._whole.nbytes
-        return self.scene.nbytes + self.rasterizer.nbytes + whole
-
-    def for_display(self) -> Rasterizer:
-        """Return a rasterizer of the whole scene, floaters included, made when it is first needed."""
-        if self.without_floaters is None:
-            return self.rasterizer
-        with self._lock:
-            if self._whole is None:
-                self._whole = self.rasterizer.of(self.scene)
-            return self._whole
-
-    def prepare(self, estimator: str) -> Any:
-        """Return what the estimator prepares for this scene (e.g. its view index), made once."""
-        make = getattr(ESTIMATORS.load(estimator), "prepare", None)
-        if make is None:
-            return None
-        with self._lock:
-            if estimator not in self._prepared:
-                # A seed of its own: what a scene has prepared must not depend on the photo that came first.
-                tools = Tools(self.searched, self.rasterizer, self.matcher, np.random.default_rng(0), None)
-                self._prepared[estimator] = make(tools, self.cache_dir)
-                # It was read through for the index; from now on the renderer's copy is used.
-                release(self.scene)
-            return self._prepared[estimator]
-
-    def as_seen_by(self, query: Query) -> LoadedScene:
-        """Return this scene, over white where its background is untold, shows, and is white in the photo.
-
-        The first such photo has the scene's view index made again, over white.
-        """
-        info = self.scene.info
-        if info.background_is_known or info.background_rgb == WHITE:
-            return self
-        if not has_white_border(query.rgb, query.valid_mask):
-            return self
-        index = self.prepare(DEFAULT_ESTIMATOR)
-        with self._lock:
-            # Whether the background shows at all is asked of the views once: a room hides it everywhere.
-            if self._over_white is None:
-                shown = shows_background(self.rasterizer, [view.camera for view in index.views])
-                self._over_white = self._over(WHITE) if shown else self
-            return self._over_white
-
-    def _over(self, background_rgb: tuple[float, float, float]) -> LoadedScene:
-        """Return the scene over an assumed background, in the same memory."""
-        info = replace(self.scene.info, background_rgb=background_rgb)
-        said = (*self.warnings, WHITE_ASSUMED)
-        return replace(
-            self, scene=replace(self.scene, info=info),
-            without_floaters=self.without_floaters and replace(self.without_floaters, info=info),
-            rasterizer=self.rasterizer.over(background_rgb), warnings=said,
-            _prepared={}, _whole=None, _over_white=None, _lock=threading.Lock(),
-        )  # fmt: skip
-
-
-def choose_rasterizer() -> tuple[str, str]:
-    """Return the rasterizer for scenes that name none, and why it isn't an earlier one of RASTERIZER_ORDER."""
-    reasons = []
-    for name in RASTERIZER_ORDER:
-        reason = RASTERIZERS.missing(name)
-        if reason is None:
-            return name, "; ".join(reasons)
-        reasons.append(f"{name}: {reason}")
-    raise BackendMissing("; ".join(reasons), where="render")
-
-
-def _renderer(scene: GaussianScene, name: str | None) -> tuple[Rasterizer, str, tuple[str, ...]]:
-    """Return the rasterizer, why it isn't an earlier one of RASTERIZER_ORDER, and what results should warn of."""
-    if name:
-        return RASTERIZERS.load(name).create(scene), "", ()
-    name, skipped_rasterizers = choose_rasterizer()
-    try:
-        return RASTERIZERS.load(name).create(scene), skipped_rasterizers, ()
-    except BackendMissing as error:  # the GPU's memory may be full
-        last = RASTERIZER_ORDER[-1]
-        if name == last:
-            raise
-        return RASTERIZERS.load(last).create(scene), str(error), (f"rendered with {last}: {error}",)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, Request, localize
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+from service.localize import Request, localize
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages

@@ -22,10 +22,10 @@ import numpy as np
 
 from service.geometry import moved, pose_distance, se3_log
 from service.interfaces import Frame, Rasterizer, RenderTally
+from service.loaded_scene import LoadedScene
 from service.localize import (
     Cancelled,
     Clock,
-    LoadedScene,
     Request,
     asked_of,
     estimate_of,

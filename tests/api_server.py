@@ -31,7 +31,7 @@ import service.estimators
 import service.web.app
 from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.engine import Engine
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.web.api_keys import KeyRing
 from service.web.schemas.error_examples import EXAMPLES
 from service.web.settings import Settings

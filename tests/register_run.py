@@ -80,7 +80,8 @@ def localized(folder: Path, count: int) -> Photos:
     """Return a scene's test photos with their true poses, and as they are localized."""
     # Here: tests/test_registration.py uses the rest, and needn't wait for the engine.
     from service.bench.bench_photos import find_photos
-    from service.localize import LoadedScene, localize
+    from service.loaded_scene import LoadedScene
+    from service.localize import localize
     from service.photos.images import read_query
     from service.results import Status
     from service.scene_formats import load_scene

@@ -12,7 +12,7 @@ import numpy as np
 import service.estimators
 from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.jobs.embedded_engine import EmbeddedEngine
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
 PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)

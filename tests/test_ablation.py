@@ -13,7 +13,8 @@ from test_estimators import LENS_UPRIGHT, photo_at, unseen_pose
 from service.bench.ablation import CONDITIONS, Removal, removals, run, table, unscaled_dilation
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.match_stages import MATCHING, solve_matches_near

@@ -13,7 +13,8 @@ from test_reasons import BEFORE_A_WALL, FAST, middle_of_a_wall, with_a_wrong_len
 from service.accuracy import Accuracy
 from service.errors import InvalidAccuracy
 from service.geometry import moved, pose_distance, se3_exp
-from service.localize import LoadedScene, Request, localize, render_and_verify
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize, render_and_verify
 from service.pose.features.query_images import QueryImages
 from service.pose.verification.gate import VERIFICATION, doubted
 from service.pose.verification.precision import probability_within

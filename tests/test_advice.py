@@ -15,7 +15,8 @@ from test_reasons import BEFORE_A_WALL, FAR_OUTSIDE, middle_of_a_wall, with_any_
 
 from service.geometry import look_at, moved
 from service.interfaces import Frame, Rasterizer
-from service.localize import LoadedScene, Request, localize, render_and_verify
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize, render_and_verify
 from service.pose.features.query_images import QueryImages
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.photo_quality import blur_effect, photo_faults

@@ -33,7 +33,7 @@ from PIL import Image
 from stand_ins import HALF, PHOTO, TURNED, BlindMatcher, make_scene
 
 import service.estimators
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web import hints
 from service.web.schemas import resources

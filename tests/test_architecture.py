@@ -28,7 +28,7 @@ FLOORS = {
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
-        {"localize"},
+        {"localize", "loaded_scene"},
         {"tracking", "smoothing", "multi_scene", "coverage"},
         {"scene_manager", "live"},
         {"jobs"},
@@ -56,6 +56,7 @@ FLOORS = {
 SAME_FLOOR = {
     "service": {
         ("types", "errors"),
+        ("localize", "loaded_scene"),
         ("types", "accuracy"),
         ("accuracy", "errors"),
         ("types", "distortion"),

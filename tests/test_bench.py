@@ -24,7 +24,7 @@ from service.bench.start_poses import KINDS, start_pose
 from service.errors import CorruptScene, InvalidOptions, SceneNotFound, UnknownName
 from service.geometry import look_at, moved, pose_distance, project, rotation_from_quat, so3_log, transformed
 from service.interfaces import Frame
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image, read_query, with_palette
 from service.pose.features.scene_focus import centre_depth
 from service.results import PoseEstimate, Reason, Status, Verdict

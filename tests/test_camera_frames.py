@@ -15,7 +15,7 @@ from test_numbers import write_moved
 
 from service.codec import decode, encode
 from service.geometry import so3_exp
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.pose.retrieval.viewpoints import index_cameras
 from service.scene_formats import load_scene

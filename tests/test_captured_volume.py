@@ -7,7 +7,8 @@ import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service.geometry import look_at, pose_distance
-from service.localize import LoadedScene, localize
+from service.loaded_scene import LoadedScene
+from service.localize import localize
 from service.pose.verification.captured_volume import captured_share, is_outside
 from service.results import Reason, Status
 from service.types import Camera, Intrinsics, Pose, Query

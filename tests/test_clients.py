@@ -19,7 +19,7 @@ from api_server import ROOT, assert_problem, create_app, serving, settings, unti
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 
 from service.geometry import look_at, rotation_from_quat
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.types import Camera, Intrinsics
 from service.web.api_keys import add_key

@@ -31,7 +31,8 @@ from service.coverage.plan_drawing import drawn_plan, level_colour
 from service.coverage.spoilt_photos import SPOIL, spoilt_photo
 from service.errors import CorruptScene
 from service.geometry import look_at, moved, project, transformed
-from service.localize import Cancelled, LoadedScene, Request
+from service.loaded_scene import LoadedScene
+from service.localize import Cancelled, Request
 from service.pose.retrieval.free_space import free_space_of
 from service.results import Status
 from service.types import Camera, Intrinsics, Pose

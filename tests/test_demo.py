@@ -25,7 +25,8 @@ from documents import blocks, lines_of
 
 from service import jit
 from service.geometry import moved, pose_distance
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.photos.images import read_query
 from service.types import Intrinsics, Pose
 

@@ -36,7 +36,7 @@ import service.scene_manager.scene_store
 from service.codec import encode
 from service.errors import BadInput, SceneError, SplatfixError
 from service.estimators import ESTIMATORS
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.scene_manager.entry import Entry
 from service.web.api_keys import add_key
 from service.web.schemas.error_examples import EXAMPLES

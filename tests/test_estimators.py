@@ -17,7 +17,8 @@ from service.estimators import ESTIMATORS
 from service.estimators.search_config import SEARCH
 from service.geometry import moved, pose_distance
 from service.interfaces import RenderTally, Tools
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.multi_scene import localize_in_scenes
 from service.pose.descent.gradient_descent import loss_and_gradient
 from service.pose.descent.losses import LOSSES, loss_against

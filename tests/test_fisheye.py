@@ -12,7 +12,8 @@ from test_estimators import photo_at, unseen_pose
 
 from service.estimators.view_index import Options
 from service.geometry import pose_distance
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.photos.images import query_of
 from service.pose.absolute_pose.fisheye import LensModels, fit_lens_models
 from service.pose.absolute_pose.pnp import AbsolutePose

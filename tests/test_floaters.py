@@ -9,7 +9,8 @@ import pytest
 
 from service.cli.scene_facts import as_lines, scene_facts
 from service.geometry import pose_distance
-from service.localize import LoadedScene, localize
+from service.loaded_scene import LoadedScene
+from service.localize import localize
 from service.pose.retrieval import floaters as module
 from service.pose.retrieval.floaters import FLOATERS, find_floaters, veil, without_floaters
 from service.render.cpu import CpuRasterizer

@@ -14,7 +14,8 @@ from small_room import FOCAL, HEIGHT, SIZE, WIDTH, pose_at, write_room
 from service.estimators.search_config import SEARCH
 from service.geometry import look_at, pose_distance, project, transformed
 from service.interfaces import Features
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.pose.features.rendered_views import View, to_uint8
 from service.pose.matching.match_stages import MATCHING, match_candidates
 from service.pose.retrieval.free_views import FREE_VIEWS, FreeViews, free_view_cameras

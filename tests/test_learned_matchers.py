@@ -17,7 +17,8 @@ from service.errors import BackendMissing, InvalidOptions
 from service.estimators import ESTIMATORS
 from service.geometry import moved
 from service.interfaces import ImageMatcher, ImagePairs, Matcher
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.matchers import MATCHERS, networks, xfeat
 from service.results import Status
 

@@ -17,7 +17,8 @@ import service.localize
 from service.accuracy import Accuracy
 from service.estimators.search_config import SEARCH
 from service.geometry import pose_distance, se3_log
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.photos.images import read_query
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose import lens_prior, pnp

@@ -16,7 +16,7 @@ from playwright.sync_api import Browser, Page, expect
 from small_room import FOCAL, pose_at, write_room
 
 from service.geometry import moved, pose_distance
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.types import Camera, Intrinsics, Pose
 from service.web.app import create_app

@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import service.loaded_scene
 import service.localize
 from service.errors import BackendMissing, EstimatorFault
 from service.geometry import moved
 from service.interfaces import Features, Frame, SceneGradients
-from service.localize import Cancelled, LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Cancelled, Request, localize
 from service.results import IterationRecord, Reason, Status
 from service.types import Camera, GaussianScene, Intrinsics, IntrinsicsCorrection, Pose, Query, SceneInfo
 
@@ -94,7 +96,8 @@ def loaded() -> LoadedScene:
 
 
 def use(monkeypatch: pytest.MonkeyPatch, script: Script) -> Script:
-    monkeypatch.setattr(service.localize, "ESTIMATORS", SimpleNamespace(load=lambda name: script))
+    for module in (service.localize, service.loaded_scene):
+        monkeypatch.setattr(module, "ESTIMATORS", SimpleNamespace(load=lambda name: script))
     return script
 
 
@@ -263,7 +266,7 @@ class Gpu:
     ],
 )
 def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expected, skipped_rasterizers, warned):
-    monkeypatch.setattr(service.localize, "RASTERIZERS", gpu)
+    monkeypatch.setattr(service.loaded_scene, "RASTERIZERS", gpu)
     use(monkeypatch, Script(1))
     bound = LoadedScene.of(loaded.scene, rasterizer=named)
     assert (bound.rasterizer.name, bound.skipped_rasterizers) == (expected, skipped_rasterizers)
@@ -273,6 +276,6 @@ def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expect
 
 
 def test_a_gpu_that_was_asked_for_is_no_other(monkeypatch, loaded):
-    monkeypatch.setattr(service.localize, "RASTERIZERS", Gpu(full=True))
+    monkeypatch.setattr(service.loaded_scene, "RASTERIZERS", Gpu(full=True))
     with pytest.raises(BackendMissing, match="no memory"):
         LoadedScene.of(loaded.scene, rasterizer="gsplat_cuda")

@@ -14,7 +14,8 @@ from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.estimators.search_config import SEARCH
 from service.geometry import project, transformed
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.results import Reason, Status

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from small_room import INTRINSICS, pose_at, write_room
 
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.photos.images import open_photo, query_of
 from service.results import Status
 from service.scene_formats import load_scene

@@ -25,7 +25,7 @@ from service.coverage.calibration import Calibration
 from service.coverage.coverage_map import CoverageMap, Trial
 from service.coverage.measurement import Measurement
 from service.geometry import look_at, rotation_from_quat
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.results import Status
 from service.types import Pose
 from service.web.api_keys import KeyRing, add_key

@@ -13,7 +13,8 @@ from service.accuracy import Accuracy
 from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.pose.absolute_pose.prior_region import distance_outside, inside_prior, widened_prior
 from service.results import PoseEstimate, Reason, Status
 from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion

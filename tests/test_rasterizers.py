@@ -18,7 +18,7 @@ from test_documented_numbers import numbers, rows_of
 
 from service.geometry import look_at, moved, se3_exp
 from service.interfaces import Frame, Rasterizer
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.render import RASTERIZERS
 from service.render.cpu import CpuRasterizer, dilation_for
 from service.render.gsplat_cuda import GsplatRasterizer

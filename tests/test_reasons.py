@@ -14,7 +14,8 @@ from test_fisheye import CAMERA, NEITHER, taken_through
 
 from service.estimators.view_index import Options
 from service.geometry import look_at
-from service.localize import LoadedScene, Request, localize, render_and_verify
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize, render_and_verify
 from service.photos.images import query_of
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages

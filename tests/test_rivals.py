@@ -15,7 +15,8 @@ from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance, project, transformed
 from service.interfaces import Features, Matcher
 from service.jobs.model import JobResult
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.matchers.mutual import mutual_nearest
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.rendered_views import View

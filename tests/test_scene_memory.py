@@ -12,7 +12,7 @@ from api_server import assert_problem, create_app, finished, post, serving, sett
 from test_scenes import TRANSFORMS, ply
 
 from service.errors import SceneTooLarge, SplatfixError
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.scene_formats.size_estimate import estimated_bytes
 from service.scene_manager import entry as entries
 from service.scene_manager.entry import Entry

@@ -17,7 +17,7 @@ from api_server import assert_problem, create_app, finished, post, serving, sett
 from stand_ins import make_scene
 
 from service.errors import BadInput, CorruptScene, InvalidRequest, UnsupportedFormat
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
 from service.scene_manager.entry import Entry

@@ -30,7 +30,8 @@ from service.live.live_tracker import LIVE, LiveTracker
 from service.live.live_values import LiveAnswer as Live
 from service.live.live_values import LiveFrame, LiveTask
 from service.live_client import LiveAnswer
-from service.localize import Cancelled, LoadedScene, Request, render_and_verify
+from service.loaded_scene import LoadedScene
+from service.localize import Cancelled, Request, render_and_verify
 from service.photos.camera_identity import CameraIdentity
 from service.photos.images import encode_image, query_of, read_query
 from service.photos.sequence import SequencePhoto

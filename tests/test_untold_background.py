@@ -9,7 +9,8 @@ import pytest
 
 from service.bench.render import synthetic_room
 from service.geometry import look_at, pose_distance
-from service.localize import WHITE_ASSUMED, LoadedScene, localize
+from service.loaded_scene import WHITE_ASSUMED, LoadedScene
+from service.localize import localize
 from service.pose.features.untold_background import WHITE, has_white_border
 from service.render.cpu import CpuRasterizer
 from service.results import Status

@@ -20,7 +20,8 @@ from service.bench.pose_metrics import COARSE, FINE, Outcome, errors
 from service.errors import UnknownName
 from service.estimators import view_index
 from service.estimators.search_config import SEARCH, SearchConfig
-from service.localize import DEFAULT_ESTIMATOR, Request
+from service.loaded_scene import DEFAULT_ESTIMATOR
+from service.localize import Request
 from service.pose.refinement.refinement_config import REFINEMENT, PyramidConfig
 from service.pose.retrieval.scores import ScoreConfig
 from service.pose.verification.appearance import LOCAL_COLOUR

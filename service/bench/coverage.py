@@ -12,7 +12,7 @@ from service.coverage.calibration import brier_score, left_out
 from service.coverage.coverage_map import FOUND_AT, CoverageMap
 from service.coverage.held_out_photos import held_out_photos
 from service.coverage.measurement import Measurement, measured_coverage
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 
 Progress = Callable[[str, int, int], None]
 

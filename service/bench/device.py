@@ -13,7 +13,8 @@ import numpy as np
 
 from service.bench.localize import BenchScene, Trial, load_bench_scene, localize_trial, make_trials, measure
 from service.bench.pose_metrics import summary
-from service.localize import DEFAULT_ESTIMATOR, Request
+from service.loaded_scene import DEFAULT_ESTIMATOR
+from service.localize import Request
 from service.render import RASTERIZERS
 from service.results import PoseEstimate
 from service.versions import versions

@@ -25,7 +25,8 @@ from service.bench.localize import BenchScene, load_bench_scene, read_occluders,
 from service.bench.modified_photo import Photo
 from service.bench.paper.runs import code_digest, read_lines
 from service.errors import InvalidRequest
-from service.localize import DEFAULT_ESTIMATOR, Request
+from service.loaded_scene import DEFAULT_ESTIMATOR
+from service.localize import Request
 
 
 @dataclass(frozen=True, slots=True)

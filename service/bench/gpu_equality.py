@@ -19,7 +19,8 @@ from service.bench.modifications import Photo, modify
 from service.bench.pose_metrics import errors
 from service.geometry import moved
 from service.interfaces import Frame, Rasterizer
-from service.localize import LoadedScene, localize
+from service.loaded_scene import LoadedScene
+from service.localize import localize
 from service.photos.images import encode_image, read_query
 from service.results import Status
 from service.types import Camera, GaussianScene

@@ -16,7 +16,7 @@ from service.bench.large_scenes import keep_most_contributing, surround_with_cop
 from service.bench.scale import process_memory
 from service.errors import BackendMissing
 from service.interfaces import Frame
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, choose_rasterizer
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene, choose_rasterizer
 from service.types import Camera, GaussianScene
 
 JOBS_AT_A_TIME = 4

@@ -16,7 +16,8 @@ from service import __version__
 from service.bench.bench_photos import BenchPhoto, find_photos
 from service.bench.gpu_runner import Row
 from service.bench.pose_metrics import Units, units_of
-from service.localize import LoadedScene, localize
+from service.loaded_scene import LoadedScene
+from service.localize import localize
 from service.photos.images import read_query
 from service.pose.features.scene_focus import centre_depth
 from service.render import RASTERIZERS

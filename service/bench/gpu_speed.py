@@ -13,7 +13,7 @@ import numpy as np
 from service.bench.gpu_runner import Row
 from service.bench.gpu_shared import Shared
 from service.interfaces import Tools
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.pose.retrieval.index import prepared_index
 
 

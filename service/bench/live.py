@@ -27,7 +27,7 @@ from service.bench.pose_metrics import COARSE, FINE, Units, errors, units_of
 from service.client import Client, ServiceError
 from service.errors import SceneNotFound
 from service.live_client import Live, LiveAnswer, LiveClosed
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.operating_system import keep_to_cores
 from service.pose.features.scene_focus import centre_depth
 from service.scene_formats import load_scene

@@ -27,7 +27,8 @@ from service.bench.start_poses import require_kind, start_pose
 from service.errors import SceneNotFound
 from service.estimators import ESTIMATORS
 from service.interfaces import Rasterizer
-from service.localize import DEFAULT_MATCHER, LoadedScene, Request, localize
+from service.loaded_scene import DEFAULT_MATCHER, LoadedScene
+from service.localize import Request, localize
 from service.photos.images import read_query
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.scene_focus import centre_depth

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from service.geometry import look_at
 from service.interfaces import Rasterizer
-from service.localize import choose_rasterizer
+from service.loaded_scene import choose_rasterizer
 from service.render import RASTERIZERS
 from service.types import Camera, GaussianScene, Intrinsics, SceneInfo
 

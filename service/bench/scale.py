@@ -23,7 +23,8 @@ import numpy as np
 from service.bench.bench_photos import find_photos
 from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, units_of
 from service.errors import BackendMissing, InvalidRequest
-from service.localize import DEFAULT_ESTIMATOR, LoadedScene, localize
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+from service.localize import localize
 from service.photos.images import read_query
 from service.pose.features.scene_focus import centre_depth
 from service.scene_formats import load_scene

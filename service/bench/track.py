@@ -21,7 +21,8 @@ from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, nee
 from service.errors import SceneNotFound
 from service.geometry import pose_distance, quat_from_rotation, rotation_from_quat
 from service.interfaces import Rasterizer
-from service.localize import LoadedScene, Request
+from service.loaded_scene import LoadedScene
+from service.localize import Request
 from service.photos.images import encode_image, read_query
 from service.photos.sequence import PHOTO_LONG_SIDE
 from service.pose.features.scene_focus import centre_depth

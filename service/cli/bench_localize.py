@@ -48,7 +48,7 @@ def bench_localize(
     """Localize a scene's test photos and compare with the truth."""
     from service.bench import miss_images
     from service.bench.localize import Budget, run
-    from service.localize import DEFAULT_MATCHER
+    from service.loaded_scene import DEFAULT_MATCHER
     from service.web.schemas.job_spec import accuracy_from, options_from
 
     print_machine()

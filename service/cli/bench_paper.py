@@ -36,7 +36,7 @@ def bench_paper(
     """Reproduce the paper: methods x scenes x protocols, then its tables and figures."""
     from service.bench.paper import runs
     from service.bench.paper.plan import chosen
-    from service.localize import DEFAULT_MATCHER
+    from service.loaded_scene import DEFAULT_MATCHER
 
     spec = runs.RunSpec(
         scenes=scene_arguments(scenes),

@@ -20,7 +20,7 @@ from service import __version__
 from service.bench.render import room_cameras, synthetic_room
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
-from service.localize import DEFAULT_MATCHER, choose_rasterizer
+from service.loaded_scene import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
 from service.operating_system import load_averages, missing_limits
 from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR

@@ -27,7 +27,7 @@ from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
     from service.jobs.model import JobRecord
-    from service.localize import LoadedScene
+    from service.loaded_scene import LoadedScene
     from service.registration.registration import Registration
     from service.results import Status
     from service.scene_manager.anchor_store import Anchor
@@ -82,7 +82,7 @@ def localize(
 
     The exit code is 0 also for photos that are not localized, unless --fail is given; 2 for an error.
     """
-    from service.localize import DEFAULT_ESTIMATOR
+    from service.loaded_scene import DEFAULT_ESTIMATOR
     from service.photos.sequence import is_sequence
     from service.results import Status
     from service.scene_formats.discovery import find_scenes

@@ -10,7 +10,8 @@ import numpy as np
 from service.cli.terminal import registrations_folder, settings_of
 from service.coverage.coverage_cache import coverage_file, read_coverage
 from service.coverage.held_out_photos import held_out_photos
-from service.localize import ASSUMED_TRAINING_PX, choose_rasterizer
+from service.loaded_scene import choose_rasterizer
+from service.localize import ASSUMED_TRAINING_PX
 from service.pose.retrieval.floaters import find_floaters, without_floaters
 from service.pose.retrieval.view_placement import coverage, find_views
 from service.pose.retrieval.viewpoints import index_cameras

@@ -11,7 +11,7 @@ from service.cli.terminal import JsonFileOption, counter, loaded_scene, progress
 
 if TYPE_CHECKING:
     from service.coverage.coverage_map import CoverageMap
-    from service.localize import LoadedScene
+    from service.loaded_scene import LoadedScene
 
 
 def scene_coverage(
@@ -21,7 +21,7 @@ def scene_coverage(
     again: Annotated[bool, typer.Option("--again", help="Measure anew, also where a map is stored.")] = False,
 ) -> None:
     """Measure where a photo of a scene would be found: localizes renders made as photos are, and held-out photos."""
-    from service.localize import DEFAULT_ESTIMATOR
+    from service.loaded_scene import DEFAULT_ESTIMATOR
 
     loaded = loaded_scene(scene, DEFAULT_ESTIMATOR)
     found = _coverage(scene, loaded, again)

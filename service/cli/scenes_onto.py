@@ -9,7 +9,8 @@ from rich.progress import track
 
 from service.cli.terminal import err, loaded_scene, scene_registrations
 from service.errors import RegistrationFailed
-from service.localize import LoadedScene, localize
+from service.loaded_scene import LoadedScene
+from service.localize import localize
 from service.photos.images import read_query
 from service.pose.retrieval.view_placement import find_views
 from service.registration.gathering import LocalizedPhoto

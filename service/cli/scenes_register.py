@@ -23,7 +23,7 @@ from service.cli.terminal import (
 from service.errors import InvalidRequest, RegistrationFailed
 
 if TYPE_CHECKING:
-    from service.localize import LoadedScene
+    from service.loaded_scene import LoadedScene
     from service.registration.gathering import GatherOptions, LocalizedPhoto
     from service.registration.known_places.known_place import KnownPlace, KnownPlaces
     from service.registration.known_places.scene_points import ScenePoints

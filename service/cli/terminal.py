@@ -14,7 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from service.errors import InvalidRequest
 
 if TYPE_CHECKING:
-    from service.localize import LoadedScene
+    from service.loaded_scene import LoadedScene
     from service.registration.registration import Registration
     from service.scene_manager.anchor_store import Anchor
     from service.web.settings import Settings
@@ -75,7 +75,7 @@ def read_file(path: Path) -> bytes:
 
 def loaded_scene(scene: Path, estimator: str | None = None, matcher: str = "") -> LoadedScene:
     """Load a scene, and prepare it for the estimator, if one is given. Raises SceneError, BackendMissing."""
-    from service.localize import LoadedScene
+    from service.loaded_scene import LoadedScene
 
     with err.status(f"reading {scene}") as status:
         settings = settings_of({"matcher": matcher} if matcher else {})

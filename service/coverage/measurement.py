@@ -17,7 +17,8 @@ from service.coverage.held_out_photos import HeldOutPhoto
 from service.coverage.plan import PLAN, PlanConfig, find_places, novelty, spread
 from service.coverage.spoilt_photos import SPOIL, SpoilConfig, spoilt_photo
 from service.geometry import pose_distance
-from service.localize import DEFAULT_ESTIMATOR, Cancelled, LoadedScene, Request, localize_in_scene
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+from service.localize import Cancelled, Request, localize_in_scene
 from service.photos.images import read_query
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.rendered_views import View

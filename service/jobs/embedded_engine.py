@@ -16,7 +16,8 @@ from service.jobs.model import JobRecord, JobResult
 from service.jobs.trajectory import Trajectory
 from service.live.live_tracker import LiveTracker
 from service.live.live_values import LiveTask
-from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene, Request, localize
+from service.loaded_scene import DEFAULT_ESTIMATOR, DEFAULT_MATCHER, LoadedScene
+from service.localize import Request, localize
 from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import read_sequence
 from service.registration.registration import Registration

@@ -18,7 +18,8 @@ from dataclasses import dataclass, replace
 from service.errors import InvalidImage
 from service.live.background import Background
 from service.live.live_values import LiveAnswer, LiveFrame, LiveTask, Mode
-from service.localize import Cancelled, LoadedScene, Request, asked_of, localize_in_scene, rasterizer_for
+from service.loaded_scene import LoadedScene
+from service.localize import Cancelled, Request, asked_of, localize_in_scene, rasterizer_for
 from service.localize import render_and_verify as verify_whole
 from service.photos.images import photo_size, read_query
 from service.photos.sequence import PHOTO_LONG_SIDE

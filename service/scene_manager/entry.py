@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from service.errors import Failure
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.scene_formats.size_estimate import estimated_bytes
 from service.scene_manager.status import SceneState, SceneStatus
 

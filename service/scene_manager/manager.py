@@ -27,7 +27,7 @@ from service.errors import (
     SceneUnloaded,
     SplatfixError,
 )
-from service.localize import DEFAULT_MATCHER, LoadedScene
+from service.loaded_scene import DEFAULT_MATCHER, LoadedScene
 from service.scene_manager.entry import Entry
 from service.scene_manager.memory_limit import MemoryLimit
 from service.scene_manager.status import AUTO, SceneContents, SceneReadiness

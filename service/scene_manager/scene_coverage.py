@@ -14,7 +14,8 @@ from service.coverage.coverage_map import CoverageMap
 from service.coverage.held_out_photos import HeldOutPhoto, held_out_photos
 from service.coverage.measurement import Measurement, measured_coverage
 from service.errors import Failure, SplatfixError
-from service.localize import Cancelled, LoadedScene
+from service.loaded_scene import LoadedScene
+from service.localize import Cancelled
 from service.scene_manager.manager import Scenes
 from service.scene_manager.status import CoverageStatus
 

@@ -7,7 +7,7 @@ import io
 import numpy as np
 
 from service.errors import InvalidIntrinsics
-from service.localize import LoadedScene
+from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.scene_manager.status import PictureFormat, PictureSpec
 from service.scene_manager.warm_up import overview

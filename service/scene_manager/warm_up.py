@@ -9,7 +9,8 @@ import numpy as np
 
 from service.errors import InvalidPrior
 from service.geometry import look_at
-from service.localize import LoadedScene, Request, localize
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.types import Camera, Intrinsics, Query
 
 ENOUGH_RENDERS = 10

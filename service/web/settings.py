@@ -15,7 +15,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettin
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EngineConfig
 from service.jobs.read_photo import MAX_FRAMES
-from service.localize import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
+from service.loaded_scene import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 from service.operating_system import available_cores
 
 _PREFIX = "SPLATFIX_"

@@ -20,7 +20,7 @@ from service.errors import (
 from service.estimators import ESTIMATORS
 from service.geometry import rotation_from_quat
 from service.jobs.model import JobSpec
-from service.localize import DEFAULT_ESTIMATOR
+from service.loaded_scene import DEFAULT_ESTIMATOR
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.prior_region import inside_prior
 from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion

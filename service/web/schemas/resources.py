@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from service.errors import JobNotReady, NoPose
 from service.estimators import ESTIMATORS
 from service.jobs.model import JobRecord, JobResult, StoredJob
-from service.localize import choose_rasterizer
+from service.loaded_scene import choose_rasterizer
 from service.matchers import MATCHERS
 from service.plugins import PluginRegistry
 from service.render import RASTERIZERS
