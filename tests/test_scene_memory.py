@@ -65,6 +65,7 @@ def test_a_photo_waits_until_the_scene_in_use_makes_room(stepping, folder, size)
         stepping.GO_ON.set()
         assert finished(client, held)["state"] == "succeeded"
         assert finished(client, waiting.headers["location"])["state"] == "succeeded"
+        until(lambda: states(client)["hall"] == "ready")
         assert states(client) == {"attic": "unloaded", "cellar": "unloaded", "hall": "ready", "tower": "unloaded"}
         # Nobody holds a scene any more: neither who was cancelled nor who was late.
         assert all(scene["jobs"] == 0 for scene in client.get("/scenes").json()["scenes"])
