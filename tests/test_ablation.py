@@ -45,6 +45,7 @@ def without(part: str, room: LoadedScene, query: Query | None = None) -> PoseEst
     )
 
 
+@pytest.mark.ci
 def test_what_is_removed_leaves_no_trace(room: LoadedScene) -> None:
     whole = without("nothing", room)
     refined = [record.loss for record in whole.records if record.stage == "refine"]

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from api_server import ROOT, assert_problem, create_app, serving, settings, until_ready
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
+from test_scenes import ply
 
 from service.geometry import look_at, rotation_from_quat
 from service.loaded_scene import LoadedScene
@@ -35,12 +36,12 @@ EAST_TURNED = [[0, -2, 0, 5], [2, 0, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]
 def place(tmp_path_factory) -> Iterator[tuple[httpx.Client, str, Path]]:
     """A service with keys on a room that has a place on Earth; its photo; a folder to work in."""
     folder = tmp_path_factory.mktemp("place")
-    room = write_room(folder / "room")
+    room = write_room(folder / "room", cameras=10)
     anchor = {"latitude": 10.0, "longitude": 20.0, "height": 30.0, "enu_from_world": EAST_TURNED}
     (room / "scene.json").write_text(json.dumps({"geo_anchor": anchor}))
     frame = LoadedScene.load(room).rasterizer.render([Camera(CAMERA, TRUTH)])[0]
     (folder / "photo.jpg").write_bytes(encode_image(frame.rgb, quality=95))
-    shutil.copy(room / "scene.ply", folder / "scene.ply")
+    (folder / "scene.ply").write_bytes(ply())  # to be uploaded
     key = add_key(folder / "keys.json", "tester", "admin")
     changes = {"estimator": "view_index", "scenes": [room], "cache_dir": folder / "cache"}
     with serving(create_app(settings(**changes, keys_file=folder / "keys.json"))) as client:
