@@ -68,7 +68,7 @@ export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit }) {
   const width = (bounds[0][1] - bounds[0][0]) * scale + 2 * MARGIN;
   const px = p => [MARGIN + (p.x - bounds[0][0]) * scale, MARGIN + (bounds[1][1] - p.y) * scale];
   const ray = 0.03 * (SIZE - 2 * MARGIN);
-  return svg("svg", { viewBox: `0 0 ${Math.max(width, 260).toFixed(1)} ${height.toFixed(1)}`, class: "plan", role: "img", "aria-label": "Plan of the scene" },
+  return svg("svg", { viewBox: `0 0 ${Math.max(width, 260).toFixed(1)} ${height.toFixed(1)}`, class: "plan", role: found.length ? "group" : "img", "aria-label": "Plan of the scene" },
     svg("g", { class: "cells" }, cells.map(c => star(px(c), 0.46 * map.cell * scale, map.headings_deg, c.cell.probabilities))),
     svg("g", { class: "cameras" }, views.map(v => arrow(px(v), v, 0.7 * ray))),
     svg("g", { class: "jobs" }, found.map(f => svg("a", { href: f.job.href },
