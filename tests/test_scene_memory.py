@@ -116,6 +116,19 @@ def test_a_failed_load_is_tried_again_by_a_later_request(stepping, folder, monke
         assert post(client, scene="hall").json()["state"] == "succeeded"
 
 
+def test_a_service_whose_only_scene_failed_gets_ready_by_itself(stepping, folder, monkeypatch):
+    """An orchestrator sends no requests to a service that isn't ready."""
+    monkeypatch.setattr(entries, "RETRY_S", 0.1)
+    monkeypatch.setattr("service.scene_manager.manager._GRACE_S", 0.1)
+    whole = (folder / "hall" / "scene.ply").read_bytes()
+    (folder / "hall" / "scene.ply").write_bytes(whole[:-100])
+    with serving(create_app(settings(scenes=[folder / "hall"], cache_dir=folder.parent / "cache"))) as client:
+        until(lambda: client.get("/readyz").json()["failed"])
+        assert client.get("/readyz").status_code == 503
+        (folder / "hall" / "scene.ply").write_bytes(whole)
+        until(lambda: client.get("/readyz").status_code == 200)
+
+
 def test_the_time_between_two_attempts_doubles_and_success_resets_it(monkeypatch):
     now = 100.0
     monkeypatch.setattr(entries.time, "monotonic", lambda: now)

@@ -29,9 +29,11 @@ class Entry:
     wanted: bool = True
     """Load it when it is asked for."""
     required: bool = False
-    """The service isn't ready before it has been loaded once, or failed to."""
+    """The service isn't ready before it has been loaded once, or failed to; then it is tried again unasked."""
     uploaded: bool = False
     """It came over HTTP, and may be deleted."""
+    awaited: bool = True
+    """Of a required scene: whether it has neither been loaded nor failed to yet."""
     jobs: int = 0
     """That use it, waiting or running: while there are any it stays."""
     used: float = 0.0
@@ -47,6 +49,11 @@ class Entry:
     def is_idle(self) -> bool:
         """Whether it is in memory and may be dropped; a scene without a file could not be loaded again."""
         return self.state == "ready" and not self.jobs and self.path is not None
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it failed and is to be tried again without being asked for: nobody may ask an unready service."""
+        return self.state == "failed" and self.required and self.wanted and time.monotonic() >= self.retry_at
 
     @property
     def memory_bytes(self) -> int:

@@ -274,7 +274,7 @@ class Scenes:
     def readiness(self) -> SceneReadiness:
         """Return whether photos can be localized, what is still loading, and what failed."""
         entries = self.entries()
-        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required]
+        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.awaited]
         failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
         loaded = [e.loaded for e in entries if e.loaded]
@@ -307,13 +307,16 @@ class Scenes:
                     error.where = error.where.replace(str(entry.path), entry.id)
                 with self._lock:
                     entry.failed(error)
-            entry.required = False
+            entry.awaited = False
             self._settle()
 
     def _next(self) -> Entry | None:
         """Wait for a requested scene that fits into memory beside those in use; None once the process ends."""
         with self._lock:
             while not self._stop.is_set():
+                for entry in self.entries():
+                    if entry.is_due:
+                        self._request(entry)
                 for entry in list(self._in_order()):
                     if self._makes_room(entry):
                         self._requested.remove(entry)
@@ -337,7 +340,7 @@ class Scenes:
         if not self._limit.could_hold(needed):
             return True  # loading refuses it, and drops none for it
         dropped = self._limit.to_drop(entry, needed, self.entries(), self._first_in_line)
-        if entry.required and not entry.used and dropped != []:
+        if entry.required and entry.awaited and not entry.used and dropped != []:
             # Of a preload list that is larger than the memory the first ones stay.
             _log.warning("scene %s is not preloaded: the others take the memory that scenes may take", entry.id)
             self._withdraw(entry)
@@ -349,7 +352,7 @@ class Scenes:
 
     def _withdraw(self, entry: Entry) -> None:
         """Take back the request to load a scene, unless it is under way."""
-        entry.required = False
+        entry.awaited = False
         if entry in self._requested:
             self._requested.remove(entry)
             entry.state = "unloaded" if entry.loaded is None else "ready"
