@@ -41,9 +41,8 @@ async function untilLoaded(scene, told, signal) {
 async function mayPass(error, scene, told, signal) {
   const { code } = error;
   if (code === "scene_unloaded") await service.ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
-  else if (!["scene_not_ready", "queue_full", "rate_limited"].includes(code)) throw error;
-  const what = code === "queue_full" || code === "rate_limited" ? "the service is busy" : "the scene is loading";
-  told(`Waiting: ${what}…`);
+  else if (!["queue_full", "rate_limited"].includes(code)) throw error;
+  told(`Waiting: ${code === "scene_unloaded" ? "the scene is loading" : "the service is busy"}…`);
   await pause(POLL_MS, signal);
 }
 
