@@ -23,7 +23,7 @@ from urllib.parse import quote
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-_HEAD, _INTRINSICS = struct.Struct("<4sBBHIId"), struct.Struct("<4d")
+_HEAD = struct.Struct("<4sBBHIId")
 
 
 class LiveRefused(Exception):
@@ -53,7 +53,7 @@ class LiveAnswer:
     """The frame's, as `send` returned it."""
     time_s: float
     mode: str
-    """tracking, relocalizing or lost."""
+    """tracking, carried (by odometry), relocalizing or lost."""
     status: str
     """localized, uncertain or not_localized."""
     reason: str | None
@@ -67,6 +67,16 @@ class LiveAnswer:
     used_ms: float
     dropped: list[int]
     """Ids of the frames since the last answer that were not used."""
+    world_from_odom: list[list[float]] | None = None
+    """4x4 similarity from the odometry's frame to the scene; None without odometry, or while it isn't known."""
+    units_per_odom: float | None = None
+    """Its scale: scene units per unit of the odometry."""
+    odom_covariance: list[list[float]] | None = None
+    """7x7, of (rotation in rad, translation in units) in this frame's camera and the scale's logarithm."""
+    odom_offset_s: float | None = None
+    """By how much the odometry's poses are late."""
+    odom_resets: int | None = None
+    """How often the odometry began anew."""
 
 
 class Live:
@@ -81,13 +91,15 @@ class Live:
         intrinsics: Mapping[str, Any] | None = None,
         prior: Mapping[str, Any] | None = None,
         accuracy: Mapping[str, Any] | None = None,
+        odometry: Mapping[str, Any] | None = None,
         timeout_s: float = 60.0,
         **connection: Any,
     ) -> None:
         """Connect to the service at `url` (http or https) and begin; a scene may have to be loaded for that.
 
-        `intrinsics`, `prior` and `accuracy` are those of a request to localize. `connection` goes to
-        `websockets.sync.client.connect`, e.g. `ssl=` for a certificate of your own.
+        `intrinsics`, `prior` and `accuracy` are those of a request to localize. `odometry` describes that of the
+        frames: metric, up_in_odom, up_sigma_deg, smooth. `connection` goes to `websockets.sync.client.connect`, e.g.
+        `ssl=` for a certificate of your own.
         """
         address = f"ws{url.removeprefix('http').rstrip('/')}/scenes/{quote(scene, safe='')}/live"
         headers = {"Authorization": f"Bearer {key}"} if key else {}
@@ -101,6 +113,7 @@ class Live:
         """What the service advises: `max_fps`, `long_side_px`; empty while there is no advice."""
         self._next_id = 0
         hello = {"type": "hello", "version": 1, "intrinsics": intrinsics, "prior": prior, "accuracy": accuracy}
+        hello["odometry"] = odometry
         self._send(json.dumps({name: value for name, value in hello.items() if value is not None}))
         self.welcome: dict[str, Any] = json.loads(self._receive(timeout_s))
         """The service's first message, with the session's limits."""
@@ -123,16 +136,27 @@ class Live:
             if answer:
                 yield answer
 
-    def send(self, jpeg: bytes, time_s: float | None = None, fx_fy_cx_cy: Sequence[float] | None = None) -> int:
+    def send(
+        self,
+        jpeg: bytes,
+        time_s: float | None = None,
+        fx_fy_cx_cy: Sequence[float] | None = None,
+        odom_from_camera: Sequence[Sequence[float]] | None = None,
+        up_in_camera: Sequence[float] | None = None,
+    ) -> int:
         """Send a frame, return its id. It may be dropped for a newer one.
 
         `time_s` is when it was taken, by any clock that doesn't go back; default: now. `fx_fy_cx_cy` are this frame's
-        intrinsics in its pixels, for lenses that change.
+        intrinsics in its pixels, for lenses that change. `odom_from_camera` is the 4x4 pose by the device's odometry
+        and `up_in_camera` up by gravity, both in OpenCV camera axes (+x right, +y down, +z forward).
         """
         number, self._next_id = self._next_id, self._next_id + 1
-        more = _INTRINSICS.pack(*fx_fy_cx_cy) if fx_fy_cx_cy else b""
+        odometry = None if odom_from_camera is None else [value for row in odom_from_camera[:3] for value in row]
+        parts = {1: (4, fx_fy_cx_cy), 2: (12, odometry), 4: (3, up_in_camera)}
+        more = b"".join(struct.pack(f"<{count}d", *part) for count, part in parts.values() if part is not None)
+        flags = sum(flag for flag, (_, part) in parts.items() if part is not None)
         taken = time.monotonic() if time_s is None else time_s
-        head = _HEAD.pack(b"SFLV", 1, 1 if more else 0, _HEAD.size + len(more), number, 0, taken)
+        head = _HEAD.pack(b"SFLV", 1, flags, _HEAD.size + len(more), number, 0, taken)
         self._send(head + more + jpeg)
         return number
 

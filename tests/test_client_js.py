@@ -94,10 +94,16 @@ def test_its_live_messages_are_read_as_frames():
     module = f"""
 import {{ liveMessage }} from "{CLIENT.as_uri()}";
 const jpeg = Uint8Array.from(Buffer.from(process.argv[2], "base64")).buffer;
-const texts = [liveMessage(7, 1.25, jpeg), liveMessage(8, 2.5, jpeg, [500.5, 501, 320, 240])];
+const odom = [[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6], [0, 0, 0, 1]], lens = [500.5, 501, 320, 240];
+const third = liveMessage(9, 3, jpeg, undefined, odom, [0, -1, 0]);
+const texts = [liveMessage(7, 1.25, jpeg), liveMessage(8, 2.5, jpeg, lens), third];
 console.log(JSON.stringify(texts.map(message => Buffer.from(message).toString("base64"))));
 """
     messages = [base64.b64decode(text) for text in json.loads(node(module, base64.b64encode(photo()).decode()))]
     first = read_frame(messages[0], None)
     assert first == LiveFrame(7, 1.25, photo())
     assert read_frame(messages[1], first).intrinsics == Intrinsics(96, 64, 500.5, 501.0, 320.0, 240.0)
+    third = read_frame(messages[2], first)
+    assert (third.intrinsics, third.up_in_camera, third.data) == (None, (0.0, -1.0, 0.0), photo())
+    assert third.odom_from_camera is not None
+    assert third.odom_from_camera.world_from_camera[:3].tolist() == [[0, -1, 0, 4], [1, 0, 0, 5], [0, 0, 1, 6]]

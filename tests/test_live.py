@@ -73,9 +73,15 @@ def live(client: httpx.Client, scene: str = "room", **options) -> Live:
     return Live(url(client), scene, proxy=None, **options)
 
 
-def frame(number: int, time_s: float, jpeg: bytes | None = None, *, flags: int = 0, length: int = 24) -> bytes:
+def frame(
+    number: int, time_s: float, jpeg: bytes | None = None, *, flags: int = 0, length: int = 24, more: bytes = b""
+) -> bytes:
     head = struct.pack("<4sBBHIId", b"SFLV", 1, flags, length, number, 0, time_s)
-    return head + (photo() if jpeg is None else jpeg)
+    return head + more + (photo() if jpeg is None else jpeg)
+
+
+def odometry(scale: float = 1.0, x: float = 0.0) -> bytes:
+    return frame(1, 1.0, flags=2, length=120, more=struct.pack("<12d", scale, 0, 0, x, 0, scale, 0, 0, 0, 0, scale, 0))
 
 
 @contextmanager
@@ -182,13 +188,20 @@ BAD = {
     "no JSON": (["{"], 4400, "hello: the first message is not JSON"),
     "no hello": (['{"type": "hi", "version": 1}'], 4400, "type: Input should be 'hello'"),
     "another version": (['{"type": "hello", "version": 2}'], 4400, "version: Input should be 1"),
-    "an unknown field": (['{"type": "hello", "version": 1, "odometry": true}'], 4400, "odometry: unknown field"),
+    "an unknown field": (['{"type": "hello", "version": 1, "rig": true}'], 4400, "rig: unknown field"),
+    "up that is nothing": ([json.dumps(HELLO | {"odometry": {"up_in_odom": [0, 0, 0]}})], 4400, "odometry.up_in_odom:"),
     "bytes first": ([b"x"], 4400, "hello: the first message is JSON"),
     "bad intrinsics": ([json.dumps(HELLO | {"intrinsics": {"width": 3}})], 4400, "intrinsics."),
     "text later": ([json.dumps(HELLO), "{}"], 4400, "frame: after the hello"),
     "a truncated header": ([json.dumps(HELLO), b"SFLV\1"], 4400, "frame: the header has 24 bytes or more"),
     "garbage": ([json.dumps(HELLO), b"x" * 999], 4400, "frame: a message begins with SFLV and version 1"),
-    "an unknown flag": ([json.dumps(HELLO), frame(1, 1.0, flags=2)], 4400, "frame.flags: unknown flags"),
+    "an unknown flag": ([json.dumps(HELLO), frame(1, 1.0, flags=8)], 4400, "frame.flags: unknown flags"),
+    "odometry with a scale": ([json.dumps(HELLO), odometry(2.0)], 4400, "frame.odom_from_camera: the upper left 3x3"),
+    "odometry far away": ([json.dumps(HELLO), odometry(x=1e7)], 4400, "frame.odom_from_camera: is farther than 1e+06"),
+    "no gravity": (
+        [json.dumps(HELLO), frame(1, 1.0, flags=4, length=48, more=struct.pack("<3d", 0, 0, float("nan")))],
+        4400, "frame.up_in_camera: is no direction",
+    ),
     "a wrong length": ([json.dumps(HELLO), frame(1, 1.0, length=99)], 4400, "frame.length: the header has 24 bytes"),
     "an id again": ([json.dumps(HELLO), *2 * [frame(1, 1.0)]], 4400, "frame.id: must ascend: 1 after 1"),
     "time goes back": ([json.dumps(HELLO), frame(1, 1.0), frame(2, 0.5)], 4400, "frame.time: must be finite"),

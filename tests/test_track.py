@@ -276,6 +276,42 @@ def test_a_live_camera_is_searched_beside_followed_and_found_again(room):
     assert all(answer.pose is None and answer.verdict is None for answer, truth in found if truth is None)
 
 
+def test_a_live_frame_without_a_pose_is_carried_by_odometry(room):
+    """Odometry in metres, two a scene unit, in a frame of its own; the lens is covered while the camera goes on."""
+    scale, start = 0.5, moved(Pose(np.eye(4)), np.array([0.3, -1.0, 0.5, 4.0, 5.0, 6.0]))
+    camera = path(40)
+
+    def odom(pose: Pose) -> Pose:
+        between = camera[0].camera_from_world @ pose.world_from_camera
+        between[:3, 3] /= scale
+        return Pose(start.world_from_camera @ between)
+
+    tracker = LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), room, SHORT)
+    black = encode_image(BLACK.rgb)
+    found, number = [], 0
+    with closing(tracker):
+        for k, pose in enumerate(camera):
+            jpeg = black if 25 <= k < 32 else encode_image(photo(room, pose, k))
+            for _ in range(200):
+                number += 1
+                answer = tracker.use(LiveFrame(number, k / 10, jpeg, odom_from_camera=odom(pose)))
+                if answer.mode in ("tracking", "carried"):
+                    break
+                time.sleep(0.05)
+            found.append(answer)
+    assert [answer.mode for answer in found[:25] + found[32:]] == 33 * ["tracking"]
+    dark = found[25:32]
+    assert [answer.mode for answer in dark] == 7 * ["carried"]
+    assert all(answer.verdict is None and answer.covariance is not None for answer in dark)
+    # Carried on for 0.7 s, by a scale that 25 frames showed; seen: 0.003
+    assert all(close(answer.pose, pose, 0.2, 0.02) for answer, pose in zip(dark, camera[25:32], strict=True))
+    told = found[-1].odometry
+    assert told is not None
+    assert told.scale == pytest.approx(scale, rel=0.03)  # seen: 0.004
+    matrix = told.world_from_odom @ odom(camera[-1]).world_from_camera
+    assert np.linalg.norm(matrix[:3, 3] - camera[-1].position_in_world) < 0.01
+
+
 def test_a_live_lens_is_estimated_once_and_kept_for_frames_of_any_size(room):
     wrong = replace(LENS, fx=1.1 * FOCAL, fy=1.1 * FOCAL, trust="approximate")
     half = LENS.resized(WIDTH // 2, HEIGHT // 2)

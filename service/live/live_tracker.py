@@ -1,10 +1,12 @@
 """Follows one live camera: each frame in the time of one small render, the rest beside it.
 
-    extrapolate at constant velocity -> refine on the last render and on one at the pose -> the gate by the pixels
+    extrapolate, by odometry if there is some -> refine on the last render and on one at the pose
+    -> the gate by the pixels
 
 Where the pixels alone don't suffice the frame is `uncertain`. Searches, and every second the whole gate, run in the
 background. A search that succeeded belongs to a frame of the past: the frames since are followed from there, thinned
-out, until the newest one is reached.
+out, until the newest one is reached. With odometry a frame that has no pose of its own is carried from those that had
+one (`fusion`).
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ from dataclasses import dataclass, replace
 
 from service.errors import InvalidImage
 from service.live.background import Background
-from service.live.live_values import LiveAnswer, LiveFrame, LiveTask, Mode
+from service.live.fusion import Fusion
+from service.live.live_values import FusedOdometry, LiveAnswer, LiveFrame, LiveTask, Mode
 from service.loaded_scene import LoadedScene
 from service.localize import Cancelled, Request, asked_of, localize_in_scene, rasterizer_for
 from service.localize import render_and_verify as verify_whole
@@ -26,6 +29,7 @@ from service.photos.sequence import PHOTO_LONG_SIDE
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import RenderedView
 from service.pose.verification.gate import downgraded
+from service.pose.verification.signals import typical_depth
 from service.results import PoseEstimate, Reason, Status, Verdict
 from service.scene_origin import query_in_scene, shifted
 from service.tracking import (
@@ -38,7 +42,7 @@ from service.tracking import (
     photometric_verdict,
     refine_from,
 )
-from service.types import Intrinsics, Pose, Query
+from service.types import Intrinsics, Pose, Query, frozen
 
 _log = logging.getLogger(__name__)
 
@@ -118,6 +122,9 @@ class LiveTracker:
         self._kept: list[LiveFrame] = []
         self._kept_every_s = config.kept_every_s
         self._tried_s = -1e9
+        self._fusion = Fusion(task.odometry, loaded.scene.info)
+        self._run = 0
+        """How often a search found the camera."""
         self._background: Background[_Found | None] = Background()
 
     def close(self) -> None:
@@ -131,6 +138,8 @@ class LiveTracker:
         """
         began = time.perf_counter()
         size = self._checked_size(frame)
+        if frame.odom_from_camera is not None:
+            self._fusion.move(frame.time_s, frame.odom_from_camera, frame.up_in_camera)
         self._take_over()
         followed = None
         if self._past and self._is_due(frame):
@@ -174,13 +183,28 @@ class LiveTracker:
     def _answer(self, frame: LiveFrame, size: tuple[int, int], followed: _Followed | None) -> LiveAnswer:
         mode: Mode = "lost" if self._searches else "relocalizing"
         astray = frame.time_s - self._verified_s > self._config.unverified_s
+        odometry = self._told(frame)
         if followed is None or astray:
-            return LiveAnswer(frame.id, frame.time_s, mode, size)
+            carried = None if frame.odom_from_camera is None else self._fusion.carried()
+            if carried is None:
+                return LiveAnswer(frame.id, frame.time_s, mode, size, odometry=odometry)
+            pose = shifted(carried[0], self._origin)
+            return LiveAnswer(frame.id, frame.time_s, "carried", size, pose, covariance=carried[1], odometry=odometry)
         verdict = followed.verdict
         if self._doubt is not None:
             verdict = downgraded(verdict, self._doubt)
         pose = shifted(followed.pose, self._origin) if any(self._origin) else followed.pose
-        return LiveAnswer(frame.id, frame.time_s, "tracking", size, pose, verdict, followed.query.photo_intrinsics)
+        return LiveAnswer(
+            frame.id, frame.time_s, "tracking", size, pose, verdict, followed.query.photo_intrinsics, odometry=odometry
+        )
+
+    def _told(self, frame: LiveFrame) -> FusedOdometry | None:
+        told = None if frame.odom_from_camera is None else self._fusion.told()
+        if told is None or not any(self._origin):
+            return told
+        matrix = told.world_from_odom.copy()
+        matrix[:3, 3] += self._origin
+        return replace(told, world_from_odom=frozen(matrix))
 
     def _keep(self, frame: LiveFrame) -> None:
         """Keep some frames while a search runs, to follow the camera from its answer to now."""
@@ -202,23 +226,18 @@ class LiveTracker:
         if unseen_s <= self._config.stale_s and unverified_s <= self._config.unverified_s:
             return True
         untried = self._tried_s <= self._verified_s
-        return untried or (
-            unverified_s <= self._config.retry_s and frame.time_s - self._tried_s >= self._config.retry_every_s
-        )
+        near = unverified_s <= self._config.retry_s or self._fusion.carried() is not None
+        return untried or (near and frame.time_s - self._tried_s >= self._config.retry_every_s)
 
     def _followed(self, query: Query, time_s: float) -> _Followed | None:
         """Refine near the expected pose; None where the gate refuses what that led to."""
         self._tried_s = time_s
         query = self._through_lens(query)
         images = QueryImages(query, self._loaded.matcher)
-        tracking = self._config.tracking
-        fresh = time_s - self._past[-1][0] <= self._config.stale_s
-        last = self._past[-1][1]
-        expected = extrapolated(self._past, time_s, tracking.max_intervals) if fresh else last
-        found = self._refined(images, expected or last)
+        found = self._refined(images, self._expected(time_s))
         if found is None:
             return None
-        verdict = photometric_verdict(images, found, tracking.verification)
+        verdict = photometric_verdict(images, found, self._config.tracking.verification)
         if verdict.status is Status.NOT_LOCALIZED:
             return None
         self._rendered = found.rendered
@@ -228,7 +247,16 @@ class LiveTracker:
             self._lens.update(images, found)
             if self._doubt is None:
                 self._searches = 0
+                if verdict.covariance is not None:
+                    depth = typical_depth(found.rendered.frame)
+                    self._fusion.fix(time_s, found.pose, verdict.covariance, depth, self._run)
         return _Followed(found.pose, verdict, query)
+
+    def _expected(self, time_s: float) -> Pose:
+        last_s, last = self._past[-1]
+        fresh = time_s - last_s <= self._config.stale_s
+        moving = extrapolated(self._past, time_s, self._config.tracking.max_intervals) if fresh else None
+        return self._fusion.predicted(last_s, last, time_s, moving or last)
 
     def _refined(self, images: QueryImages, expected: Pose) -> TrackedPose | None:
         rasterizer = rasterizer_for(images.query, self._loaded)
@@ -292,6 +320,7 @@ class LiveTracker:
             prior = replace(found.query.lens_prior, log_focal_scale=estimate.verdict.focal_sigma)
             self._lens.set(record.pose, self._lens.correction.then(record.correction), prior)
         self._loaded, self._rendered, self._doubt, self._searches = found.loaded, None, None, 0
+        self._run += 1
         self._past.clear()
         self._past.append((found.time_s, record.pose))
         self._verified_s = self._checked_s = found.time_s

@@ -4,12 +4,15 @@ Little-endian. Offset, type, field:
 
      0  4 bytes  "SFLV"
      4  uint8    version, 1
-     5  uint8    flags: 1 = intrinsics follow; all others 0
-     6  uint16   length of the header in bytes, 24 or 56: where the JPEG begins
+     5  uint8    flags, added: 1 = intrinsics, 2 = odometry, 4 = gravity follow, in this order; all others 0
+     6  uint16   length of the header in bytes, 24 to 176: where the JPEG begins
      8  uint32   id of the frame, ascending
     12  uint32   0
     16  float64  capture time in seconds, by any clock, not descending
-    24  float64  fx, fy, cx, cy of this frame in pixels, with flag 1 only
+    then, each with its flag only:
+     1  4 x float64   fx, fy, cx, cy of this frame in pixels
+     2  12 x float64  the first three rows of odom_from_camera, 4x4, OpenCV camera axes
+     4  3 x float64   up by gravity in OpenCV camera axes, of any length
 """
 
 from __future__ import annotations
@@ -17,15 +20,19 @@ from __future__ import annotations
 import math
 import struct
 
-from service.errors import InvalidImage, InvalidIntrinsics, InvalidRequest
+import numpy as np
+
+from service.errors import InvalidImage, InvalidIntrinsics, InvalidPrior, InvalidRequest
 from service.live.live_values import LiveFrame
 from service.photos.images import photo_size
-from service.types import Intrinsics
+from service.types import Intrinsics, Pose
 
 MAGIC, VERSION = b"SFLV", 1
-HAS_INTRINSICS = 1
+HAS_INTRINSICS, HAS_ODOMETRY, HAS_UP = 1, 2, 4
 _HEAD = struct.Struct("<4sBBHIId")
-_INTRINSICS = struct.Struct("<4d")
+_PARTS = {HAS_INTRINSICS: struct.Struct("<4d"), HAS_ODOMETRY: struct.Struct("<12d"), HAS_UP: struct.Struct("<3d")}
+_FARTHEST = 1e6
+"""Of an odometry's position: farther ones would lose digits."""
 
 
 def read_frame(message: bytes, after: LiveFrame | None) -> LiveFrame:
@@ -42,9 +49,9 @@ def read_frame(message: bytes, after: LiveFrame | None) -> LiveFrame:
         raise InvalidRequest(
             f"a message begins with {MAGIC.decode()} and version {VERSION}, not {magic!r} and {version}.", where="frame"
         )
-    if flags & ~HAS_INTRINSICS or zero:
+    if flags & ~sum(_PARTS) or zero:
         raise InvalidRequest(f"unknown flags or reserved bytes: {flags:#x}, {zero:#x}.", where="frame.flags")
-    needed = _HEAD.size + (_INTRINSICS.size if flags & HAS_INTRINSICS else 0)
+    needed = _HEAD.size + sum(part.size for flag, part in _PARTS.items() if flags & flag)
     if length != needed or len(message) <= length:
         raise InvalidRequest(
             f"the header has {needed} bytes with these flags, then comes the JPEG; it says {length}, in a message of "
@@ -55,8 +62,15 @@ def read_frame(message: bytes, after: LiveFrame | None) -> LiveFrame:
     jpeg = bytes(message[length:])
     if not jpeg.startswith(b"\xff\xd8\xff"):
         raise InvalidImage("a frame is a JPEG.", where="frame")
-    intrinsics = _intrinsics(message, jpeg) if flags & HAS_INTRINSICS else None
-    return LiveFrame(frame_id, time_s, jpeg, intrinsics)
+    parts, offset = {}, _HEAD.size
+    for flag, part in _PARTS.items():
+        if flags & flag:
+            parts[flag] = part.unpack_from(message, offset)
+            offset += part.size
+    intrinsics = _intrinsics(parts[HAS_INTRINSICS], jpeg) if HAS_INTRINSICS in parts else None
+    odometry = _odometry(parts[HAS_ODOMETRY]) if HAS_ODOMETRY in parts else None
+    up = _up(parts[HAS_UP]) if HAS_UP in parts else None
+    return LiveFrame(frame_id, time_s, jpeg, intrinsics, odometry, up)
 
 
 def _require_later(frame_id: int, time_s: float, after: LiveFrame | None) -> None:
@@ -66,9 +80,29 @@ def _require_later(frame_id: int, time_s: float, after: LiveFrame | None) -> Non
         raise InvalidRequest("must be finite, and not before that of the last frame.", where="frame.time")
 
 
-def _intrinsics(message: bytes, jpeg: bytes) -> Intrinsics:
+def _intrinsics(numbers: tuple[float, ...], jpeg: bytes) -> Intrinsics:
     try:
-        return Intrinsics(*photo_size(jpeg), *_INTRINSICS.unpack_from(message, _HEAD.size))
+        return Intrinsics(*photo_size(jpeg), *numbers)
     except InvalidIntrinsics as error:
         error.where = f"frame.{error.where}"
         raise
+
+
+def _odometry(numbers: tuple[float, ...]) -> Pose:
+    matrix = np.vstack([np.reshape(numbers, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+    try:
+        pose = Pose(matrix)
+    except InvalidPrior as error:
+        error.where = "frame.odom_from_camera"
+        raise
+    if np.abs(pose.position_in_world).max() > _FARTHEST:
+        raise InvalidRequest(f"is farther than {_FARTHEST:g} from its origin.", where="frame.odom_from_camera")
+    return pose
+
+
+def _up(numbers: tuple[float, ...]) -> tuple[float, float, float]:
+    x, y, z = numbers
+    # `not`: NaN compares false.
+    if not 1e-6 < math.hypot(x, y, z) < _FARTHEST:
+        raise InvalidRequest(f"is no direction: {x:g}, {y:g}, {z:g}.", where="frame.up_in_camera")
+    return x, y, z

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from typing import Any, Literal
+import math
+from typing import Annotated, Any, Literal
 
+from annotated_types import Len
 from pydantic import Field, ValidationError
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
 from service.errors import InvalidRequest
-from service.live.live_values import LiveAnswer, LiveTask, Mode
+from service.live.live_values import LiveAnswer, LiveTask, Mode, OdometryFacts
 from service.live.pace import Hint
 from service.results import Status
 from service.web.api_model import Model
@@ -24,6 +26,20 @@ PROTOCOL = 1
 """Version of the messages."""
 
 
+class LiveOdometryIn(Model):
+    """What holds for the odometry of all frames; see docs/live.md."""
+
+    metric: bool = True
+    """Its unit is the metre. Then a scene whose manifest has `metres_per_unit` needs no baseline to know the scale."""
+    up_in_odom: Annotated[list[float], Len(3, 3)] | None = None
+    """Up by gravity in its frame, of any length: [0, 1, 0] for ARKit, ARCore and WebXR. Used in scenes that know what
+    is up, and tested against the frames' poses."""
+    up_sigma_deg: float = Field(default=1.0, gt=0, le=45, allow_inf_nan=False)
+    """Standard deviation of that, and of the frames' own `up_in_camera`."""
+    smooth: bool = True
+    """`world_from_odom` changes by at most 1 cm and 0.2 degrees a frame at the camera, unless odometry began anew."""
+
+
 class LiveHello(Model):
     """The client's first message, and its only one in JSON."""
 
@@ -35,6 +51,8 @@ class LiveHello(Model):
     prior: PriorIn | None = None
     """Of the first frame; a box or a Gaussian holds for all."""
     accuracy: AccuracyIn | None = None
+    odometry: LiveOdometryIn | None = None
+    """Of frames that bring some; default: metric, without gravity."""
     seed: int = Field(default=0, ge=0, lt=2**63)
 
 
@@ -77,11 +95,12 @@ class LiveAnswerOut(Model):
     time_s: float
     """The frame's."""
     mode: Mode
-    """`tracking`: with a pose. `relocalizing`: the first search goes on. `lost`: searches found nothing; they go on."""
+    """`tracking`: with a pose of its own. `carried`: with a pose by odometry since frames that had one. `relocalizing`:
+    without one, the first search goes on. `lost`: searches found nothing; they go on."""
     status: Status
-    """`localized` and `uncertain` as in results; `not_localized` without a pose."""
+    """`localized` and `uncertain` as in results; `uncertain` for carried poses; `not_localized` without a pose."""
     reason: str | None = None
-    """What decided the status; None without a pose."""
+    """What decided the status; None without a pose of its own."""
     score: float | None = None
     """Probability that the pose is as accurate as was asked for."""
     world_from_camera: Matrix | None = None
@@ -90,6 +109,18 @@ class LiveAnswerOut(Model):
     """6x6, of the twist (rotation in rad, translation in units) in the camera frame: true = pose @ exp(twist)."""
     intrinsics: IntrinsicsOut | None = None
     """That the pose belongs to."""
+    world_from_odom: Matrix | None = None
+    """4x4, row-major: the similarity that takes points of the odometry's frame to the scene, and its camera at this
+    frame to where it is, by all frames so far. None without odometry; after it began anew until a frame is found."""
+    units_per_odom: float | None = None
+    """The similarity's scale: scene units per unit of the odometry."""
+    odom_covariance: Matrix | None = None
+    """7x7, of the twist (rotation in rad, translation in units) in this frame's camera, as `covariance`, and the
+    scale's logarithm: of the camera that `world_from_odom` and this frame's odometry tell."""
+    odom_offset_s: float | None = None
+    """By how much the odometry's poses are late: they belong to a time that is this much after the frame's."""
+    odom_resets: int | None = None
+    """How often the odometry began anew: a higher number says that `world_from_odom` has jumped."""
     waited_ms: float
     """From the frame's arrival to its use."""
     used_ms: float
@@ -120,23 +151,41 @@ def live_task(hello: LiveHello, held: str, estimator: str) -> LiveTask:
         prior=prior,
         region=region,
         accuracy=DEFAULT_ACCURACY if hello.accuracy is None else Accuracy(**hello.accuracy.model_dump()),
+        odometry=OdometryFacts() if hello.odometry is None else _odometry_facts(hello.odometry),
     )
+
+
+def _odometry_facts(given: LiveOdometryIn) -> OdometryFacts:
+    up = given.up_in_odom
+    if up is None:
+        return OdometryFacts(given.metric, None, given.up_sigma_deg, given.smooth)
+    x, y, z = up
+    # `not`: NaN compares false.
+    if not 1e-6 < math.hypot(x, y, z) < 1e6:
+        raise InvalidRequest(f"is no direction: {x:g}, {y:g}, {z:g}.", where="odometry.up_in_odom")
+    return OdometryFacts(given.metric, (x, y, z), given.up_sigma_deg, given.smooth)
 
 
 def live_answer_out(answer: LiveAnswer, waited_s: float, dropped: tuple[int, ...]) -> LiveAnswerOut:
     """Convert an answer."""
-    pose, verdict = answer.pose, answer.verdict
-    covariance = None if verdict is None else verdict.covariance
+    pose, verdict, odometry = answer.pose, answer.verdict, answer.odometry
+    covariance = answer.covariance if verdict is None else verdict.covariance
+    without = Status.NOT_LOCALIZED if pose is None else Status.UNCERTAIN
     return LiveAnswerOut(
         id=answer.id,
         time_s=answer.time_s,
         mode=answer.mode,
-        status=Status.NOT_LOCALIZED if verdict is None else verdict.status,
+        status=without if verdict is None else verdict.status,
         reason=None if verdict is None else str(verdict.reason),
         score=None if verdict is None else verdict.score,
         world_from_camera=None if pose is None else rows(pose.world_from_camera),
         covariance=None if covariance is None else rows(covariance),
         intrinsics=None if answer.intrinsics is None else intrinsics_out(answer.intrinsics),
+        world_from_odom=None if odometry is None else rows(odometry.world_from_odom),
+        units_per_odom=None if odometry is None else odometry.scale,
+        odom_covariance=None if odometry is None else rows(odometry.covariance),
+        odom_offset_s=None if odometry is None else odometry.offset_s,
+        odom_resets=None if odometry is None else odometry.resets,
         waited_ms=1e3 * waited_s,
         used_ms=1e3 * answer.used_s,
         dropped=list(dropped),

@@ -36,15 +36,18 @@
  */
 
 /**
- * @typedef {{id: number, time_s: number, mode: "tracking" | "relocalizing" | "lost",
+ * @typedef {{id: number, time_s: number, mode: "tracking" | "carried" | "relocalizing" | "lost",
  *   status: "localized" | "uncertain" | "not_localized", reason: string | null, score: number | null,
  *   world_from_camera: number[][] | null, covariance: number[][] | null, intrinsics: Intrinsics | null,
+ *   world_from_odom: number[][] | null, units_per_odom: number | null, odom_covariance: number[][] | null,
+ *   odom_offset_s: number | null, odom_resets: number | null,
  *   waited_ms: number, used_ms: number, dropped: number[]}} LiveAnswer
  * @typedef {{max_fps: number | null, long_side_px: number | null}} LiveHint
  * @typedef {object} LiveOptions
  * @property {Record<string, any>} [intrinsics]  of the frames, as for `localize`; estimated where there are none
  * @property {Record<string, any>} [prior]
  * @property {Record<string, any>} [accuracy]
+ * @property {Record<string, any>} [odometry]  of the frames: metric, up_in_odom, up_sigma_deg, smooth
  * @property {(answer: LiveAnswer) => void} [onAnswer]
  * @property {(hint: LiveHint) => void} [onHint]  what had better be sent: frames a second, pixels of the long side
  * @property {(code: number, reason: string) => void} [onClose]  the session has ended; docs/live.md lists the codes
@@ -258,13 +261,14 @@ export class Live {
   #socket; #options; #nextId = 0; #open = /** @type {Set<number>} */ (new Set());
 
   /** @param {URL} address @param {LiveOptions} options */
-  constructor(address, { intrinsics, prior, accuracy, ...options }) {
+  constructor(address, { intrinsics, prior, accuracy, odometry, ...options }) {
+    const hello = { type: "hello", version: 1, intrinsics, prior, accuracy, odometry };
     this.#options = options;
     this.#socket = new WebSocket(address);
     this.#socket.binaryType = "arraybuffer";
     /** @type {Promise<void>} Resolves when frames may be sent. */
     this.began = new Promise((resolve, reject) => {
-      this.#socket.onopen = () => this.#socket.send(JSON.stringify({ type: "hello", version: 1, intrinsics, prior, accuracy }));
+      this.#socket.onopen = () => this.#socket.send(JSON.stringify(hello));
       this.#socket.onmessage = event => this.#hear(JSON.parse(event.data), resolve);
       this.#socket.onclose = ({ code, reason }) => {
         reject(new ServiceError({ code: "live_closed", detail: `The live session ended (${code}). ${reason}`.trim() }, 0));
@@ -281,12 +285,14 @@ export class Live {
    * @param {ArrayBuffer} jpeg
    * @param {number} timeS  when it was taken, by any clock
    * @param {number[]} [lens]  fx, fy, cx, cy of this frame, for lenses that change
+   * @param {number[][]} [odomFromCamera]  4x4, by the device's odometry, OpenCV camera axes
+   * @param {number[]} [upInCamera]  by gravity, OpenCV camera axes
    * @returns {number} its id
    */
-  send(jpeg, timeS, lens) {
+  send(jpeg, timeS, lens, odomFromCamera, upInCamera) {
     const id = this.#nextId++;
     this.#open.add(id);
-    this.#socket.send(liveMessage(id, timeS, jpeg, lens));
+    this.#socket.send(liveMessage(id, timeS, jpeg, lens, odomFromCamera, upInCamera));
     return id;
   }
 
@@ -310,14 +316,18 @@ export class Live {
  * @param {number} timeS
  * @param {ArrayBuffer} jpeg
  * @param {number[]} [lens]  fx, fy, cx, cy
+ * @param {number[][]} [odomFromCamera]  4x4
+ * @param {number[]} [upInCamera]
  */
-export function liveMessage(id, timeS, jpeg, lens) {
-  const length = lens ? 56 : 24, message = new Uint8Array(length + jpeg.byteLength), head = new DataView(message.buffer);
-  message.set([0x53, 0x46, 0x4c, 0x56, 1, lens ? 1 : 0]);  // SFLV, version, flags
+export function liveMessage(id, timeS, jpeg, lens, odomFromCamera, upInCamera) {
+  const parts = [lens, odomFromCamera?.slice(0, 3).flat(), upInCamera], numbers = parts.flatMap(part => part ?? []);
+  const length = 24 + 8 * numbers.length, message = new Uint8Array(length + jpeg.byteLength);
+  const head = new DataView(message.buffer), flags = parts.reduce((sum, part, bit) => sum + (part ? 1 << bit : 0), 0);
+  message.set([0x53, 0x46, 0x4c, 0x56, 1, flags]);  // SFLV, version, flags
   head.setUint16(6, length, true);
   head.setUint32(8, id, true);
   head.setFloat64(16, timeS, true);
-  lens?.forEach((value, index) => head.setFloat64(24 + 8 * index, value, true));
+  numbers.forEach((value, index) => head.setFloat64(24 + 8 * index, value, true));
   message.set(new Uint8Array(jpeg), length);
   return message;
 }

@@ -1,0 +1,34 @@
+"""What is known of the scale between odometry and scene, also after the fixes that showed it are gone."""
+
+from __future__ import annotations
+
+_LEAST_SIGMA = 0.01
+"""Devices' scales change by about that."""
+
+
+class ScaleMemory:
+    """The logarithm of scene units per unit of the odometry, and its standard deviation."""
+
+    def __init__(self, log_scale: float, sigma: float) -> None:
+        """Begin with what is known before any fix."""
+        self.log_scale, self.sigma = log_scale, sigma
+        self._before = log_scale, sigma
+        """Without the fixes since the odometry began anew."""
+
+    def prior(self) -> tuple[float, float]:
+        """Return what is known beside the fixes of the window.
+
+        What is remembered came in part from fixes that are still there: it counts with a quarter of its weight.
+        """
+        doubled = max(2 * self.sigma, _LEAST_SIGMA)
+        return (self.log_scale, doubled) if doubled < self._before[1] else self._before
+
+    def learn(self, log_scale: float, sigma: float) -> None:
+        """Take over what a fit with `prior` led to; it isn't remembered as surer than the fixes alone are."""
+        of_prior = self.prior()[1]
+        alone = max(sigma**-2 - of_prior**-2, 1e-12) ** -0.5
+        self.log_scale, self.sigma = log_scale, min(self.sigma, alone)
+
+    def begin_anew(self) -> None:
+        """Keep what is known: the fixes are forgotten, and their scale is still the device's."""
+        self._before = self.log_scale, max(self.sigma, _LEAST_SIGMA)
