@@ -458,7 +458,7 @@ def test_the_film_of_a_live_bench_has_its_parts_and_true_poses(room):
 def test_the_figures_of_a_live_bench_are_those_of_what_was_heard():
     shots = [Shot("steady", k / 10, b"", Pose(np.eye(4))) for k in range(8)]
     shots += [
-        Shot("dark", 0.8, b"", None),
+        Shot("dark", 0.8, b"", Pose(np.eye(4))),
         Shot("jumped", 0.9, b"", Pose(np.eye(4))),
         Shot("jumped", 1.0, b"", Pose(np.eye(4))),
     ]
@@ -480,7 +480,7 @@ def test_the_figures_of_a_live_bench_are_those_of_what_was_heard():
     hear(7, 0.9, 0.0, "uncertain")  # in the dark nothing can be right
     hear(8, 1.0, None, "not_localized")
     hear(9, 1.25, 0.06)  # wrong
-    found = figures(told, Units(np.zeros(3), 1.0, False))
+    found = figures(told, Units(np.zeros(3), 1.0, False), LENS)
     assert (found["sent"], found["wrong_localized"]) == (10, 1)
     assert found["right"] == 5 / 10
     assert found["localized"] == 6 / 10

@@ -23,6 +23,7 @@ from urllib.request import ProxyHandler, build_opener
 import numpy as np
 
 from service.bench.live_film import FILM, FilmConfig, Shot, make_film
+from service.bench.live_odometry import displayed, odometry_figures, with_odometry
 from service.bench.pose_metrics import COARSE, FINE, Units, errors, units_of
 from service.client import Client, ServiceError
 from service.errors import SceneNotFound
@@ -70,6 +71,7 @@ def run(
     cores: int = 1,
     seed: int = 0,
     withheld: bool = False,
+    odometry: bool = True,
     cache_dir: Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     config: FilmConfig = FILM,
@@ -77,7 +79,8 @@ def run(
 ) -> dict[str, Any]:
     """Return the object that `--json` writes: figures of each session, and of the service. Raises SceneError.
 
-    The service runs on `cores` processors; with `withheld` it isn't told the camera's intrinsics.
+    The service runs on `cores` processors; with `withheld` it isn't told the camera's intrinsics. With `odometry`
+    frames bring a device's, in metres that the scene knows nothing of.
     """
     loaded = LoadedScene.of(load_scene(folder), cache_dir=cache_dir)
     training = [named.camera for named in loaded.scene.cameras]
@@ -89,6 +92,9 @@ def run(
     camera = Intrinsics(640, 480, focal, focal, 320.0, 240.0)
     stations = [camera.pose for camera in training]
     film = make_film(stations, camera, loaded.rasterizer, units, seconds, seed, progress, config)
+    if odometry:
+        up = -np.sum([pose.world_from_camera[:3, 1] for pose in stations], 0)
+        film = with_odometry(film, units, up / np.linalg.norm(up), seed)
     del loaded
     with _service(folder, cores, cache_dir) as (url, scene):
         _warm_up(url, scene, film, camera)
@@ -106,7 +112,8 @@ def run(
         "service_cpu_share": server_s / wall_s,
         "service_cpu_ms_a_frame": 1e3 * server_s / max(1, sum(len(one.answers) for one in told)),
         "clients_cpu_share": own_s / wall_s,
-        "sessions": [figures(one, units) for one in told],
+        "odometry": odometry,
+        "sessions": [figures(one, units, camera) for one in told],
     }
 
 
@@ -143,7 +150,8 @@ def _session(
                 continue
             arrives = max(arrives, shot.time_s + delay)
             time.sleep(max(0.0, start + arrives - time.perf_counter()))
-            frame_id = live.send(shot.jpeg, shot.time_s)
+            odom = None if shot.odom is None else shot.odom.world_from_camera.tolist()
+            frame_id = live.send(shot.jpeg, shot.time_s, odom_from_camera=odom)
             told.sent_at[frame_id], told.shot_of[frame_id] = time.perf_counter() - start, number
         time.sleep(1.0)  # for the last answers
         live.close()
@@ -227,22 +235,30 @@ def _cpu_s(url: str) -> float:
 # ------------------------------------------------------------------ figures
 
 
-def figures(told: Told, units: Units) -> dict[str, Any]:
+def figures(told: Told, units: Units, camera: Intrinsics) -> dict[str, Any]:
     """Return a session's figures.
 
     used_per_s: answered frames for each second in which frames came, beside the dark. right: of all frames that the
     scene can explain, lost and dropped ones included, those with a pose within 1 degree and 0.01 units. back_s: from
-    the arrival of the first frame after an interruption to the first `localized` answer.
+    the arrival of the first frame after an interruption to the first `localized` answer. With odometry a frame without
+    an answer has the pose that the client knows by its odometry; `odometry_figures` has more.
     """
     shots, answers = told.shots, told.answers
     explained = [n for n, shot in enumerate(shots) if shot.truth is not None]
     answered = {told.shot_of[i]: answer for i, answer in answers.items()}
     off = {n: _errors(a, shots[n].truth, units) for n, a in answered.items() if a.world_from_camera}
+    more = {}
+    if shots[0].odom is not None:
+        shown = displayed(shots, answers, told.heard_at)
+        kept = {n: pose for n, pose in enumerate(shown) if pose is not None and n not in off}
+        off |= {n: errors(pose, truth, units) for n, pose in kept.items() if (truth := shots[n].truth) is not None}
+        more = odometry_figures(shots, answers, told.shot_of, shown, camera, units)
     tracked = [a for a in answers.values() if a.mode == "tracking"]
     times = [a.waited_ms + a.used_ms for a in tracked] or [np.nan]
     localized = {n for n, a in answered.items() if a.status == "localized"}
     used = [n for n in answered if shots[n].truth is not None]
     right = [n for n in explained if n in off and _within(off[n], FINE)]
+    own = [n for n in right if n in answered]
     parts = {shot.part: [n for n in explained if shots[n].part == shot.part] for shot in shots if shot.truth}
     fps = 1 / np.median(np.diff([shot.time_s for shot in shots]))
     return {
@@ -251,12 +267,13 @@ def figures(told: Told, units: Units) -> dict[str, Any]:
         "arrival_to_answer_ms_p50": float(np.percentile(times, 50)),
         "arrival_to_answer_ms_p95": float(np.percentile(times, 95)),
         "right": len(right) / len(explained),
-        "right_of_answered": len(right) / max(1, len(used)),
+        "right_of_answered": len(own) / max(1, len(used)),
         "localized": len(localized) / len(explained),
         "wrong_localized": sum(n in localized and not _within(error, COARSE) for n, error in off.items()),
         "right_by_part": {part: sum(n in set(right) for n in ns) / len(ns) for part, ns in parts.items()},
         "back_s": {part: _back_s(told, part, localized) for part in ("steady", "blurred", "jumped", "unlocked")},
         "hints": told.hints,
+        **more,
     }
 
 

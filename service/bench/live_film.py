@@ -68,8 +68,15 @@ class Shot:
     time_s: float
     """Since the film's start, when it is taken and sent."""
     jpeg: bytes
-    truth: Pose | None
-    """None where the scene can't explain the frame: a covered lens."""
+    pose: Pose
+    """Where it is taken."""
+    odom: Pose | None = None
+    """odom_from_camera, in metres; None without odometry."""
+
+    @property
+    def truth(self) -> Pose | None:
+        """The pose; None where the scene can't explain the frame: a covered lens."""
+        return None if self.part == "dark" else self.pose
 
 
 def make_film(
@@ -102,8 +109,7 @@ def make_film(
             rgb = _seen(part, path, where, camera, rasterizer, config)
             rgb = _altered(part, rgb, number, rng, config)
             noise = rng.standard_normal(rgb.shape, np.float32) * np.float32(config.noise_sigma)
-            truth = None if part == "dark" else path[where]
-            shots.append(Shot(part, time_s, encode_image(rgb + noise, quality=config.jpeg_quality), truth))
+            shots.append(Shot(part, time_s, encode_image(rgb + noise, quality=config.jpeg_quality), path[where]))
             where += 1
             if progress:
                 progress(len(shots), count)

@@ -26,6 +26,7 @@ def bench_live(
     cores: Annotated[int, typer.Option(min=1, help="Processors of the service.")] = 1,
     seed: int = 0,
     intrinsics: Annotated[Literal["given", "withheld"], typer.Option()] = "given",
+    odometry: Annotated[bool, typer.Option(help="Frames bring the odometry of a device, which drifts.")] = True,
     json_file: JsonFileOption = None,
 ) -> None:
     """Send a hand-held camera's film to a service as it is taken, and measure what comes back."""
@@ -40,6 +41,7 @@ def bench_live(
             cores=cores,
             seed=seed,
             withheld=intrinsics == "withheld",
+            odometry=odometry,
             progress=counter(progress, "frames"),
             cache_dir=settings_of({}).cache_dir,
         )
