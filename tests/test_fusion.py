@@ -138,6 +138,24 @@ def test_what_is_told_moves_by_small_steps_unless_asked():
         assert small is smooth
 
 
+def test_after_a_silence_nothing_is_told_until_a_frame_is_found():
+    steps = walk(2.0)
+    fusion = Fusion(OdometryFacts(), INFO)
+    for step in steps[:40]:
+        fusion.move(step.time_s, step.odom)
+        fusion.fix(step.time_s, step.fix or step.truth, SIGMA, DEPTH)
+    assert fusion.told() is not None
+    for step in steps[40:50]:
+        fusion.move(step.time_s + 20, step.odom)
+        assert fusion.told() is None
+        assert fusion.carried() is None
+    fusion.fix(steps[49].time_s + 20, steps[49].truth, SIGMA, DEPTH)
+    told = fusion.told()
+    assert told is not None
+    assert told.resets == 1
+    assert scale_error(told) < 0.05  # that of before
+
+
 def test_wrong_fixes_are_left_out():
     steps = walk(6.0, wrong=0.15)
     told = fused(steps)
@@ -206,3 +224,8 @@ def test_a_scene_in_metres_needs_no_baseline():
     assert scale_error(unknown) > 0.1
     assert unknown is not None
     assert unknown.covariance[6, 6] > 0.1
+
+
+def test_a_scale_that_the_walk_contradicts_is_not_believed():
+    told = fused(walk(6.0), info=replace(INFO, metres_per_unit=1.4 / SCALE))
+    assert scale_error(told[-1]) < 0.02

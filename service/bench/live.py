@@ -139,7 +139,9 @@ def play(
 def _session(
     told: Told, url: str, scene: str, intrinsics: dict[str, float] | None, rng: np.random.Generator, link: LinkConfig
 ) -> None:
-    with Live(url, scene, intrinsics=intrinsics, proxy=None) as live:
+    # Not metric: a scene's scale would be known from its manifest.
+    odometry = None if told.shots[0].odom is None else {"metric": False}
+    with Live(url, scene, intrinsics=intrinsics, odometry=odometry, proxy=None) as live:
         start = time.perf_counter()
         listener = threading.Thread(target=_listen, args=(told, live, start))
         listener.start()

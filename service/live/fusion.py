@@ -4,8 +4,8 @@
     -> move what is told towards the estimate, by a small step a frame
 
 `odometry_fit` has the equations. The window holds one fix for each viewpoint, the newest there. The odometry began anew
-where it moves faster than anybody carries a camera, where it contradicts two fixes in a row, or where all fixes of a
-second contradict those before: the fixes before are forgotten, the scale is kept.
+where it moves faster than anybody carries a camera or was silent for seconds, where it contradicts two fixes in a row,
+or where all fixes of a second contradict those before: the fixes before are forgotten, the scale is kept.
 """
 
 from __future__ import annotations
@@ -46,6 +46,8 @@ class FusionConfig:
     most_speed: float = 6.0
     most_turn_deg_s: float = 700.0
     """Beyond which an odometry didn't move but began anew,"""
+    most_gap_s: float = 3.0
+    """After a longer time without odometry nobody knows what it did meanwhile: devices stop it when they are locked."""
     least_jump: float = 0.3
     least_jump_deg: float = 25.0
     """if it also moved by more than this: times are uneven."""
@@ -232,6 +234,8 @@ class Fusion:
 
     def _is_jump(self, dt: float, turn: float, shift: float) -> bool:
         config = self._config
+        if dt > config.most_gap_s:
+            return True
         turned = np.degrees(turn)
         # Capture times of phones jitter by some milliseconds.
         dt = max(dt, 1 / 60)
@@ -306,16 +310,17 @@ class Fusion:
     def _refit(self, fix: Fix) -> None:
         if self._scale is None:
             return
-        priors = Priors(*self._scale.prior())
-        if self._up_in_world is not None and self._up_in_odom is not None:
-            up_sigma = float(np.hypot(np.radians(self._facts.up_sigma_deg), SCENE_UP_SIGMA))
-            priors = replace(priors, up_in_world=self._up_in_world, up_in_odom=self._up_in_odom, up_sigma=up_sigma)
-        fit = fit_odometry(self._fixes, priors, self._config.fit)
+        fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
         if self._turned_against(fit, fix):
-            fit = fit_odometry(self._fixes, priors, self._config.fit)
+            fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
+        if not self._scale.learn(fit.log_scale, float(np.sqrt(fit.covariance[6, 6]))):
+            fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
         self._fit, self._fitted = fit, self._fixes[-1]
-        self._scale.learn(fit.log_scale, float(np.sqrt(fit.covariance[6, 6])))
         self._tell()
+
+    def _priors(self, scale: ScaleMemory) -> Priors:
+        up_sigma = float(np.hypot(np.radians(self._facts.up_sigma_deg), SCENE_UP_SIGMA))
+        return Priors(*scale.prior(), self._up_in_world, self._up_in_odom, up_sigma)
 
     def _turned_against(self, fit: OdometryFit, fix: Fix) -> bool:
         """Return whether all fixes since a while contradict the others, which are then left out."""

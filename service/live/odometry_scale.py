@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 _LEAST_SIGMA = 0.01
 """Devices' scales change by about that."""
+_CONTRADICTION = 4.0
+"""Standard deviations by which a scale that was known is wrong: that of a manifest, or of another device."""
+_UNKNOWN_SIGMA = 0.7
+"""Of the logarithm, when nothing is known."""
 
 
 class ScaleMemory:
@@ -23,11 +29,19 @@ class ScaleMemory:
         doubled = max(2 * self.sigma, _LEAST_SIGMA)
         return (self.log_scale, doubled) if doubled < self._before[1] else self._before
 
-    def learn(self, log_scale: float, sigma: float) -> None:
-        """Take over what a fit with `prior` led to; it isn't remembered as surer than the fixes alone are."""
-        of_prior = self.prior()[1]
+    def learn(self, log_scale: float, sigma: float) -> bool:
+        """Take over what a fit with `prior` led to; it isn't remembered as surer than the fixes alone are.
+
+        Return False, and forget what was known, if the fixes alone contradict that.
+        """
+        expected, of_prior = self.prior()
         alone = max(sigma**-2 - of_prior**-2, 1e-12) ** -0.5
+        by_fixes = (log_scale / sigma**2 - expected / of_prior**2) * alone**2
+        if abs(by_fixes - expected) > _CONTRADICTION * math.hypot(alone, of_prior):
+            self.log_scale, self.sigma, self._before = by_fixes, 2 * alone, (by_fixes, _UNKNOWN_SIGMA)
+            return False
         self.log_scale, self.sigma = log_scale, min(self.sigma, alone)
+        return True
 
     def begin_anew(self) -> None:
         """Keep what is known: the fixes are forgotten, and their scale is still the device's."""
