@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from annotated_types import Len
 from pydantic import Field, ValidationError
 from pydantic.json_schema import JsonSchemaMode, models_json_schema
 
@@ -31,7 +30,7 @@ class LiveOdometryIn(Model):
 
     metric: bool = True
     """Its unit is the metre. Then a scene whose manifest has `metres_per_unit` needs no baseline to know the scale."""
-    up_in_odom: Annotated[list[float], Len(3, 3)] | None = None
+    up_in_odom: list[float] | None = Field(default=None, min_length=3, max_length=3)
     """Up by gravity in its frame, of any length: [0, 1, 0] for ARKit, ARCore and WebXR. Used in scenes that know what
     is up, and tested against the frames' poses."""
     up_sigma_deg: float = Field(default=1.0, gt=0, le=45, allow_inf_nan=False)
