@@ -82,7 +82,8 @@ def _require_later(frame_id: int, time_s: float, after: LiveFrame | None) -> Non
 
 def _intrinsics(numbers: tuple[float, ...], jpeg: bytes) -> Intrinsics:
     try:
-        return Intrinsics(*photo_size(jpeg), *numbers)
+        fx, fy, cx, cy = numbers
+        return Intrinsics(*photo_size(jpeg), fx, fy, cx, cy)
     except InvalidIntrinsics as error:
         error.where = f"frame.{error.where}"
         raise
