@@ -1,13 +1,16 @@
 """The mutation run: small faults are put into the code one by one, and the tests shall notice them.
 
     python tests/mutation_run.py --out mutants.jsonl [--seed 0] [--count 60] [--workers 2] [--limit-s 600]
+        [--measured FOLDER] [--select "not browser and not ci"] [PATH ...]
 
-Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/, all kinds alike, is applied in a
-copy of the last commit, and the tests that run its line are started until one fails. Which those are is measured first,
-by one run of all tests (some ten minutes), and kept beside the output. Compiled kernels and processes of their own
-can't be measured, and what an import runs is measured in the test that happened to import it: these have the test files
-that name the module or run any of its lines, then those of the modules that import it, then all. A
-failing test counts if it passes without the mutant; one that does not end within the limit has not noticed anything.
+Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/ (or from the paths), all kinds
+alike, is applied in a copy of the last commit, and the tests that run its line are started, those of the cheapest files
+first, until one fails. Which those are, and how long each takes, is measured first by one run of all tests (some ten
+minutes) and kept in the folder `--measured`, for other seeds and later commits: lines are found again where a file has
+changed since, and a test file that has changed runs as a whole. Compiled kernels and processes of their own can't be
+measured, and what an import runs is measured in the test that happened to import it: these have the test files that
+name the module or run any of its lines, then those of the modules that import it, then all. A failing test counts if
+it passes without the mutant; one that does not end within the limit has not noticed anything.
 
 The output has a line of JSON for each mutant; a run that was stopped goes on where it was. A mutant that changes
 nothing that anybody could see is marked by hand: `"equivalent": "why"` in its line. Prints the sums.
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import difflib
 import json
 import os
 import queue
@@ -27,10 +31,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+import xml.etree.ElementTree as ET
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -40,18 +47,12 @@ from mutations import KINDS, Mutant, mutants_of
 
 ROOT = Path(__file__).parents[1]
 LIMIT = "time limit"
-FEW = 40
-"""Tests of one line: with more, those of the files that import the module come first."""
 
 
-def drawn(root: Path, count: int, seed: int) -> list[Mutant]:
-    """Return mutants by chance, the kinds in turn; of a longer list the first are the same."""
-    found = [
-        mutant
-        for folder in ("service", "viewer")
-        for path in sorted((root / folder).rglob("*.py"))
-        for mutant in mutants_of(str(path.relative_to(root)), path.read_bytes())
-    ]
+def drawn(root: Path, count: int, seed: int, paths: Sequence[str] = ("service", "viewer")) -> list[Mutant]:
+    """Return mutants of files and folders by chance, the kinds in turn; of a longer list the first are the same."""
+    files = (f for p in paths for f in (sorted((root / p).rglob("*.py")) if (root / p).is_dir() else [root / p]))
+    found = [m for file in files for m in mutants_of(str(file.relative_to(root)), file.read_bytes())]
     by_kind = [[mutant for mutant in found if mutant.kind == kind] for kind in KINDS]
     for mutants in by_kind:
         random.Random(seed).shuffle(mutants)
@@ -62,27 +63,55 @@ def drawn(root: Path, count: int, seed: int) -> list[Mutant]:
 # ------------------------------------------------------------------ which tests run a line
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Coverage:
     """Which tests run a line, by the measured contexts `file::test|phase`."""
 
     data: CoverageData
     names: dict[str, str]
     """Path in the repository -> path in the data."""
+    commit: str
+    """What was measured."""
+    seconds: dict[str, float]
+    """Of each test, with the fixtures that it was the first to need."""
 
     @classmethod
-    def read(cls, file: Path) -> Coverage:
-        data = CoverageData(str(file))
+    def read(cls, folder: Path) -> Coverage:
+        data = CoverageData(str(folder / "contexts.coverage"))
         data.read()
-        return cls(data, {re.sub(r"^.*?/(?=(service|viewer)/)", "", name): name for name in data.measured_files()})
+        names = {re.sub(r"^.*?/(?=(service|viewer)/)", "", name): name for name in data.measured_files()}
+        seconds = {}
+        for case in ET.parse(folder / "seconds.xml").iter("testcase"):
+            module, _, classes = case.attrib["classname"].removeprefix("tests.").partition(".")
+            parts = [f"tests/{module}.py", *filter(None, classes.split(".")), case.attrib["name"]]
+            seconds["::".join(parts)] = float(case.attrib["time"])
+        return cls(data, names, (folder / "commit").read_text().strip(), seconds)
+
+    @cached_property
+    def changed(self) -> set[str]:
+        """The test files that aren't what was measured."""
+        return set(_git("diff", "--name-only", self.commit, "HEAD", "--", "tests").split())
+
+    def line(self, mutant: Mutant) -> int | None:
+        """Return the line of a mutant when it was measured, None if it was another."""
+        if not _git("diff", "--name-only", self.commit, "HEAD", "--", mutant.file):
+            return mutant.line
+        if not _git("ls-tree", self.commit, "--", mutant.file):
+            return None
+        before, after = (_git("show", f"{at}:{mutant.file}").splitlines() for at in (self.commit, "HEAD"))
+        for i, j, count in difflib.SequenceMatcher(None, before, after, autojunk=False).get_matching_blocks():
+            if j < mutant.line <= j + count:
+                return mutant.line - j + i
+        return None
 
     def tests(self, mutant: Mutant) -> list[str]:
-        """Return the tests that run the line; of what a fixture runs, all tests of the file."""
+        """Return the tests that run the line; all tests of a file that has changed or whose fixture runs it."""
         found = set()
-        for context in self.data.contexts_by_lineno(self.names.get(mutant.file, "")).get(mutant.line, []):
+        for context in self.data.contexts_by_lineno(self.names.get(mutant.file, "")).get(self.line(mutant) or -1, []):
             test, _, phase = context.partition("|")
             if test:
-                found.add(test if phase == "run" else test.split("::")[0])
+                file = test.split("::")[0]
+                found.add(test if phase == "run" and file not in self.changed else file)
         return sorted(test for test in found if "::" not in test or test.split("::")[0] not in found)
 
     def files(self, source: str) -> set[str]:
@@ -90,33 +119,53 @@ class Coverage:
         contexts = self.data.contexts_by_lineno(self.names.get(source, "")).values()
         return {test.split("::")[0] for tests in contexts for test in tests if test}
 
+    def cheapest_first(self, tests: Iterable[str]) -> list[str]:
+        """Return tests by file, the files that take the least time first; a file's tests keep their order."""
+        of_files: dict[str, list[str]] = defaultdict(list)
+        for test in tests:
+            of_files[test.split("::")[0]].append(test)
+        whole: dict[str, float] = defaultdict(float)
+        for test, seconds in self.seconds.items():
+            whole[test.split("::")[0]] += seconds
+        cost = {
+            file: sum(whole[file] if each == file else self.seconds.get(each, 0.0) for each in chosen)
+            for file, chosen in of_files.items()
+        }
+        order = {test: i for i, test in enumerate(self.seconds)}
+        files = sorted(cost, key=cost.__getitem__)
+        return [test for file in files for test in sorted(of_files[file], key=lambda test: order.get(test, -1))]
 
-def measured(copy: Copy, workers: int, file: Path) -> None:
-    """Run all tests once and write which of them run which line."""
-    file.unlink(missing_ok=True)
+
+def _git(*arguments: str) -> str:
+    return subprocess.run(["git", *arguments], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+
+
+def measure(copy: Copy, workers: int, folder: Path) -> None:
+    """Run all tests once and write which of them run which line, how long each takes, and of which commit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "contexts.coverage").unlink(missing_ok=True)
     command = ["-n", str(workers), "--dist=loadfile", "--cov", "--cov-context=test", "--cov-report="]
-    done = copy.pytest(command, 3600, COVERAGE_FILE=str(file.absolute()))
+    command.append(f"--junitxml={(folder / 'seconds.xml').absolute()}")
+    done = copy.pytest(command, 3600, COVERAGE_FILE=str((folder / "contexts.coverage").absolute()))
     if done.returncode != 0:
         print(f"some tests fail before anything is changed:\n{done.stdout[-3000:]}", file=sys.stderr)
+    (folder / "commit").write_text(_git("rev-parse", "HEAD"))
 
 
 def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]]:
     """Yield what to run, one after the other until something fails."""
     near = {str(path) for path in naming(mutant.file, copy) if path.parts[0] == "tests"}
-    tests = [] if runs_at_import(mutant.line, (copy / mutant.file).read_bytes()) else coverage.tests(mutant)
-    if not tests:
-        near |= coverage.files(mutant.file)
-        importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
-        yield sorted(near)
-        yield sorted(importing - near)
-        # What only an import runs, such as a default in a model of the API, may show anywhere.
-        everything = {f"tests/{path.name}" for path in (copy / "tests").glob("test_*.py")}
-        yield sorted(everything - near - importing)
-    elif len(tests) <= FEW:
-        yield tests
-    else:
-        yield [test for test in tests if test.split("::")[0] in near]
-        yield [test for test in tests if test.split("::")[0] not in near]
+    tests = set() if runs_at_import(mutant.line, (copy / mutant.file).read_bytes()) else set(coverage.tests(mutant))
+    if tests:
+        added = near & coverage.changed
+        yield coverage.cheapest_first({test for test in tests if test.split("::")[0] not in added} | added)
+        return
+    near |= coverage.files(mutant.file)
+    importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
+    # What only an import runs, such as a default in a model of the API, may show anywhere.
+    everything = {f"tests/{path.name}" for path in (copy / "tests").glob("test_*.py")}
+    for files in (near, importing - near, everything - near - importing):
+        yield coverage.cheapest_first(files & everything)
 
 
 def runs_at_import(line: int, source: bytes) -> bool:
@@ -142,13 +191,15 @@ class Copy:
     """A copy of the last commit, with code caches of its own."""
 
     folder: Path
+    select: str = ""
+    """Of the tests those that pytest's `-m` selects."""
 
     @classmethod
-    def make(cls, folder: Path) -> Copy:
+    def make(cls, folder: Path, select: str = "") -> Copy:
         folder.mkdir()
         archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout
         subprocess.run(["tar", "-x"], cwd=folder, input=archive, check=True)
-        copy = cls(folder)
+        copy = cls(folder, select)
         warm = [sys.executable, "-m", "service", "doctor", "--warm"]
         subprocess.run(warm, cwd=folder, env=copy.environment, check=True, stdout=subprocess.DEVNULL)
         return copy
@@ -159,7 +210,7 @@ class Copy:
 
     def pytest(self, arguments: Sequence[str], limit_s: float, **environment: str) -> subprocess.CompletedProcess[str]:
         """Run tests; what takes longer has return code -1. A test may have to compile changed kernels first."""
-        options = ["-p", "no:cacheprovider", "--timeout=240"]
+        options = ["-p", "no:cacheprovider", "--timeout=240", "-m", self.select]
         command = [sys.executable, "-m", "pytest", *options, *arguments]
         with tempfile.TemporaryFile("w+") as output:
             process = subprocess.Popen(
@@ -179,15 +230,18 @@ class Copy:
             output.seek(0)
             return subprocess.CompletedProcess(command, code, output.read())
 
-    def first_failure(self, tests: Sequence[str], limit_s: float) -> str | None:
-        """Return the test that fails first, or "time limit", or None if all pass."""
+    def first_failure(self, tests: Sequence[str], limit_s: float) -> tuple[str, str] | None:
+        """Return the test that fails first and its error, or "time limit", or None if all pass."""
         listed = self.folder / ".tests"
         listed.write_text("\n".join(tests))
         done = self.pytest(["-x", f"@{listed}"], limit_s)
         if done.returncode in (0, 5):  # 5: there was no test
             return None
+        if done.returncode == -1:
+            return LIMIT, ""
         failed = re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - .*)?$", done.stdout, re.M)
-        return LIMIT if done.returncode == -1 else failed[1] if failed else f"exit code {done.returncode}"
+        error = re.search(r"^E   +(.*)$", done.stdout, re.M)
+        return failed[1] if failed else f"exit code {done.returncode}", error[1][:200] if error else ""
 
 
 def _end_group(process: subprocess.Popen) -> None:
@@ -201,7 +255,7 @@ def judged(mutant: Mutant, copy: Copy, coverage: Coverage, limit_s: float) -> di
     """Apply a mutant, run its tests, and take it back."""
     path = copy.folder / mutant.file
     source, times = path.read_bytes(), path.stat()
-    begun, failed = time.monotonic(), None
+    begun, failed, tests = time.monotonic(), None, []
     try:
         path.write_bytes(mutant.applied(source))
         for tests in stages(mutant, coverage, copy.folder):
@@ -212,11 +266,14 @@ def judged(mutant: Mutant, copy: Copy, coverage: Coverage, limit_s: float) -> di
     finally:
         path.write_bytes(source)
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))  # compiled kernels are found by it
-    flaky = failed is not None and "::" in failed and copy.first_failure([failed], limit_s) == failed
+    by, error = failed or (None, "")
+    again = [by] if by and by.startswith("tests/") else tests
+    flaky = by not in (None, LIMIT) and (copy.first_failure(again, limit_s) or (None,))[0] == by
     return {
         **{name: getattr(mutant, name) for name in ("file", "line", "column", "kind", "before", "after")},
-        "noticed": failed not in (None, LIMIT) and not flaky,
-        "by": failed,
+        "noticed": by not in (None, LIMIT) and not flaky,
+        "by": by,
+        "error": error,
         "flaky": flaky,
         "covered": bool(coverage.tests(mutant)),
         "seconds": round(time.monotonic() - begun, 1),
@@ -227,14 +284,15 @@ def judged(mutant: Mutant, copy: Copy, coverage: Coverage, limit_s: float) -> di
 # ------------------------------------------------------------------ the run
 
 
-def judge_all(todo: Sequence[Mutant], workers: int, limit_s: float, out: Path) -> None:
+def judge_all(
+    todo: Sequence[Mutant], workers: int, limit_s: float, out: Path, folder_measured: Path, select: str
+) -> None:
     """Judge mutants, several at a time, and add their lines to the output."""
     with tempfile.TemporaryDirectory() as folder, out.open("a") as lines, ThreadPoolExecutor(workers) as pool:
-        copies = list(pool.map(Copy.make, [Path(folder, str(i)) for i in range(workers)]))
-        contexts = out.with_suffix(".coverage")
-        if not contexts.exists():
-            measured(copies[0], workers, contexts)
-        coverage = Coverage.read(contexts)
+        copies = list(pool.map(lambda i: Copy.make(Path(folder, str(i)), select), range(workers)))
+        if not (folder_measured / "commit").exists():
+            measure(copies[0], workers, folder_measured)
+        coverage = Coverage.read(folder_measured)
         idle: queue.SimpleQueue[Copy] = queue.SimpleQueue()
         for copy in copies:
             idle.put(copy)
@@ -263,10 +321,14 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=60)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--limit-s", type=float, default=600)
+    parser.add_argument("--measured", type=Path, help="by default beside the output")
+    parser.add_argument("--select", default="", help="of the tests only those: an expression as of pytest's -m")
+    parser.add_argument("paths", nargs="*", default=["service", "viewer"])
     asked = parser.parse_args()
     done = {tuple(row[name] for name in ("file", "line", "column", "before", "after")) for row in rows_of(asked.out)}
-    todo = [mutant for mutant in drawn(ROOT, asked.count, asked.seed) if mutant.key not in done]
-    judge_all(todo, asked.workers, asked.limit_s, asked.out)
+    todo = [mutant for mutant in drawn(ROOT, asked.count, asked.seed, asked.paths) if mutant.key not in done]
+    folder = asked.measured or asked.out.with_suffix(".measured")
+    judge_all(todo, asked.workers, asked.limit_s, asked.out, folder, asked.select)
     counted = [row for row in rows_of(asked.out) if not row["equivalent"]]
     missed = [f"{row['file']}:{row['line']} {row['before']} -> {row['after']}" for row in counted if not row["noticed"]]
     print(json.dumps({"mutants": len(counted), "noticed": len(counted) - len(missed), "missed": missed}, indent=1))
