@@ -5,14 +5,22 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
+from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, estimate, folder_of, poses
 
+from service.bench import gate
+from service.bench import localize as bench
 from service.bench.gate import GARBAGE, unrelated_image
 from service.bench.gate_fit import Sample, fit_model, fitted, probabilities, summary
+from service.bench.pose_metrics import Units
+from service.geometry import moved, pose_distance
 from service.pose.verification.gate import VERIFICATION
 from service.pose.verification.gate_model import MODEL_FILE, SHIPPED_MODEL, load_model, write_model
+from service.results import IterationRecord, Reason, Status, Verdict
 
 
 def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:
@@ -160,3 +168,175 @@ def test_pictures_of_nothing_are_pictures_and_differ() -> None:
     assert all(p.min() >= 0 and p.max() <= 1 for p in pictures)
     means = np.array([[p.mean(), p.std(), np.abs(np.diff(p, axis=1)).mean()] for p in pictures])
     assert len(np.unique(means.round(4), axis=0)) == GARBAGE
+
+
+def test_pictures_of_nothing_are_what_they_are_called() -> None:
+    grey, noise, ramp, blotches, diagonal, bars, rectangles, soft = map(unrelated_image, range(GARBAGE))
+    assert np.unique(grey) == 0.5
+    assert np.ptp(ramp, axis=0).max() == 0
+    assert (ramp[0, 0] == 0).all()
+    assert (ramp[0, -1] == 1).all()
+    # Diagonal stripes of 20 pixels; bars of 4 or a multiple.
+    assert set(np.unique(diagonal)) == set(np.unique(bars)) == {0.0, 1.0}
+    assert (diagonal[0, :80, 0] == np.repeat([0, 1, 0, 1], 20)).all()
+    assert np.array_equal(diagonal[1:, :-1], diagonal[:-1, 1:])
+    assert np.ptp(bars[0, :, 0].reshape(-1, 4), axis=1).max() == np.ptp(bars, axis=0).max() == 0
+    # How far neighbours differ: noise by 1/3 on average; what was enlarged 4 and 40 times by about 4 and 40 times less.
+    roughness = [np.abs(np.diff(picture, axis=1)).mean() for picture in (noise, soft, blotches)]
+    assert roughness[0] == pytest.approx(1 / 3, rel=0.02)
+    assert roughness[0] > 3 * roughness[1] > 15 * roughness[2] > 0
+    # Nearly everything but the margins is covered by rectangles of random colours.
+    assert (rectangles == 0.5).all(2).mean() < 0.05
+    assert 100 < len(np.unique(rectangles.reshape(-1, 3), axis=0)) <= 201
+
+
+# ------------------------------------------------------------------ how samples are gathered
+
+
+def bench_scene(units_per_scene_unit: float = 1.0) -> SimpleNamespace:
+    loaded = SimpleNamespace(scene=SimpleNamespace(info=SimpleNamespace(name="s")))
+    return SimpleNamespace(units=Units(np.zeros(3), units_per_scene_unit, False), loaded=loaded)
+
+
+def test_poses_are_moved_by_the_stated_distances_evenly_on_a_logarithmic_scale() -> None:
+    rng = np.random.default_rng(0)
+    for between, most_deg in (gate.MOVED, gate.NEAR):
+        away = [
+            pose_distance(gate._moved(poses()[0], bench_scene(2.0), between, most_deg, rng), poses()[0])
+            for _ in range(200)
+        ]
+        degrees, scene_units = np.array(away).T
+        low, high = np.array(between) / 2.0
+        assert low <= scene_units.min() < 1.1 * low
+        assert 0.9 * high < scene_units.max() <= high
+        assert np.median(scene_units) == pytest.approx(np.sqrt(low * high), rel=0.25)
+        assert 0.95 * most_deg < degrees.max() <= most_deg
+        assert np.median(degrees) == pytest.approx(most_deg / 2, rel=0.15)
+    # As the module describes them.
+    assert gate.MOVED == ((0.06, 1.5), 8.0)
+    assert gate.NEAR == ((0.002, 0.012), 0.12)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "units", "right"), [(4.9, 0.0, True), (5.1, 0.0, False), (0.0, 0.049, True), (0.0, 0.051, False)]
+)
+def test_a_pose_is_right_within_five_degrees_and_a_twentieth(degrees: float, units: float, right: bool) -> None:
+    truth, verdict = poses()[0], estimate(poses()[0]).verdict
+    pose = moved(truth, np.array([0, 0, np.radians(degrees), units / 2, 0, 0]))
+    assert gate._sample(bench_scene(2.0), "clean", "p", truth, pose, verdict).right is right
+    assert not gate._sample(bench_scene(2.0), "foreign", "p", None, pose, verdict).right
+
+
+@pytest.mark.parametrize(
+    ("reason", "doubted"),
+    [
+        *((Reason(name), True) for name in ("focal_uncertain", "intrinsics_contradicted", "low_coverage")),
+        *((Reason(name), True) for name in ("position_uncertain", "ambiguous", "mirrored")),
+        *((Reason(name), False) for name in ("verified", "render_mismatch", "few_inliers")),
+    ],
+)
+def test_what_has_a_reason_beside_the_signals_is_in_doubt(reason: Reason, doubted: bool) -> None:
+    verdict = replace(estimate(poses()[0]).verdict, reason=reason)
+    assert gate._sample(bench_scene(), "clean", "p", None, poses()[0], verdict).doubted is doubted
+
+
+def large_photos(folder: Path) -> Path:
+    """Enlarge a scene's photos, so that enough is left where they are cropped."""
+    file = folder / "transforms.json"
+    data = json.loads(file.read_text())
+    for frame in data["frames"]:
+        frame |= {name: 6 * frame[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+        with Image.open(folder / frame["file_path"]) as image:
+            image.resize((384, 288)).save(folder / frame["file_path"])
+    file.write_text(json.dumps(data))
+    return folder
+
+
+@pytest.fixture
+def gathered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """`gate.run` on scenes of two photos whose every photo is localized where the first one was taken."""
+    truths = [poses()[0], poses()[5]]
+    seen = SimpleNamespace(occluders=set(), queries=0, progress=[])
+
+    def verdict_at(pose, status=Status.LOCALIZED) -> Verdict:
+        degrees, distance = np.min([pose_distance(pose, truth) for truth in truths], axis=0)
+        level = 0.95 if degrees < 5 and distance < 0.03 else 0.1
+        return replace(estimate(pose, status).verdict, signals=dict(sample("s", "", True, level).signals))
+
+    def localize(query, loaded, request):
+        assert request.options.effort == "fast"
+        seen.queries += 1
+        inliers = 1000 if query.rgb.shape[1] == 384 else 3
+        record = IterationRecord("refine", poses()[0], num_inliers=inliers)
+        return replace(estimate(poses()[0]), records=(record,))
+
+    def prepare_photo(photo, modify, background, seed, occluders):
+        seen.occluders |= {picture.shape for picture in occluders}
+        return original(photo, modify, background, seed, occluders)
+
+    original = gate.prepare_photo
+    monkeypatch.setattr(gate, "prepare_photo", prepare_photo)
+    monkeypatch.setattr(bench.LoadedScene, "of", lambda scene, **_: FakeLoaded(scene, FakeRasterizer(), FakeMatcher()))
+    monkeypatch.setattr(gate, "localize", localize)
+    monkeypatch.setattr(gate, "render_and_verify", lambda images, pose, rasterizer: verdict_at(pose))
+    monkeypatch.setattr(gate, "verify", lambda images, pose, rendered: verdict_at(pose))
+    # A step of refinement leads nowhere: once to no pose at all, else back to the truth or to where it began.
+    losses = iter([np.inf] + [1.0] * 1000)
+    monkeypatch.setattr(
+        gate, "refine_photometric", lambda p, f, c, start, levels: SimpleNamespace(loss=next(losses), pose=start.pose)
+    )
+    found = iter([None, *(SimpleNamespace(pose=pose) for pose in truths * 1000)])
+    monkeypatch.setattr(gate, "refine_from", lambda images, expected, rendered, rasterizer: next(found))
+    verdicts = iter([None, *([Status.LOCALIZED, Status.NOT_LOCALIZED] * 1000)])
+    monkeypatch.setattr(gate, "verify_tracked", lambda images, f: (s := next(verdicts)) and verdict_at(f.pose, s))
+
+    def run(*names: str) -> tuple[dict, SimpleNamespace]:
+        folders = [large_photos(folder_of(tmp_path / name, "nerfstudio")) for name in names]
+        return gate.run(folders, progress=lambda *now: seen.progress.append(now)), seen
+
+    return run
+
+
+def test_the_samples_of_a_scene_are_those_that_the_module_describes(gathered) -> None:
+    result, seen = gathered("a")
+    by_kind: dict[str, list[dict]] = {}
+    for line in result["samples"]:
+        by_kind.setdefault(line["kind"], []).append(line)
+    counts = {kind: len(lines) for kind, lines in by_kind.items()}
+    drawn = {name if name else "clean" for name in (",".join(m) for m in gate.WITHIN_REASON)}
+    drawn |= {f"beyond {m[0]}" for m in gate.BEYOND}
+    # Of two photos: each modification once, the mirror image, six poses moved little and much.
+    assert counts == dict.fromkeys([*drawn, "mirrored"], 2) | {
+        "near": 12, "moved": 12, "drifted": 11, "tracked": 11, "garbage": GARBAGE
+    }  # fmt: skip
+    assert seen.progress == [(1, 2), (2, 2)]
+    assert seen.queries == 2 * (len(drawn) + 1) + GARBAGE
+    # Everything is localized where the first photo was taken; turned by 45 degrees, that is wrong.
+    for kind, lines in by_kind.items():
+        if kind in drawn:
+            assert [line["right"] for line in lines] == [kind != "roll=45", False], kind
+    assert all(line["right"] for line in by_kind["near"])
+    assert not any(line["right"] for kind in ("mirrored", "garbage", "moved", "drifted") for line in by_kind[kind])
+    # The first refinement found nothing; of the other poses the tracker doubts one, then accepts every other.
+    assert [line["tracked"] for line in by_kind["tracked"]] == [False, *([True, False] * 5)]
+    assert all(line["tracked"] is None for kind, lines in by_kind.items() if kind != "tracked" for line in lines)
+    # Many inliers led to the photos' poses, few to those of pictures of another size.
+    assert all(line["matched"] for line in by_kind["clean"])
+    assert not any(line["matched"] for line in by_kind["garbage"])
+    # A single scene has no other photos to cut from.
+    assert seen.occluders == {(480, 640, 3)}
+    assert result["model"]["fitted_on"]["scenes"][0]["photos"] == 2
+    assert result["model"]["fitted_on"]["poses"] == len(result["samples"]) - len(by_kind["tracked"])
+
+
+def test_photos_of_the_other_scenes_are_foreign_and_cut_from(gathered, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gate, "WITHIN_REASON", ((), ("occlusion=0.2",)))
+    monkeypatch.setattr(gate, "BEYOND", ())
+    result, seen = gathered("a", "b")
+    foreign = [line for line in result["samples"] if line["kind"] == "foreign"]
+    assert [(line["scene"], line["right"]) for line in foreign] == [("a", False)] * 2 + [("b", False)] * 2
+    assert seen.occluders == {(288, 384, 3)}
+    assert seen.progress[-1] == (4, 4)
+    # A scene's samples don't depend on the scenes before it: the same photos, the same draws.
+    moved_poses = [line["signals"] for line in result["samples"] if line["kind"] == "near"]
+    assert moved_poses[:12] == moved_poses[12:]

@@ -185,7 +185,7 @@ def _foreign(one: BenchScene, others: Sequence[BenchScene]) -> Iterator[Sample]:
 
 
 def unrelated_image(number: int) -> np.ndarray:
-    """Return a picture of nothing: one colour, noise, ramp, blotches, chequers, stripes, rectangles, soft noise."""
+    """Return a picture of nothing: grey, noise, ramp, blotches, diagonal stripes, bars, rectangles, or soft noise."""
     rng = np.random.default_rng(number)
     height, width = 480, 640
     picture = np.full((height, width, 3), 0.5, np.float32)
