@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,20 +18,23 @@ import small_room
 import torch
 from typer.testing import CliRunner
 
-from service.bench import gpu
+from service.bench import gpu, gpu_equality, gpu_memory, gpu_speed
 from service.bench.gpu_equality import image_differences
 from service.bench.gpu_runner import Part, run_parts
-from service.bench.gpu_shared import Shared, machine
+from service.bench.gpu_shared import SMALL, Shared, machine
 from service.bench.gpu_table import markdown
 from service.bench.large_scenes import write_folder
+from service.bench.pose_metrics import Units
 from service.cli import app as command_line
 from service.cli.app import app
-from service.errors import UnknownName
-from service.interfaces import Frame
+from service.errors import BackendMissing, UnknownName
+from service.geometry import pose_distance
+from service.interfaces import Frame, SceneGradients
 from service.photos.images import encode_image
 from service.render.cpu import CpuRasterizer
+from service.results import Status
 from service.scene_formats import load_scene
-from service.types import Camera, Intrinsics
+from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 ROOT = Path(__file__).parents[1]
 SETUP = "bench_parts:Shared", ("scene",)
@@ -239,6 +243,301 @@ def test_the_table_of_a_run_that_was_cut_short():
     assert "| differs: a.jpg | localized, CPU uncertain; 0.5 deg, 0.25 units |" in text
     assert "| 1,000 | 0.5 | 2 |" in text
     assert "| 9,000 | a / b |  |" in text
+
+
+# ------------------------------------------------------------------ each part, by a planted clock and planted renders
+
+
+class Clock:
+    """Time that passes only when something takes some."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def takes(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch) -> Clock:
+    clock = Clock()
+    for module in (gpu_speed, gpu_memory):
+        monkeypatch.setattr(module, "time", clock)
+    return clock
+
+
+class PlantedScene:
+    """Two photos and two renderers, `a` being tested and twice as slow; memory grows by a byte a localization."""
+
+    def __init__(self, clock: Clock, **work) -> None:
+        self.clock, self.work = clock, replace(SMALL, **work)
+        self.photos = ["p", "q"]
+        self.tested, self.reference = self.loaded(2.0), self.loaded(1.0)
+        self.both = ("a", self.tested), ("b", self.reference)
+        self.localized: list[str] = []
+
+    def loaded(self, slow: float) -> SimpleNamespace:
+        def render(cameras):
+            self.clock.takes(0.5 * slow * len(cameras))
+
+        rasterizer = SimpleNamespace(render=render)
+        return SimpleNamespace(
+            slow=slow, prepare=lambda estimator: None, rasterizer=rasterizer, scene=None, matcher=None
+        )
+
+    def localize(self, photo: str, loaded: SimpleNamespace) -> SimpleNamespace:
+        """Localize `p` in 1 s, of which 0.75 s are a stage; `q` in 3 s, in two stages of 1 s."""
+        self.localized.append(photo)
+        stages = {"p": {"retrieve": 0.75}, "q": {"retrieve": 1.0, "refine": 1.0}}[photo]
+        self.clock.takes(loaded.slow * {"p": 1.0, "q": 3.0}[photo])
+        timings = [SimpleNamespace(stage=name, wall_s=loaded.slow * took) for name, took in stages.items()]
+        return SimpleNamespace(timings=timings)
+
+    def device_memory(self) -> dict[str, int]:
+        return {"peak_bytes": len(self.localized)}
+
+
+def test_latency_is_the_median_of_the_photos_and_of_each_stage(clock):
+    shared = PlantedScene(clock, repeats=3)
+    of_a, of_b = gpu_speed.latency(shared)
+    assert shared.localized == ["p", *["p", "q"] * 3] * 2  # the first isn't counted
+    assert (of_b["renderer"], of_b["localizations"]) == ("b", 6)
+    assert of_b["ms_p50"] == pytest.approx(2000)
+    assert of_b["ms_p95"] == pytest.approx(3000)
+    # Decoding is what no stage took: 0.25 s of `p`, 1 s of `q`.
+    assert of_b["stages_ms_p50"] == pytest.approx({"retrieve": 875, "refine": 1000, "decode": 625})
+    assert of_b["stages_count"] == {"retrieve": 6, "refine": 3, "decode": 6}
+    assert of_a["stages_ms_p50"] == pytest.approx({name: 2 * ms for name, ms in of_b["stages_ms_p50"].items()})
+
+
+def test_throughput_counts_the_jobs_that_began_in_time(clock):
+    of_a, of_b = gpu_speed.throughput(PlantedScene(clock, at_a_time=(1,), throughput_s=8.5))
+    # p, q, p, q, p end at 1, 4, 5, 8 and 9 s; twice as slow, p, q, p at 2, 8 and 10 s.
+    assert of_b == {"renderer": "b", "at_a_time": 1, "jobs": 5, "jobs_per_s": pytest.approx(5 / 9)}
+    assert (of_a["jobs"], of_a["jobs_per_s"]) == (3, pytest.approx(3 / 10))
+    # One at least, though the time is over before.
+    (slow, _) = gpu_speed.throughput(PlantedScene(clock, at_a_time=(1,), throughput_s=0.0))
+    assert (slow["jobs"], slow["jobs_per_s"]) == (1, pytest.approx(1 / 2))
+
+
+def test_the_index_is_timed_with_and_without_its_renders(clock, monkeypatch):
+    def prepared_index(tools, _):
+        clock.takes(6.0)
+        return SimpleNamespace(views=[SimpleNamespace(camera=k) for k in range(3)])
+
+    monkeypatch.setattr(gpu_speed, "prepared_index", prepared_index)
+    of_a, of_b = gpu_speed.index(PlantedScene(clock))
+    assert of_b == {"renderer": "b", "views": 3, "seconds": 6.0, "views_per_s": 0.5, "renders_per_s": 2.0}
+    assert of_a["renders_per_s"] == 1.0
+
+
+def test_memory_is_read_after_every_tenth_of_the_jobs(clock):
+    shared = PlantedScene(clock, jobs=40)
+    rows = list(gpu_memory.many_jobs(shared))
+    assert [row["jobs"] for row in rows] == [2, *range(4, 41, 4)]
+    # Photos in turn, each once: 1 s and 3 s, twice as slow.
+    assert [row["seconds"] for row in rows] == [4.0 * row["jobs"] for row in rows]
+    assert [row["device_peak_bytes"] for row in rows] == [row["jobs"] for row in rows]
+    assert all(row["resident_bytes"] > 1e6 for row in rows)
+    assert sorted(shared.localized) == ["p"] * 20 + ["q"] * 20
+    assert [row["jobs"] for row in gpu_memory.many_jobs(PlantedScene(clock, jobs=3))] == [1, 2, 3]
+
+
+class OutOfMemoryError(RuntimeError):
+    """Of the same name as PyTorch's."""
+
+
+LENS = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
+
+
+def named_cameras(count: int) -> tuple[NamedCamera, ...]:
+    poses = [Pose(np.array([[1, 0, 0, k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])) for k in range(count)]
+    return tuple(NamedCamera(f"{k}.jpg", Camera(LENS, pose)) for k, pose in enumerate(poses))
+
+
+def test_each_size_of_a_scene_is_timed_until_one_does_not_fit(clock, room, monkeypatch):
+    scene = replace(load_scene(room), cameras=named_cameras(2))
+    widths = []
+
+    class Module:
+        @staticmethod
+        def create(part):
+            clock.takes(part.count / 1000)
+            if part.count > 3000:
+                raise OutOfMemoryError("full")
+
+            def render(cameras):
+                widths.extend(camera.intrinsics.width for camera in cameras)
+                clock.takes(0.1 if len(cameras) == 1 else 0.04 * len(cameras))  # together they take less
+
+            return SimpleNamespace(render=render, nbytes=7 * part.count)
+
+    shared = PlantedScene(clock, sizes=(1000, 2000, 4000), sizes_px=80, views=2)
+    shared.scene, shared.module = scene, Module
+    monkeypatch.setattr(gpu_memory, "surround_with_copies", lambda scene, count: gpu_memory._first(scene, count))
+    monkeypatch.setattr(gpu_memory, "keep_most_contributing", lambda scene, count, _: gpu_memory._first(scene, count))
+    small, larger, full = gpu_memory.sizes(shared)
+    assert [row["gaussians"] for row in (small, larger, full)] == [1000, 2000, 4000]
+    assert (small["create_s"], larger["create_s"]) == pytest.approx((1.0, 2.0))
+    assert (small["bytes"], larger["bytes"]) == (7000, 14000)
+    for width in (20, 80):
+        assert (small[f"ms_{width}px"], small[f"ms_{width}px_together"]) == pytest.approx((100, 40))
+    # Two cameras, five times one by one and once together, in both widths of both sizes.
+    assert widths == ([20] * 12 + [80] * 12) * 2
+    assert small["device_peak_bytes"] == 0
+    assert full["error"] == "OutOfMemoryError: full"
+    monkeypatch.setattr(Module, "create", lambda part: (_ for _ in ()).throw(RuntimeError("lost")))
+    with pytest.raises(RuntimeError, match="lost"):
+        list(gpu_memory.sizes(shared))
+    monkeypatch.setattr(Module, "create", lambda part: (_ for _ in ()).throw(BackendMissing("no GPU", where="render")))
+    assert [row["gaussians"] for row in gpu_memory.sizes(shared)] == [1000]
+
+
+@pytest.mark.parametrize("size", [LENS.width, LENS.width // 2])
+def test_a_scene_then_a_render_and_nothing_afterwards_lacks_memory(clock, room, size):
+    shared = PlantedScene(clock, sizes_px=size)
+    shared.scene, shared.renderer = replace(load_scene(room), cameras=named_cameras(1)), "a"
+    limits: list[int | None] = [None]
+
+    class Planted:
+        def render(self, cameras):
+            (camera,) = cameras
+            assert camera.intrinsics.width == size
+            if limits[-1] == 0:
+                raise OutOfMemoryError("no image")
+            flat = np.full((2, 2), np.float32(len(limits) if size < LENS.width else 1))
+            return [Frame(np.stack([flat] * 3, 2), flat, flat, flat)]
+
+        def of(self, scene):
+            assert limits[-1] == scene.nbytes // 2
+            raise BackendMissing("no memory left", where="render")
+
+    shared.tested.rasterizer, shared.module = Planted(), SimpleNamespace(limit_device_memory=limits.append)
+    rows = {row["case"]: row["happens"] for row in gpu_memory.out_of_memory(shared)}
+    same = "the same image" if size == LENS.width else "another image"
+    assert list(rows.values()) == ["BackendMissing: render: no memory left", "OutOfMemoryError: no image", same]
+    assert limits == [None, shared.scene.nbytes // 2, 0, None]
+    shared.module = SimpleNamespace()
+    assert [row["case"] for row in gpu_memory.out_of_memory(shared)] == ["none"]
+
+
+class OffBy:
+    """A renderer whose images are off by some amount at a share of the pixels, its gradients by a share."""
+
+    def __init__(self, amount: float = 0.0, share: float = 1.0, gradient: float = 0.0) -> None:
+        self.amount, self.share, self.gradient = amount, share, gradient
+
+    def render(self, cameras):
+        (camera,) = cameras
+        shape = camera.intrinsics.height, camera.intrinsics.width
+        off = np.zeros(shape[0] * shape[1])
+        off[: round(self.share * len(off))] = self.amount
+        flat = (0.5 + off.reshape(shape)).astype(np.float32)
+        return [Frame(np.stack([flat] * 3, 2), flat, flat, flat)]
+
+    def pose_gradient(self, camera, d_rgb, d_depth, d_alpha):
+        assert d_rgb.shape == (*d_depth.shape, 3) == (camera.intrinsics.height, camera.intrinsics.width, 3)
+        return np.arange(1.0, 7.0) * (1 + self.gradient)
+
+    def scene_gradients(self, camera, d_rgb, d_depth, d_alpha):
+        rows = {name: np.ones((2, size), np.float32) for name, size in (("means", 3), ("quats", 4), ("scales", 3))}
+        rows |= {"opacities": np.ones(2, np.float32), "sh": np.ones((2, 1, 3), np.float32)}
+        rows["scales"] *= np.float32(1 + self.gradient)
+        return SceneGradients(np.array([4, 1], np.int32), **rows)
+
+
+def compared(clock, room, ours: OffBy) -> PlantedScene:
+    shared = PlantedScene(clock, views=2, widths=(40, 80), compared=None)
+    shared.scene = replace(load_scene(room), cameras=named_cameras(3))
+    shared.tested.rasterizer, shared.reference.rasterizer = ours, OffBy()
+    return shared
+
+
+@pytest.mark.parametrize(
+    ("ours", "within"),
+    [
+        (OffBy(5e-7), True),
+        (OffBy(2e-6), False),  # the mean's bound is 1e-6
+        (OffBy(9e-5, 0.002), True),
+        (OffBy(2e-4, 0.002), False),  # a quantile's is 1e-4: more than a thousandth of the pixels are beyond
+        (OffBy(8e-4, 0.0005), True),
+    ],
+)
+def test_images_agree_within_the_bounds_of_mean_and_quantile(clock, room, ours, within):
+    rows = list(gpu_equality.pictures(compared(clock, room, ours)))
+    assert [(row["camera"], row["width"]) for row in rows] == [(n, w) for w in (40, 80) for n in ("0.jpg", "2.jpg")]
+    assert all(row["within"] is within for row in rows)
+    assert all(row["alpha"] == 0.5 for row in rows)
+
+
+@pytest.mark.parametrize(("off", "within"), [(0.9e-4, True), (1.1e-4, False)])
+def test_gradients_agree_within_a_ten_thousandth_of_their_norm(clock, room, off, within):
+    rows = list(gpu_equality.gradients(compared(clock, room, OffBy(gradient=off))))
+    assert [row["width"] for row in rows] == [80, 80]
+    for row in rows:
+        assert row["differences"]["pose"] == pytest.approx(off)
+        assert row["differences"]["scales"] == pytest.approx(off, rel=2e-3)
+        assert row["differences"]["means"] == 0
+        assert (row["gaussians"], row["within"]) == (2, within)
+
+
+@pytest.mark.parametrize(
+    ("statuses", "units", "within"),
+    [
+        (("localized", "localized"), 0.0009, True),
+        (("localized", "localized"), 0.0011, False),
+        (("localized", "uncertain"), 0.0, False),
+        (("uncertain", "uncertain"), 5.0, True),  # both refused: nothing to agree about
+    ],
+)
+def test_poses_agree_if_one_is_localized(clock, tmp_path, monkeypatch, statuses, units, within):
+    shared = PlantedScene(clock, spoilt=0)
+    truth = named_cameras(1)[0].camera
+    (tmp_path / "p.png").write_bytes(encode_image(np.full((60, 80, 3), 0.5, np.float32), "png"))
+    shared.photos = [SimpleNamespace(name="p", path=tmp_path / "p.png", camera=truth)]
+    shared.scene = SimpleNamespace(info=SimpleNamespace(background_rgb=(0, 0, 0)))
+    shared.units = Units(np.zeros(3), 0.5, False)
+    monkeypatch.setattr(gpu_equality, "spoilt_photos", lambda *_: iter(()))
+
+    def localize(query, loaded):
+        assert query.intrinsics.fx == LENS.fx
+        first = loaded is shared.tested
+        shifted = np.eye(4)
+        shifted[0, 3] = 2 * units if first else 0.0  # half a unit a scene unit
+        verdict = SimpleNamespace(status=Status(statuses[0 if first else 1]))
+        return SimpleNamespace(pose=Pose(shifted), verdict=verdict)
+
+    monkeypatch.setattr(gpu_equality, "localize", localize)
+    (row,) = gpu_equality.poses(shared)
+    assert (row["status"], row["cpu_status"], row["within"]) == (*statuses, within)
+    assert row["translation_units"] == pytest.approx(units)
+    assert row["truth_deg_units"] == pytest.approx([0, units])
+    assert row["cpu_truth_deg_units"] == [0, 0]
+
+
+def test_spoilt_photos_are_taken_near_cameras_and_are_the_same_every_time():
+    large = LENS.resized(320, 240)
+    cameras = tuple(NamedCamera(each.name, Camera(large, each.camera.pose)) for each in named_cameras(4))
+    loaded = SimpleNamespace(scene=SimpleNamespace(cameras=cameras), rasterizer=OffBy())
+    found = list(gpu_equality.spoilt_photos(loaded, 60, 160, units_per_scene_unit=10.0))
+    again = list(gpu_equality.spoilt_photos(loaded, 2, 160, units_per_scene_unit=10.0))
+    assert [data for _, data, _ in again] == [data for _, data, _ in found[:2]]
+    turned, shifted = [], []
+    for number, (name, _, camera) in enumerate(found):
+        label, taken_from, *specs = name.split()
+        assert (int(label), tuple(specs)) == (number, gpu_equality.SPOILT_BY[number % 6])
+        start = next(each.camera.pose for each in cameras if each.name == taken_from)
+        if "roll=12" not in specs:
+            degrees, distance = pose_distance(camera.pose, start)
+            turned.append(degrees)
+            shifted.append(distance)
+        assert max(camera.intrinsics.width, camera.intrinsics.height) <= 160
+    # The root mean square of three normal components is sqrt(3) times theirs; ten units are one scene unit.
+    assert np.sqrt(np.mean(np.square(turned))) == pytest.approx(np.degrees(0.15) * np.sqrt(3), rel=0.15)
+    assert np.sqrt(np.mean(np.square(shifted))) == pytest.approx(0.01 * np.sqrt(3), rel=0.15)
 
 
 @pytest.mark.gpu
