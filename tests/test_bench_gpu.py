@@ -534,7 +534,7 @@ def test_spoilt_photos_are_taken_near_cameras_and_are_the_same_every_time():
             degrees, distance = pose_distance(camera.pose, start)
             turned.append(degrees)
             shifted.append(distance)
-        assert max(camera.intrinsics.width, camera.intrinsics.height) <= 160
+            assert max(camera.intrinsics.width, camera.intrinsics.height) <= 160
     # The root mean square of three normal components is sqrt(3) times theirs; ten units are one scene unit.
     assert np.sqrt(np.mean(np.square(turned))) == pytest.approx(np.degrees(0.15) * np.sqrt(3), rel=0.15)
     assert np.sqrt(np.mean(np.square(shifted))) == pytest.approx(0.01 * np.sqrt(3), rel=0.15)
