@@ -31,6 +31,7 @@ from service.jobs.model import (
     Retention,
     StoredJob,
 )
+from service.jobs.store import JobWatch
 from service.scene_formats import load_scene
 from service.scene_manager.anchor_store import Anchor
 from service.scene_manager.scene_store import check_scene_id
@@ -51,6 +52,12 @@ class MemoryJobStore:
     def __init__(self) -> None:
         self._rows: dict[str, _Row] = {}
         self._lock = threading.RLock()
+
+    def watch(self) -> JobWatch | None:
+        return None
+
+    def now(self) -> float:
+        return time.time()
 
     def accept(self, job: NewJob) -> StoredJob:
         with self._lock:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from memory_stores import MemoryJobStore, MemoryPhotoStore, MemorySceneStore
+from postgres_server import Server, postgres_server
 from test_scenes import ply
 
 from service.errors import (
@@ -46,9 +47,33 @@ FAILURE = Failure("interrupted", "the service ended.")
 NONE = Batch(0, ())
 
 
-@pytest.fixture(params=["sqlite", "memory"])
+POSTGRES = pytest.param("postgres", marks=pytest.mark.ci)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture
+def database(server):
+    """An empty one in PostgreSQL."""
+    from service.jobs.postgres_database import PostgresDatabase
+
+    database = PostgresDatabase(server.database())
+    yield database
+    database.close()
+
+
+@pytest.fixture(params=["sqlite", "memory", POSTGRES])
 def store(request, tmp_path) -> Iterator[JobStore]:
-    made: JobStore = SqliteJobStore(tmp_path / "jobs.sqlite") if request.param == "sqlite" else MemoryJobStore()
+    if request.param == "postgres":
+        from service.jobs.postgres_store import PostgresJobStore
+
+        made: JobStore = PostgresJobStore(request.getfixturevalue("database"))
+    else:
+        made = SqliteJobStore(tmp_path / "jobs.sqlite") if request.param == "sqlite" else MemoryJobStore()
     assert isinstance(made, JobStore)
     yield made
     made.close()
@@ -335,9 +360,14 @@ def test_photos_are_stale_when_their_time_is_over(store):
 # ------------------------------------------------------------------ photos
 
 
-@pytest.fixture(params=["folder", "memory"])
+@pytest.fixture(params=["folder", "memory", POSTGRES])
 def photos(request, tmp_path) -> PhotoStore:
-    made = FolderPhotoStore(tmp_path / "photos") if request.param == "folder" else MemoryPhotoStore()
+    if request.param == "postgres":
+        from service.jobs.postgres_store import PostgresPhotoStore
+
+        made: PhotoStore = PostgresPhotoStore(request.getfixturevalue("database"))
+    else:
+        made = FolderPhotoStore(tmp_path / "photos") if request.param == "folder" else MemoryPhotoStore()
     assert isinstance(made, PhotoStore)
     return made
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ Connection = sqlite3.Connection
 
 
 class Database:
-    """One file."""
+    """One file; implements `SqlDatabase`."""
 
     def __init__(self, path: Path, migrations: Sequence[Callable[[Connection], None]], what: str) -> None:
         """Open the file or make it, and bring it to the present version. Raises StorageFailed.
@@ -61,6 +62,21 @@ class Database:
                 if isinstance(error, sqlite3.Error):
                     raise StorageFailed(f"the service can't write {self._what} to disk: {error}.") from error
                 raise
+
+    def lock(self, connection: Connection, name: str) -> None:
+        """Do nothing: one transaction at a time has the whole file."""
+
+    def announce(self, connection: Connection, job_id: str) -> None:
+        """Do nothing: one process uses the file."""
+
+    def now(self) -> float:
+        """Return the time of this machine."""
+        return time.time()
+
+    def probe(self) -> None:
+        """Write the version that is there. Raises StorageFailed."""
+        with self.transaction() as writer:
+            writer.execute(f"PRAGMA user_version = {self.version}")
 
     def give_space_back(self) -> None:
         """Make the file smaller by what was deleted."""

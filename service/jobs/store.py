@@ -1,4 +1,4 @@
-"""Where jobs are kept, as a protocol; `sqlite_store` is the implementation of the service.
+"""Where jobs are kept, as a protocol; `sqlite_store` implements it for one process, `postgres_store` for several.
 
 A worker owns an attempt from its claim until its lease ends, and renews the lease while it works. `reclaim` takes away
 attempts whose lease has ended; records and results of an attempt that was lost are refused. So a job ends once, however
@@ -14,12 +14,35 @@ from service.errors import Failure
 from service.jobs.model import Batch, Ending, JobFilter, JobRecord, JobResult, JobState, NewJob, Retention, StoredJob
 
 
+class JobWatch(Protocol):
+    """Hears of changes that other processes make to jobs of a store."""
+
+    def wait(self, seconds: float) -> set[str]:
+        """Return the ids of jobs that have changed, as soon as there are any, none after that time.
+
+        Changes may be merged or missed (a connection was lost): whoever waits looks at the jobs now and then, too.
+        """
+        ...
+
+    def close(self) -> None:
+        """Let `wait` return; called on another thread."""
+        ...
+
+
 @runtime_checkable
 class JobStore(Protocol):
     """Jobs with their records and results. Safe to call from several threads.
 
     A change is durable when its method returns; each raises StorageFailed if it can't be.
     """
+
+    def watch(self) -> JobWatch | None:
+        """Return what hears of changes by other processes; None: this process has the store for itself."""
+        ...
+
+    def now(self) -> float:
+        """Return the time by the clock that leases go by, in seconds since 1970."""
+        ...
 
     def accept(self, job: NewJob) -> StoredJob:
         """Store a new job, or return the one that has its idempotency key. Raises IdempotencyConflict."""

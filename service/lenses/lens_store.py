@@ -1,6 +1,6 @@
 """Where lenses are kept, as a protocol, and an implementation that forgets them with the process.
 
-`service/jobs/sqlite_lens_store.py` is the implementation of the service.
+`service/jobs/sql_lens_store.py` is the implementation of the service.
 """
 
 from __future__ import annotations
