@@ -15,8 +15,9 @@ from stand_ins import make_scene
 from service.errors import IdempotencyConflict, PhotoGone
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
+from service.jobs.job_order import JobOrder
 from service.jobs.model import JobSpec, StoredJob
-from service.jobs.service import JobOrder, Jobs
+from service.jobs.service import Jobs
 
 
 class CountingObserver:
@@ -69,7 +70,7 @@ def order(key: str | None = None, **options) -> JobOrder:
 
 
 def ended(jobs: Jobs, job: StoredJob) -> StoredJob:
-    until(lambda: jobs.get(job.id).ended and jobs.live(job.id) is None)
+    until(lambda: jobs.get(job.id).ended and jobs.live(job) is None)
     return jobs.get(job.id)
 
 
@@ -102,7 +103,7 @@ def test_a_lost_attempt_is_made_again_and_its_late_result_is_refused(stepping):
     observer = CountingObserver()
     with running(UnrenewedStore(), observer) as jobs:
         accepted = jobs.accept(order(hold=True))
-        live = jobs.live(accepted.id)
+        live = jobs.live(accepted)
         assert live
         until(lambda: jobs.get(accepted.id).attempt == 2)  # another worker has it, while the first one still holds on
         until(lambda: len(live.records) == 1)

@@ -22,8 +22,9 @@ from test_lenses import PHONE, viewpoint
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import EngineAnswer, LocalizeTask, OnRecord
+from service.jobs.job_order import JobOrder
 from service.jobs.model import JobRecord, JobResult, JobSpec
-from service.jobs.service import JobOrder, Jobs
+from service.jobs.service import Jobs
 from service.lenses.lens_memory import LensMemory, measured
 from service.lenses.lens_store import MemoryLensStore
 from service.photos.camera_identity import CameraIdentity

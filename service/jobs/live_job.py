@@ -61,6 +61,12 @@ class LiveJob:
         return f"{self.id}.{self.attempt}"
 
     @property
+    def has_listeners(self) -> bool:
+        """Whether somebody waits for changes."""
+        with self._lock:
+            return bool(self._listeners)
+
+    @property
     def memory_bytes(self) -> int:
         """Memory of the photo, bytes."""
         return self.shown.rgb.nbytes if self.shown else 0

@@ -81,6 +81,11 @@ class JobQueue:
         with self._changed, suppress(ValueError):
             self._queue.remove(job)
 
+    def idle(self) -> int:
+        """Return how many workers have nothing to do, and won't have by what waits here."""
+        with self._changed:
+            return sum(worker.job is None for worker in self._workers) - len(self._queue) - self._reserved
+
     def waiting(self) -> int:
         """Return how many jobs wait."""
         return len(self._queue)

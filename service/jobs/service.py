@@ -4,18 +4,18 @@
 
 The store has the authoritative state. Unfinished jobs are in memory, too, so that listeners get each record at once;
 an attempt's records are stored in batches, the last batch together with its end. The leases of running attempts are
-renewed here; an attempt whose lease has ended is made again, and listeners see the new attempt.
+renewed here; an attempt whose lease has ended is made again, and listeners see the new attempt. Where several
+processes share the store, jobs of the others are in memory as long as somebody listens (`shared_jobs`).
 """
 
 from __future__ import annotations
 
 import logging
 import math
-import secrets
 import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 from service.errors import (
@@ -30,29 +30,30 @@ from service.errors import (
 )
 from service.jobs.config import JobsConfig, Observer
 from service.jobs.engine import Engine, HeldScenes
+from service.jobs.job_order import JobOrder, new_job
+from service.jobs.left_over_photos import LeftOverPhotos
 from service.jobs.live_job import LiveJob
 from service.jobs.model import (
     Ending,
     JobFilter,
     JobRecord,
     JobResult,
-    JobSpec,
     LensUse,
     NewJob,
-    PhotoInfo,
     Retention,
     StoredJob,
 )
 from service.jobs.photo_store import PhotoStore
 from service.jobs.queue import JobQueue
-from service.jobs.read_photo import DecodedPhoto, Recall, read_photo
+from service.jobs.read_photo import Recall, read_photo
 from service.jobs.scene_wait import SceneWait
+from service.jobs.shared_jobs import SharedJobs
 from service.jobs.store import JobStore
 from service.jobs.worker import Worker
 from service.lenses.lens_memory import LensMemory
 from service.photos.images import encode_image, undistorted_jpeg
 from service.scene_manager.status import AUTO
-from service.types import NO_CORRECTION
+from service.types import NO_CORRECTION, Query
 
 _log = logging.getLogger(__name__)
 
@@ -61,25 +62,6 @@ _RENEWALS = 3
 """Of a lease before it ends."""
 _STUCK_LIMIT = 2
 """Abandoned threads keep their memory: from this number on the process should be restarted."""
-
-
-@dataclass(frozen=True, slots=True)
-class JobOrder:
-    """A photo, or several, and what to do with it; not yet decoded."""
-
-    photo: bytes
-    """A photo or a video as it was sent; several photos as `photos.sequence.packed` puts them together."""
-    name: str
-    """Of the file; empty if it has none."""
-    photo_sha256: str
-    spec: JobSpec
-    client: str
-    """Who asks: the scope of idempotency keys."""
-    idempotency_key: str | None
-    digest: str
-    """Of the request's meaning: the same for the same request."""
-    lens_owner: str = ""
-    """Among whose lenses the photo's is; empty: the photo's lens isn't remembered."""
 
 
 class Jobs:
@@ -108,24 +90,26 @@ class Jobs:
             stuck_s=config.stuck_s,
         )
         self._scene_wait = SceneWait(engine, self._queue, store, self._worker)
+        watch, take = store.watch(), self._enqueue_when_ready
+        self._shared = SharedJobs(watch, store, engine, self._queue, self._worker, take) if watch else None
+        self._left_over = LeftOverPhotos(store, photos)
         self._renew_at = 0.0
         self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
     def start(self) -> None:
         """Queue the unfinished jobs of an earlier process.
 
-        The data folder is locked for this process, so no other worker can be alive: all leases are over.
+        A data folder is locked for this process, so no other worker can be alive: all leases are over. In a store that
+        is shared they end by themselves, and what waits belongs to other fronts until it has waited for a while.
         """
-        self._reclaim(math.inf)
-        for job in self._store.queued():
-            if job.id not in self._live:
-                self._enqueue_when_ready(job)
-        # A photo is written before its job: a crash between the two leaves one without a job.
-        for orphan in self._photos.ids() - self._store.ids():
-            self._photos.delete(orphan)
-        # A crash after a job ended may have left the photo as it was sent, with its EXIF data.
-        for job_id in self._photos.with_original() - self._live.keys():
-            self._photos.discard_original(job_id, None)
+        if self._shared:
+            self._shared.start()
+        else:
+            self._reclaim(math.inf)
+            for job in self._store.queued():
+                if job.id not in self._live:
+                    self._enqueue_when_ready(job)
+            self._left_over.delete()
         self._maintenance.start()
 
     # ------------------------------------------------------------------ from outside
@@ -152,7 +136,7 @@ class Jobs:
                 # On record with the job: the same prior after a restart, whatever was learnt meanwhile.
                 lens = LensUse(order.lens_owner, photo.recalled)
                 order = replace(order, spec=replace(order.spec, lens=lens))
-            new = _new_job(order, scene, photo)
+            new = new_job(order, scene, photo)
             job = self._stored(new, order.photo)
         # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
         except BaseException:
@@ -228,14 +212,17 @@ class Jobs:
         """Return the newest jobs that fit, at most `limit`."""
         return [self._current(job) for job in self._store.page(wanted, limit)]
 
-    def live(self, job_id: str) -> LiveJob | None:
-        """Return the job if it hasn't ended."""
-        return self._live.get(job_id)
+    def live(self, job: StoredJob) -> LiveJob | None:
+        """Return the job as it goes on, here or at another front; None if it has ended. Not for the event loop."""
+        if (live := self._live.get(job.id)) or self._shared is None or job.ended:
+            return live
+        return self._shared.follow(job)
 
     def records(self, job: StoredJob, first: int = 0) -> list[JobRecord]:
         """Return the records of the latest attempt from number `first` on."""
         live = self._live.get(job.id)
-        return live.records[first:] if live and live.attempt else self._store.records(job.id, first)
+        ours = live and live.attempt and live.attempt >= job.attempt
+        return live.records[first:] if live and ours else self._store.records(job.id, first)
 
     def record(self, job: StoredJob, index: int | None) -> JobRecord:
         """Return a record; None: the latest. Raises JobNotReady if it may still come, else RecordNotFound."""
@@ -260,11 +247,19 @@ class Jobs:
     def photo(self, job: StoredJob) -> bytes:
         """Return the photo as the estimator sees it, as JPEG. Raises PhotoGone, JobNotReady."""
         live = self._live.get(job.id)
+        if live is None and not job.ended and self._shared:  # another front has it
+            return encode_image(self._read_again(job).rgb)
         if live is None:
             return self._photos.kept(job.id)
         if live.shown is None:
             raise JobNotReady("after a restart the photo is read again when the job starts.", where="photo")
         return encode_image(live.shown.rgb)
+
+    def _read_again(self, job: StoredJob) -> Query:
+        """Return the photo of a job that isn't in memory here."""
+        info = self._engine.scene(job.scene).info
+        background = info.background_rgb if info else (0.0, 0.0, 0.0)
+        return read_photo(self._photos.original(job.id), job.spec, background, self._config.max_frames).query
 
     def waiting(self) -> int:
         """Return how many jobs wait for a worker."""
@@ -290,16 +285,27 @@ class Jobs:
         return [*found, *([storage_error] if storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
-        """Cancel at once if the job waits, between two records if it runs; no effect once it has ended."""
+        """Cancel at once if the job waits, between two records if it runs; no effect once it has ended.
+
+        One that another front has ends as soon as that one hears of it.
+        """
         live = self._live.get(job.id)
-        if live is None:
+        if live is None and self._shared is None:
             return
         # On disk before the attempt stops, so that a crash in between does not run it again.
         self._store.request_cancel(job.id)
-        self._stop(live)
+        if live:
+            self._stop(live)
         if self._store.end_queued(job, Ending("cancelled"), self._worker.photo_until()):
+            self._ended(job.id)
+
+    def _ended(self, job_id: str) -> None:
+        """Clean up after a job that ended without a worker."""
+        if live := self._live.get(job_id):
             self._queue.withdraw(live)
             self._worker.clean_up(live)
+        else:
+            self._photos.discard_original(job_id, None)
 
     def delete(self, job: StoredJob) -> None:
         """Delete an ended job with its records, result and photo. Raises JobNotReady while it is queued or running."""
@@ -319,6 +325,8 @@ class Jobs:
             live.end()
         # It writes to the store, which is closed next.
         self._maintenance.join(_MAINTENANCE_S + 1)
+        if self._shared:
+            self._shared.close()
         self._store.close()
 
     def _stop(self, live: LiveJob) -> None:
@@ -328,7 +336,7 @@ class Jobs:
     def _current(self, job: StoredJob) -> StoredJob:
         """Return the job with the records that have come since the last batch."""
         live = self._live.get(job.id)
-        if live is None or not live.attempt or job.ended:
+        if live is None or not live.attempt or live.attempt < job.attempt or job.ended:
             return job
         return replace(job, records=len(live.records), stage=live.stage)
 
@@ -341,10 +349,12 @@ class Jobs:
         while not closing.wait(min(_MAINTENANCE_S, self._config.lease_s / _RENEWALS)):
             try:
                 self._renew()  # before `_reclaim`, which must not take attempts that are alive
-                self._reclaim(time.time())
+                self._reclaim(self._store.now())
                 self._scene_wait.expire()
                 for job_id in [*self._store.expire_photos(), *self._store.prune(kept)]:
                     self._photos.delete(job_id)
+                if self._shared:
+                    self._left_over.delete_old()
                 # No job may come that would show that the disk has space again: the service is not ready meanwhile.
                 if self._worker.storage_error:
                     self._store.probe()
@@ -357,7 +367,7 @@ class Jobs:
         if time.monotonic() < self._renew_at:
             return
         if running := tuple(self._worker.running):
-            self._store.renew(running, time.time() + self._config.lease_s)
+            self._store.renew(running, self._store.now() + self._config.lease_s)
         self._renew_at = time.monotonic() + self._config.lease_s / _RENEWALS
 
     def _reclaim(self, before: float) -> None:
@@ -365,34 +375,16 @@ class Jobs:
         failure = Failure.of(Interrupted(f"the service ended {most} times while this job ran."))
         for job in self._store.reclaim(before, most, failure):
             _log.warning("job %s: attempt %d was lost; it is %s", job.id, job.attempt, job.state)
-            if not job.ended:
+            if job.ended:
+                self._ended(job.id)
+            elif self._shared is None or self._shared.knows_scenes(job):
                 self._enqueue_when_ready(job)
-            elif live := self._live.get(job.id):
-                self._worker.clean_up(live)
 
     def _enqueue_when_ready(self, job: StoredJob) -> None:
         """Queue a stored job as soon as its scenes are loaded or have failed to load; keep its listeners."""
         # Clients may be waiting for the events of an attempt that was lost.
-        live = self._live.setdefault(job.id, LiveJob(job.id, job.scene))
+        followed = self._shared.adopt(job.id) if self._shared else None
+        live = self._live.setdefault(job.id, followed or LiveJob(job.id, job.scene))
         live.refused = None
         asked = job.spec.scene if job.spec.names_several_scenes else job.scene
         self._scene_wait.submit(live, asked, reserved=False)
-
-
-def _new_job(order: JobOrder, scene: str, photo: DecodedPhoto) -> NewJob:
-    spec, now = order.spec, time.time()
-    return NewJob(
-        id=secrets.token_hex(8),
-        client=order.client,
-        idempotency_key=order.idempotency_key,
-        digest=order.digest,
-        created=now,
-        deadline=spec.deadline_s and now + spec.deadline_s,
-        scene=scene,
-        estimator=spec.estimator,
-        spec=spec,
-        photo=PhotoInfo(order.name, order.photo_sha256, photo.query.intrinsics),
-        photo_sha256=order.photo_sha256,
-        photo_bytes=len(order.photo),
-        keep_photo=spec.keep_photo,
-    )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
@@ -52,6 +53,11 @@ class Worker:
         """The jobs that haven't ended."""
         self.running: set[tuple[str, int]] = set()
         """The attempts (job, number) whose leases are to be renewed."""
+        self.busy: Counter[str] = Counter()
+        """The threads that are at a job, from before its claim until after its end: two if it lost its lease here."""
+        self._busy_lock = threading.Lock()
+        self.lost: Callable[[LiveJob], None] = lambda live: None
+        """Called with a job that isn't this process' any more, where others share the store."""
         self.closing = threading.Event()
         """Set while the service ends: unfinished jobs are queued again for the next start."""
         self.storage_error = ""
@@ -62,7 +68,17 @@ class Worker:
     def run(self, live: LiveJob) -> None:
         """Make one attempt, unless the job was cancelled while it waited."""
         with bound(job_id=live.id):
-            self._run(live)
+            with self._busy_lock:
+                self.busy[live.id] += 1
+            ours = False
+            try:
+                ours = self._run(live)
+            finally:
+                with self._busy_lock:
+                    self.busy[live.id] -= 1
+                    self.busy += Counter()  # without those that are at zero
+                if not ours and live.id not in self.busy:
+                    self.lost(live)
 
     def give_up(self, live: LiveJob) -> None:
         """End a job whose thread is stuck."""
@@ -75,44 +91,57 @@ class Worker:
             self._engine.cancel(live.task_id)
             self.clean_up(live)
 
-    def _run(self, live: LiveJob) -> None:
-        job = self._store.get(live.id)
-        lease_until = time.time() + self._config.lease_s
-        attempt = self._persisted(live, lambda: self._store.claim(job, lease_until))
+    def _run(self, live: LiveJob) -> bool:
+        """Claim a job and make an attempt; return False if the job is another's, or will be made again."""
+        job = self._persisted(live, lambda: self._store.get(live.id))
+        if job is None:
+            return True  # the service ends
+        attempt = self._persisted(live, lambda: self._store.claim(job, self._store.now() + self._config.lease_s))
         if attempt is None:
-            return
+            return self.closing.is_set() or self._refused(live)
         self._observer.started(time.time() - job.created)
         live.begin(attempt)
         self.running.add((job.id, attempt))
         try:
-            self._carry_out(live, job, attempt)
+            return self._carry_out(live, job, attempt)
         finally:
             self.running.discard((job.id, attempt))
 
-    def _carry_out(self, live: LiveJob, job: StoredJob, attempt: int) -> None:
-        """Make an attempt that was claimed, and put its end on record."""
+    def _refused(self, live: LiveJob) -> bool:
+        """End a job that can't be claimed because it was cancelled; return False if that isn't why."""
+        job = self._store.get(live.id)
+        if not job.cancelled:
+            return False
+        if self._store.end_queued(job, Ending("cancelled"), self.photo_until()):
+            self.clean_up(live)
+        return job.ended or job.state == "queued"
+
+    def _carry_out(self, live: LiveJob, job: StoredJob, attempt: int) -> bool:
+        """Make an attempt that was claimed, and put its end on record; return whether that was done."""
         stored = _Stored(attempt)
         try:
             end = self._attempt(live, job, stored)
         except _AttemptLost:
             _log.warning("job %s: attempt %d was lost to another", job.id, attempt)
-            return
+            return False
         except EngineLost:
             # Without its lease it counts as lost: a job that crashes its engine must not be tried without end.
             _log.error("job %s: its engine ended in attempt %d", job.id, attempt)
             live.held = None
             self.running.discard((job.id, attempt))
             self._persisted(live, lambda: self._store.renew([(job.id, attempt)], 0.0))
-            return
+            return False
         if end is None:
             self._persisted(live, lambda: self._store.requeue(job.id, attempt))
-            return
+            return True
         batch = Batch(stored.count, live.records[stored.count :])
         until = self.photo_until()
-        if self._persisted(live, lambda: self._store.finish(job.id, attempt, batch, end, until)):
-            status = end.result.estimate.verdict.status if end.result else ""
-            _log.info("job %s: %s %s", job.id, end.state, status)
-            self.clean_up(live)
+        if not self._persisted(live, lambda: self._store.finish(job.id, attempt, batch, end, until)):
+            return False
+        status = end.result.estimate.verdict.status if end.result else ""
+        _log.info("job %s: %s %s", job.id, end.state, status)
+        self.clean_up(live)
+        return True
 
     def _attempt(self, live: LiveJob, job: StoredJob, stored: _Stored) -> Ending | None:
         """Localize; None if it was stopped because the service ends."""

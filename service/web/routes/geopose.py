@@ -71,7 +71,7 @@ async def geopose(
         scene=scene_id, intrinsics=intrinsics, prior=gpp.prior_of(wanted, anchor), deadline_s=wait_s
     )
     job = await create_job(request, app_state, Body(photo, "", {}), fields)
-    if live := app_state.jobs.live(job.id):
+    if live := await to_thread.run_sync(app_state.jobs.live, job):
         await live.wait(wait_s)
     job = await to_thread.run_sync(app_state.jobs.get, job.id)
     if not job.ended:

@@ -106,7 +106,7 @@ async def job_events(
     data: `result` if the job succeeded, else `error`. `Last-Event-ID` resumes, also after a restart of the service.
     """
     stream = _EventStream.after(last_event_id)
-    if live := app_state.jobs.live(job.id):
+    if live := await to_thread.run_sync(app_state.jobs.live, job):
         async for _ in live.changes():
             attempt, records = live.progress
             if attempt:  # 0: queued again after a restart of the service

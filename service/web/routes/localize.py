@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from anyio import to_thread
 from fastapi import APIRouter, Header, Request, Response
 
+from service.jobs.job_order import JobOrder
 from service.jobs.model import ENDED, StoredJob
-from service.jobs.service import JobOrder
 from service.web.middleware.limits import client_of, too_large
 from service.web.route_policy import PHOTO_BODY, route_policy
 from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document, lens_owner
@@ -111,7 +111,7 @@ async def localize_photo(
     job = await create_job(request, app_state, body, read_fields(body.fields), idempotency_key)
     wait_s = min(wait_preference(prefer), app_state.settings.max_wait_s)
     if wait_s:
-        if live := app_state.jobs.live(job.id):
+        if live := await to_thread.run_sync(app_state.jobs.live, job):
             await live.wait(wait_s)
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
     answer = await to_thread.run_sync(job_document, app_state, job.id, root)
