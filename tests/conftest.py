@@ -75,3 +75,22 @@ def client(stepping) -> Iterator:
     with ready_service() as client:
         yield client
         stepping.GO_ON.set()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator:
+    """A PostgreSQL server; skips what needs it where there is none."""
+    from postgres_server import postgres_server
+
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture
+def database(postgres) -> Iterator:
+    """An empty database in PostgreSQL."""
+    from service.jobs.postgres_database import PostgresDatabase
+
+    database = PostgresDatabase(postgres.database())
+    yield database
+    database.close()

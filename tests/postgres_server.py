@@ -16,6 +16,9 @@ from uuid import uuid4
 
 import pytest
 
+POSTGRES = pytest.param("postgres", marks=pytest.mark.ci)
+"""Of fixtures of stores."""
+
 
 def programs() -> Path | None:
     """Return the folder of initdb and pg_ctl, which Debian keeps out of PATH."""

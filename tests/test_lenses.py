@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from postgres_server import POSTGRES
 
 from service.geometry import look_at
 from service.jobs.sqlite_lens_store import SqliteLensStore
@@ -184,9 +185,15 @@ def test_what_was_not_measured_stays():
 # ------------------------------------------------------------------ stores
 
 
-@pytest.fixture(params=["sqlite", "memory"])
+@pytest.fixture(params=["sqlite", "memory", POSTGRES])
 def store(request, tmp_path) -> Iterator[LensStore]:
-    made = SqliteLensStore(tmp_path / "lenses.sqlite", 3) if request.param == "sqlite" else MemoryLensStore(3)
+    if request.param == "postgres":
+        database = request.getfixturevalue("database")
+        from service.jobs.postgres_store import PostgresLensStore
+
+        made: LensStore = PostgresLensStore(database, 3)
+    else:
+        made = SqliteLensStore(tmp_path / "lenses.sqlite", 3) if request.param == "sqlite" else MemoryLensStore(3)
     assert isinstance(made, LensStore)
     yield made
     made.close()

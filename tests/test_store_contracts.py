@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from memory_stores import MemoryJobStore, MemoryPhotoStore, MemorySceneStore
-from postgres_server import Server, postgres_server
+from postgres_server import POSTGRES
 from test_scenes import ply
 
 from service.errors import (
@@ -45,25 +45,6 @@ from service.types import BoxPrior, Camera, Intrinsics, Pose
 CAMERA = Intrinsics(64, 48, 60.0, 61.0, 32.0, 24.0, "OPENCV", (0.1, 0.2, 0.3, 0.4), "approximate")
 FAILURE = Failure("interrupted", "the service ended.")
 NONE = Batch(0, ())
-
-
-POSTGRES = pytest.param("postgres", marks=pytest.mark.ci)
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with postgres_server() as server:
-        yield server
-
-
-@pytest.fixture
-def database(server):
-    """An empty one in PostgreSQL."""
-    from service.jobs.postgres_database import PostgresDatabase
-
-    database = PostgresDatabase(server.database())
-    yield database
-    database.close()
 
 
 @pytest.fixture(params=["sqlite", "memory", POSTGRES])

@@ -59,6 +59,8 @@ class PostgresDatabase:
                 min_size=1,
                 max_size=_CONNECTIONS,
                 timeout=_WAIT_S,
+                # Then the next request tries anew; longer, and the pauses between attempts grow to minutes.
+                reconnect_timeout=3.0,
                 kwargs={"autocommit": True, "connect_timeout": 5, "application_name": "splatfix"},
                 # Connections of a server that was restarted are found out before they are used.
                 check=psycopg_pool.ConnectionPool.check_connection,

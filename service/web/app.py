@@ -8,6 +8,7 @@ paths of requests.
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections.abc import AsyncIterator, Iterator
 from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager, suppress
 from pathlib import Path
@@ -20,15 +21,17 @@ from starlette.middleware.cors import CORSMiddleware
 from starlette.routing import Route
 
 from service import __version__
-from service.errors import InvalidRequest, SceneNotFound, StorageFailed
+from service.errors import BackendMissing, InvalidRequest, SceneNotFound, StorageFailed
 from service.estimators import ESTIMATORS
 from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.engine import Engine
-from service.jobs.photo_store import FolderPhotoStore
+from service.jobs.photo_store import FolderPhotoStore, PhotoStore
 from service.jobs.service import Jobs
 from service.jobs.sqlite_lens_store import SqliteLensStore
 from service.jobs.sqlite_store import SqliteJobStore
+from service.jobs.store import JobStore
 from service.lenses.lens_memory import LensMemory
+from service.lenses.lens_store import LensStore
 from service.matchers import MATCHERS
 from service.operating_system import locked
 from service.render import RASTERIZERS
@@ -53,6 +56,8 @@ from service.web.routes.dependencies import AppState
 from service.web.settings import Settings, is_loopback
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
+
+_log = logging.getLogger(__name__)
 
 
 def create_app(settings: Settings | None = None, engine: Engine | None = None, keys: KeyRing | None = None) -> FastAPI:
@@ -137,8 +142,7 @@ async def _start(
     for scene in scene_store.scenes():
         if scene.uploaded:
             engine.add(scene)
-    store, photos = SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos")
-    lenses = SqliteLensStore(folder / "lenses.sqlite", settings.keep_lenses)
+    store, photos, lenses = await to_thread.run_sync(_stores, settings, folder)
     stack.callback(lenses.close)
     # The store is opened in any case: with none to keep it deletes what it had.
     memory = LensMemory(lenses) if settings.keep_lenses else None
@@ -154,6 +158,27 @@ async def _start(
     state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
     metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
     return state
+
+
+def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, LensStore]:
+    """Open the stores of jobs, photos and lenses. Raises StorageFailed, BackendMissing."""
+    if settings.database is None:
+        lenses = SqliteLensStore(folder / "lenses.sqlite", settings.keep_lenses)
+        return SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos"), lenses
+    # Not above: the driver is there only where the extra is installed.
+    try:
+        from service.jobs.postgres_database import PostgresDatabase, unprotected
+        from service.jobs.postgres_store import PostgresJobStore, PostgresLensStore, PostgresPhotoStore
+    except ImportError as error:
+        raise BackendMissing(
+            f"PostgreSQL: {error}.", where="database", hint="pip install 'splatfix[postgres]'"
+        ) from error
+    address = settings.database.get_secret_value()
+    if warning := unprotected(address):
+        _log.warning("%s", warning)
+    database = PostgresDatabase(address)
+    lenses = PostgresLensStore(database, settings.keep_lenses)
+    return PostgresJobStore(database), PostgresPhotoStore(database), lenses
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:

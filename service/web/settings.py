@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
+from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
 from service.jobs.config import JobsConfig
@@ -110,6 +110,9 @@ class Settings(BaseSettings):
     """Time for running jobs to finish after SIGTERM; unfinished ones are run again after the restart."""
     data_dir: Path | None = None
     """Folder of the stored jobs and uploaded scenes; None: a temporary one. `splatfix serve` has its own default."""
+    database: SecretStr | None = None
+    """PostgreSQL database of jobs, photos and lenses that several fronts share, e.g. postgresql://splatfix@db/splatfix;
+    None: files in `data_dir`, of this process alone."""
     keep_jobs: int = Field(default=10_000, ge=1)
     """Number of ended jobs that are kept."""
     keep_days: float = Field(default=30.0, gt=0)
