@@ -10,7 +10,7 @@ STUDIO_BIN := scenes/studio/.venv/bin
 # Four on two cores, too: tests of servers mostly wait.
 PYTEST := $(BIN)/pytest -n 4 --dist loadfile
 
-.PHONY: setup demo test coverage newest lint check release-check studio another-day clean
+.PHONY: setup demo test test-fleet coverage newest lint check release-check studio another-day clean
 
 setup: .venv/ready
 
@@ -33,6 +33,11 @@ check: setup
 
 test: check
 	$(PYTEST) -m "not browser and not ci"
+
+# What several machines share, with the packages that only they need. PostgreSQL's server is the system's.
+test-fleet: setup
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres]"
+	$(BIN)/pytest -rs tests/test_fronts.py tests/test_store_contracts.py tests/test_lenses.py
 
 # All tests, and which lines they run in their own process.
 coverage: check

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from itertools import chain
 from typing import Annotated
 
 import typer
@@ -16,13 +17,14 @@ def doctor(
 ) -> None:
     """Print what runs on this machine, and why the rest doesn't. Exit code 1 if localizing can't work."""
     from service.cli.diagnostics import compile_kernels, findings
+    from service.cli.fleet_findings import fleet_findings
 
     if warm:
         with err.status("compiling"):
             compile_kernels()
     healthy = True
     with err.status("examining"):
-        for finding in findings():
+        for finding in chain(findings(), fleet_findings(settings_of({}))):
             say(finding.line)
             healthy &= finding.ok or not finding.needed
     for line in settings_lines():
