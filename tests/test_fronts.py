@@ -299,6 +299,18 @@ def test_who_can_read_along_is_told(address, warned):
     assert bool(unprotected(address)) == warned
 
 
+def test_doctor_examines_the_database_and_shows_no_password(address, monkeypatch):
+    from service.cli.doctor import settings_lines
+    from service.cli.fleet_findings import fleet_findings
+
+    (found,) = fleet_findings(settings(database=address))
+    assert (found.subject, found.ok) == ("database", True)
+    lost = address.replace("127.0.0.1", "user:secret@192.0.2.1").replace("splatfix@user", "user") + "?connect_timeout=1"
+    assert list(fleet_findings(settings())) == []
+    monkeypatch.setenv("SPLATFIX_DATABASE", lost)
+    assert "secret" not in "".join(settings_lines())
+
+
 # ------------------------------------------------------------------ over HTTP
 
 

@@ -174,9 +174,9 @@ class PostgresListener:
     def _connect(self) -> psycopg.Connection:
         if self._closed:
             raise psycopg.OperationalError("closed")
-        self._connection = psycopg.connect(self._address, autocommit=True, connect_timeout=5)
-        self._connection.execute(f"LISTEN {_CHANNEL}")
-        return self._connection
+        connection = self._connection = psycopg.connect(self._address, autocommit=True, connect_timeout=5)
+        connection.execute(f"LISTEN {_CHANNEL}")
+        return connection
 
     def _disconnect(self) -> None:
         if self._connection:
