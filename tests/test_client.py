@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import io
 import json
 import sys
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import httpx
 import numpy as np
@@ -127,6 +130,139 @@ def test_the_coroutines_do_the_same(shared):
 def test_both_clients_have_the_same_methods():
     public = [{name for name in vars(kind) if not name.startswith("_")} for kind in (Client, AsyncClient)]
     assert public[0] == public[1]
+
+
+TURNED = Pose(np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]]))
+LENS = Intrinsics(96, 64, 80.0, 81.0, 48.0, 32.0)
+SIZE = {"width": 96, "height": 64, "fx": 80.0, "fy": 81.0, "cx": 48.0, "cy": 32.0}
+PLACED = {"pose": {"world_from_camera": TURNED.world_from_camera.tolist()}}
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "options", "sent"),
+    [
+        ("job", ("j",), {}, ("GET", "/jobs/j", b"")),
+        ("jobs", (), {"scene": "s", "limit": 3}, ("GET", "/jobs?scene=s&limit=3", b"")),
+        ("cancel", ("j",), {}, ("DELETE", "/jobs/j", b"")),
+        ("trace", ("j",), {}, ("GET", "/jobs/j/trace", b"")),
+        ("photo", ("j",), {}, ("GET", "/jobs/j/photo", b"")),
+        ("step_render", ("j", 4), {}, ("GET", "/jobs/j/iterations/4/render.jpg?camera=pose", b"")),
+        ("step_render", ("j",), {"camera": "m"}, ("GET", "/jobs/j/iterations/last/render.jpg?camera=m", b"")),
+        ("export", ("j", "colmap"), {"name": "a.jpg"}, ("GET", "/jobs/j/export/colmap?name=a.jpg", b"")),
+        ("scenes", (), {}, ("GET", "/scenes", b"")),
+        ("scene", ("s",), {}, ("GET", "/scenes/s", b"")),
+        ("load_scene", ("s",), {}, ("POST", "/scenes/s/load", b"")),
+        ("unload_scene", ("s",), {}, ("POST", "/scenes/s/unload", b"")),
+        ("delete_scene", ("s",), {}, ("DELETE", "/scenes/s", b"")),
+        ("coverage", ("s",), {}, ("GET", "/scenes/s/coverage", b"")),
+        ("coverage", ("s",), {"measure": True}, ("POST", "/scenes/s/coverage", b"")),
+        ("anchors", ("s",), {}, ("GET", "/scenes/s/anchors", b"")),
+        ("put_anchor", ("s", "a b/c", (1, 2, 3)), {},
+         ("PUT", "/scenes/s/anchors/a%20b%2Fc", {"position": [1.0, 2.0, 3.0]})),
+        ("delete_anchor", ("s", "a"), {}, ("DELETE", "/scenes/s/anchors/a", b"")),
+        ("splats", ("s", 9), {}, ("GET", "/scenes/s/splats?max=9", b"")),
+        ("render", ("s", TURNED), {}, ("POST", "/scenes/s/render", PLACED | {"format": "jpeg"})),
+        ("render", ("s", TURNED, LENS), {"kind": "png"},
+         ("POST", "/scenes/s/render", PLACED | {"format": "png", "intrinsics": SIZE})),
+        ("depth", ("s", TURNED), {}, ("POST", "/scenes/s/render", PLACED | {"format": "depth"})),
+    ],
+)  # fmt: skip
+def test_either_client_sends_what_the_api_documents_and_reads_its_answer(name, arguments, options, sent):
+    answers, seen = documents(), []
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        seen.append((request.method, request.url.raw_path.decode(), json.loads(request.content or b"null") or b""))
+        found = answers[name]
+        return httpx.Response(200, content=found) if isinstance(found, bytes) else httpx.Response(200, json=found)
+
+    async def asynchronous():
+        async with AsyncClient("http://fake", transport=httpx.MockTransport(answer)) as service:
+            return await getattr(service, name)(*arguments, **options)
+
+    with Client("http://fake", transport=httpx.MockTransport(answer)) as service:
+        values = [getattr(service, name)(*arguments, **options), asyncio.run(asynchronous())]
+    assert seen == [sent, sent]
+    for value in values:
+        if name in ("job", "cancel"):
+            assert (value.id, value.state) == ("j", "running")
+        elif name == "jobs":
+            assert [job.id for job in value] == ["j"]
+        elif name == "scenes":
+            assert [scene.id for scene in value] == ["ball"]
+        elif name in ("scene", "load_scene", "unload_scene"):
+            assert value.id == "ball"
+        elif name in ("anchors", "depth"):
+            assert np.array_equal(value["door"] if name == "anchors" else value, [1.0, 2.0, 3.0])
+        elif name in ("put_anchor", "delete_anchor", "delete_scene"):
+            assert value is None
+        else:
+            assert value == (answers[name].decode() if name == "export" else answers[name])
+
+
+def documents() -> dict[str, object]:
+    """Return what a service answers to each method of the clients."""
+    fake, depth = FakeService(), io.BytesIO()
+    job = fake.job("j", 2).out().model_dump(mode="json")
+    scene = httpx.Client(transport=fake.transport, base_url="http://fake").get("/scenes").json()["scenes"][0]
+    np.save(depth, np.array([1.0, 2.0, 3.0]))
+    return {
+        **dict.fromkeys(("job", "cancel"), job), "jobs": {"jobs": [job]}, "trace": {"iterations": []},
+        **dict.fromkeys(("photo", "step_render", "render", "splats", "export"), b"bytes"),
+        **dict.fromkeys(("scene", "load_scene", "unload_scene"), scene), "scenes": {"scenes": [scene]},
+        "coverage": {"state": "none"}, "anchors": {"anchors": [{"name": "door", "position": [1, 2, 3]}]},
+        **dict.fromkeys(("put_anchor", "delete_anchor", "delete_scene"), b""), "depth": depth.getvalue(),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("states", "code"),
+    [
+        (["loading", "loading", "ready"], None),
+        (["loading"] * 9, "timeout"),
+        (["loading", "unloaded"], "scene_unloaded"),
+        (["loading", "failed"], "corrupt_scene"),
+    ],
+)
+def test_either_client_waits_until_a_scene_is_ready_or_never_will_be(states, code, monkeypatch):
+    document, slept = documents()["scene"], []
+    assert isinstance(document, dict)
+    clock = SimpleNamespace(monotonic=lambda: time.monotonic() + sum(slept), sleep=slept.append)
+    monkeypatch.setattr(client_module, "time", clock)
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    def transport() -> httpx.MockTransport:
+        left = iter(states)
+
+        def answer(request: httpx.Request) -> httpx.Response:
+            state = next(left)
+            problem = {"code": "corrupt_scene", "detail": "broken", "status": 422, "where": "", "hint": ""}
+            return httpx.Response(
+                200, json=document | {"state": state, "error": problem if state == "failed" else None}
+            )
+
+        return httpx.MockTransport(answer)
+
+    async def asynchronous():
+        monkeypatch.setattr(client_module, "asyncio", SimpleNamespace(sleep=sleep))
+        async with AsyncClient("http://fake", transport=transport()) as service:
+            return await service.wait_until_ready("ball", timeout_s=1.4)
+
+    calls = [
+        lambda: Client("http://fake", transport=transport()).wait_until_ready("ball", timeout_s=1.4),
+        lambda: asyncio.run(asynchronous()),
+    ]
+    for call in calls:
+        slept.clear()
+        if code is None:
+            assert call().state == "ready"
+        else:
+            with pytest.raises(ServiceError) as raised:
+                call()
+            assert raised.value.code == code
+        # Half a second between two looks; the last of nine that are too many comes after 1.5 s.
+        assert slept == [0.5] * {None: 2, "timeout": 3}.get(code, 1)
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, estimate, folder_of
 
 from service.bench import localize as bench
@@ -395,3 +397,141 @@ def test_the_share_below_the_bound_by_step():
 
     curves = [[(0, 30, 1), (3, 4, 0.01), (9, 0.1, 0.001)], [(0, 30, 1), (5, 6, 0.01)], [(0, 1, 0.04), (2, 9, 1)]]
     assert _share_curve(curves) == ([0, 2, 3, 5, 9], pytest.approx([1 / 3, 0, 1 / 3, 1 / 3, 1 / 3]))
+
+
+# ------------------------------------------------------------------ what the figures show
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """What `figures` draws, before it becomes a PNG."""
+    from service.bench.paper import figures
+
+    shown = []
+    monkeypatch.setattr(figures, "_png", lambda figure, dpi=figures.DPI: shown.append((figure, dpi)) or b"png")
+    return figures, shown
+
+
+def lines_of(place) -> dict[str, tuple[list[float], list[float]]]:
+    return {each.get_label(): tuple(np.asarray(v, float).tolist() for v in each.get_data()) for each in place.lines}
+
+
+def test_figure_1_shows_each_vector_from_the_render_to_the_photo_and_the_paths_from_the_truth(drawn):
+    figures, shown = drawn
+    photo = np.zeros((100, 200, 3), np.uint8)
+    rendered = np.array([[50.5, 40.5], [60.5, 50.5]])
+    vectors = figures.Vectors("turned", photo, rendered, rendered + np.array([10.0, 5.0]))
+    # In the plane y = 7, longer along x than along z.
+    positions = np.array([[0.0, 7, 0], [4, 7, 1], [9, 7, 0]])
+    path = figures.Path3D("joint", positions, np.array([30.0, 3.0, 0.5]))
+    assert figures.vectors_and_paths([[vectors, vectors], [vectors]], [path], positions[2]) == b"png"
+    ((figure, _),) = shown
+    above, below = figure.subfigs
+    assert [place.get_title() for place in above.axes] == ["turned"] * 3  # the fourth place is empty
+    place = above.axes[0]
+    (arrows,) = (each for each in place.collections if hasattr(each, "U"))
+    # The centre of the first pixel is (0.5, 0.5) here, (0, 0) in matplotlib.
+    assert np.allclose(arrows.XY, rendered - 0.5)
+    assert np.allclose(np.stack([arrows.U, arrows.V], 1), [[10, 5]] * 2)
+    rings = [np.asarray(each.get_offsets()) for each in place.collections if each is not arrows]
+    assert np.allclose(rings, [rendered - 0.5, rendered + np.array([9.5, 4.5])])
+    # The matches' extent, 50.5 to 70.5 and 40.5 to 55.5, and a twentieth of 200 pixels around it; y points down.
+    assert place.get_xlim() == pytest.approx((40.5, 80.5), abs=0.5)
+    assert place.get_ylim() == pytest.approx((65.5, 30.5), abs=0.5)
+    assert np.unique(place.images[0].get_array()) == 255 - int(255 * 0.45) - 1  # black, paled
+    track, errors = below.axes
+    (xs, ys), ends = lines_of(track)["joint"], lines_of(track)["truth"]
+    assert ends == ([0.0], [0.0])
+    # Distances from the truth are kept, the longest along the first axis.
+    assert np.allclose(np.hypot(xs, ys), [9, np.hypot(5, 1), 0])
+    assert abs(xs[0]) > 8.9
+    assert lines_of(errors)["joint"] == ([1.0, 2.0, 3.0], [30.0, 3.0, 0.5])
+    assert (errors.get_xscale(), errors.get_yscale()) == ("log", "log")
+    assert [text.get_text() for place in (track, errors) for text in place.get_legend().get_texts()] == [
+        "joint", "truth", "joint"
+    ]  # fmt: skip
+
+
+def test_the_box_of_vectors_ends_at_the_photo(drawn):
+    figures, _ = drawn
+    ends = np.array([[1.0, 1.0], [199.0, 99.0]])
+    vectors = figures.Vectors("", np.zeros((100, 200, 3), np.uint8), ends, ends)
+    assert figures._box_of([vectors]) == (0.0, 200.0, 100.0, 0.0)
+
+
+def test_figures_2_and_3_have_a_row_a_query_and_a_column_a_method(drawn):
+    figures, shown = drawn
+    image = np.full((4, 6, 3), 7, np.uint8)
+    figures.pictures([[image, None], [None, image]], ["photo", "icomma"], ["fern", "fox"])
+    ((figure, dpi),) = shown
+    assert dpi == figures.PICTURES_DPI
+    places = np.array(figure.axes).reshape(2, 2)
+    assert [[bool(place.images) for place in row] for row in places] == [[True, False], [False, True]]
+    assert [[text.get_text() for place in row for text in place.texts] for row in places] == [["not run"]] * 2
+    assert [place.get_title() for place in places.ravel()] == ["photo", "icomma", "", ""]
+    assert [place.get_ylabel() for place in places.ravel()] == ["fern", "", "fox", ""]
+    assert all(len(place.get_xticks()) == len(place.get_yticks()) == 0 for place in places.ravel())
+
+
+def test_figure_4_has_shares_from_the_first_step_on(drawn):
+    figures, shown = drawn
+    figures.shares_by_step({"easy": {"icomma": ([0, 4], [0.25, 0.5], 8)}, "hard": {"own": ([2], [1.0], 3)}})
+    ((figure, _),) = shown
+    easy, hard = figure.axes
+    # On a logarithmic axis there is no step 0.
+    assert lines_of(easy) == {"icomma (8 queries)": ([1.0, 5.0], [0.25, 0.5])}
+    assert lines_of(hard) == {"own (3 queries)": ([3.0], [1.0])}
+    assert easy.lines[0].get_drawstyle() == "steps-post"
+    for place, title in ((easy, "easy"), (hard, "hard")):
+        assert (place.get_xscale(), place.get_title()) == ("log", title)
+        assert place.get_ylabel() == "share within 5 deg and 0.05 units"
+        assert place.get_ylim()[0] < 0 < 1 < place.get_ylim()[1]
+        assert len(place.get_legend().get_texts()) == 1
+        assert place.xaxis.get_gridlines()[0].get_visible()
+
+
+def test_a_reliability_diagram_has_what_was_said_and_what_was_true(drawn):
+    figures, shown = drawn
+    rows = [{"said": 0.15, "true": 0.1, "count": 40, "from": 0.1, "to": 0.2}]
+    rows += [{"said": 0.95, "true": 1.0, "count": 9, "from": 0.9, "to": 1.0}]
+    figures.reliability({"with_matches": rows})
+    ((figure, _),) = shown
+    above, below = figure.axes
+    assert lines_of(above) == {"calibrated": ([0.0, 1.0], [0.0, 1.0]), "with matches": ([0.15, 0.95], [0.1, 1.0])}
+    bars = [(bar.get_x() + bar.get_width() / 2, bar.get_height()) for bar in below.patches]
+    assert bars == [(pytest.approx(0.15), 40), (pytest.approx(0.95), 9)]
+    assert above.get_xlim() == (0, 1)
+    assert above.get_ylim()[0] < 0 < 1 < above.get_ylim()[1]
+    assert (below.get_yscale(), len(above.get_legend().get_texts())) == ("log", 2)
+
+
+def test_growth_is_drawn_against_the_number_of_gaussians_memory_in_megabytes(drawn):
+    figures, shown = drawn
+    names = ("load_cpu_s", "load_again_cpu_s", "index_cpu_s", "cpu_ms_p50")
+    rows = [
+        {"gaussians": count, **{name: count * (1 + i) for i, name in enumerate(names)}, "file_bytes": 4e6 * count,
+         "peak_bytes": 1e6 * count, "resident_bytes": 2e6 * count, "anonymous_bytes": 3e6 * count}
+        for count in (10, 100)
+    ]  # fmt: skip
+    figures.growth(rows)
+    ((figure, _),) = shown
+    seen = [{label: ys for label, (_, ys) in lines_of(place).items()} for place in figure.axes]
+    assert seen == [
+        {"load from the file": [10, 100], "load again": [20, 200], "index": [30, 300]},
+        {"localize": [40, 400]},
+        {"peak": [10, 100], "resident": [20, 200], "anonymous": [30, 300], "scene file": [40, 400]},
+    ]
+    times, latency, memory = figure.axes
+    assert all(place.get_xscale() == "log" and place.get_xlabel() == "Gaussians" for place in figure.axes)
+    assert times.get_yscale() == "log"
+    assert latency.get_ylim()[0] == memory.get_ylim()[0] == 0
+    assert [len(place.get_legend().get_texts()) for place in figure.axes] == [3, 1, 4]
+
+
+def test_a_figure_becomes_a_png_of_its_size():
+    from matplotlib.figure import Figure
+
+    from service.bench.paper.figures import _png
+
+    with Image.open(io.BytesIO(_png(Figure(figsize=(2, 1)), 50))) as image:
+        assert (image.format, image.size) == ("PNG", (100, 50))
