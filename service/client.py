@@ -20,6 +20,7 @@ import time
 import uuid
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -30,6 +31,7 @@ import numpy as np
 ENDED = frozenset({"succeeded", "failed", "cancelled", "interrupted"})
 """States of a job that has ended."""
 MAX_WAIT_S = 3600.0
+WEEK_S = 7 * 86_400.0
 _RECONNECT_S = 1.0
 # The service sends a ping every 15 s; a stream that is silent for three of them is broken.
 _STREAM = httpx.Timeout(10.0, read=45.0)
@@ -238,6 +240,20 @@ class Scene:
     up_in_world: np.ndarray | None
     metres_per_unit: float | None
     raw: Json = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Key:
+    """What an API key may do."""
+
+    name: str | None
+    role: str
+    """`read`, `localize`, `admin`: each includes those before it."""
+    scenes: tuple[str, ...] | None
+    """Names or patterns; None: all."""
+    expires: datetime | None
+    raw: Json = field(repr=False)
+    """With rate, share of the queue and, of `all_keys`, when it was made."""
 
 
 @dataclass(frozen=True)
@@ -458,6 +474,27 @@ def _anchors(raw: Json) -> dict[str, np.ndarray]:
     return {anchor["name"]: np.array(anchor["position"], np.float64) for anchor in raw["anchors"]}
 
 
+def _address(base: httpx.URL, link: str) -> str:
+    """Return the whole address of a path that the service answered, which has the service's sub-path already."""
+    return str(base.join(link))
+
+
+def _key(raw: Json) -> Key:
+    # Python 3.10 doesn't read the Z of ISO 8601.
+    expires = raw["expires"] and datetime.fromisoformat(raw["expires"].replace("Z", "+00:00"))
+    scenes = None if raw["scenes"] is None else tuple(raw["scenes"])
+    return Key(raw["name"], raw["role"], scenes, expires, raw)
+
+
+def _key_body(role: str, limits: Mapping[str, Any]) -> Json:
+    expires = limits.get("expires")
+    return {"role": role, **limits, "expires": expires.isoformat() if isinstance(expires, datetime) else expires}
+
+
+def _key_path(name: str) -> str:
+    return f"/keys/{quote(name, safe='')}"
+
+
 def _scene_pause(scene: Scene, waiting: _Waiting) -> float:
     """Return the seconds until a scene is looked at again. Raises ServiceError if it won't be ready."""
     problem = scene.raw.get("error")
@@ -645,6 +682,30 @@ class Client:
         """Delete a named point of a scene."""
         self._send("DELETE", _anchor_path(scene_id, name))
 
+    def share(self, job_id: str, *, expires_in_s: float = WEEK_S) -> str:
+        """Make a link that shows a job, read-only, to whoever has it; return its address."""
+        made = _document(self._send("POST", f"/jobs/{job_id}/share", json={"expires_in_s": expires_in_s}))
+        return _address(self._http.base_url, made["link"])
+
+    def own_key(self) -> Key:
+        """Return what the key may do that requests are sent with; its name is None where the service has no keys."""
+        return _key(self._json("/key"))
+
+    def all_keys(self) -> list[Key]:
+        """Return all keys of the service (role admin)."""
+        return list(map(_key, self._json("/keys")["keys"]))
+
+    def add_key(self, name: str, role: str = "localize", **limits: Any) -> str:
+        """Make a key (role admin) and return it, which no later answer has.
+
+        `limits`: scenes, rate, queue_share, and expires, a datetime with its time zone.
+        """
+        return _document(self._send("PUT", _key_path(name), json=_key_body(role, limits)))["key"]
+
+    def remove_key(self, name: str) -> None:
+        """Revoke a key, with its sessions and share links (role admin)."""
+        self._send("DELETE", _key_path(name))
+
     def splats(self, scene_id: str, limit: int) -> bytes:
         """Return the most important Gaussians for drawing, in the binary form of GET /scenes/{id}/splats."""
         return self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit}).content
@@ -809,6 +870,22 @@ class AsyncClient:
 
     async def delete_anchor(self, scene_id: str, name: str) -> None:
         await self._send("DELETE", _anchor_path(scene_id, name))
+
+    async def share(self, job_id: str, *, expires_in_s: float = WEEK_S) -> str:
+        made = _document(await self._send("POST", f"/jobs/{job_id}/share", json={"expires_in_s": expires_in_s}))
+        return _address(self._http.base_url, made["link"])
+
+    async def own_key(self) -> Key:
+        return _key(await self._json("/key"))
+
+    async def all_keys(self) -> list[Key]:
+        return list(map(_key, (await self._json("/keys"))["keys"]))
+
+    async def add_key(self, name: str, role: str = "localize", **limits: Any) -> str:
+        return _document(await self._send("PUT", _key_path(name), json=_key_body(role, limits)))["key"]
+
+    async def remove_key(self, name: str) -> None:
+        await self._send("DELETE", _key_path(name))
 
     async def splats(self, scene_id: str, limit: int) -> bytes:
         return (await self._send("GET", f"/scenes/{scene_id}/splats", params={"max": limit})).content

@@ -132,6 +132,10 @@ class RecordNotFound(SplatfixError):
     code = "record_not_found"
 
 
+class KeyNotFound(SplatfixError):
+    code = "key_not_found"
+
+
 class LensNotFound(SplatfixError):
     code = "lens_not_found"
 

@@ -168,9 +168,10 @@ class MemoryJobStore:
         jobs = [job for job in jobs if wanted.before is None or job.number < wanted.before]
         return [job for job in jobs if all(getattr(job, name) == value for name, value in given.items())][:limit]
 
-    def count(self, state: JobState) -> int:
+    def count(self, state: JobState, client: str | None = None) -> int:
         with self._lock:
-            return sum(row.job.state == state for row in self._rows.values())
+            jobs = [row.job for row in self._rows.values() if row.job.state == state]
+        return sum(client in (None, job.client) for job in jobs)
 
     def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
         with self._lock:
@@ -212,6 +213,13 @@ class MemoryJobStore:
     def ids(self) -> set[str]:
         with self._lock:
             return set(self._rows)
+
+    def reassign(self, client: str, to: str) -> None:
+        with self._lock:
+            taken = {row.job.idempotency_key for row in self._rows.values() if row.job.client == to} - {None}
+            for row in self._rows.values():
+                if row.job.client == client and row.job.idempotency_key not in taken:
+                    self._change(row, client=to)
 
     def probe(self) -> None: ...
 

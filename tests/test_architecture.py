@@ -44,7 +44,7 @@ FLOORS = {
         {"retrieval", "descent", "verification"},
     ],
     "service/web": [
-        {"api_model", "hints", "api_keys", "settings", "metrics", "viewer_process"},
+        {"api_model", "hints", "key_file", "api_keys", "settings", "metrics", "viewer_process"},
         {"problems", "route_policy"},
         {"schemas"},
         {"middleware"},
@@ -66,7 +66,7 @@ SAME_FLOOR = {
         ("geodesy", "geometry"),
     },
     "service/pose": set(),
-    "service/web": set(),
+    "service/web": {("api_keys", "key_file")},
 }
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.

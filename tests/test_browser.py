@@ -19,6 +19,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from service.client import Client
 from service.scene_manager.status import CoverageStatus
+from service.web.api_keys import KeyRing
 from service.web.pages import PAGES
 from service.web.viewer_relay import Relay
 from viewer.viewer_server import Viewer
@@ -40,8 +41,8 @@ def fake() -> FakeService:
 @pytest.fixture
 def url(fake: FakeService) -> Iterator[str]:
     """A service that has nothing but the relay to a viewer of the fake service."""
-    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
-    relay = Relay(fake.upstream(viewer.server.get_port()))
+    viewer = Viewer(lambda _: Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
+    relay = Relay(fake.upstream(viewer.server.get_port()), KeyRing(None))
     relay_only = FastAPI()
     relay_only.include_router(relay.router)
     relay_only.mount("/ui", StaticFiles(directory=PAGES))

@@ -26,7 +26,8 @@ from service.errors import InvalidRequest
 from service.jobs.model import SequenceFrame
 from service.results import Reason, StageTiming, Status
 from service.types import Camera, Intrinsics, NamedCamera
-from service.web.api_keys import KeyRing, add_key
+from service.web.api_keys import KeyRing
+from service.web.key_file import add_key
 from service.web.schemas.conversion import frame_out, timing_out
 from service.web.schemas.job_results import RankedScene
 from service.web.settings import Settings

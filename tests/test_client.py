@@ -9,6 +9,7 @@ import json
 import sys
 import time
 from collections.abc import AsyncIterator
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,7 +22,7 @@ from stand_ins import make_scene
 
 from service import client as client_module
 from service.client import AsyncClient, Client, Intrinsics, Job, Pose, Prior, Record, ServiceError
-from service.web.api_keys import add_key
+from service.web.key_file import add_key
 
 SOURCE = Path(client_module.__file__).read_text("utf-8")
 
@@ -69,6 +70,37 @@ def test_a_photo_is_localized_with_a_key(keyed):
         assert (raised.value.code, raised.value.status) == ("no_pose", 409)
         assert service.scene("room").raw["training_cameras"] is not None
         assert [scene.id for scene in service.scenes()] == ["room"]
+
+
+def test_links_and_keys_are_made_and_revoked(keyed):
+    url, key = keyed
+    ends = datetime(2031, 1, 31, 12, tzinfo=UTC)
+    with Client(url, key, use_proxy=False) as service:
+        assert (service.own_key().name, service.own_key().role) == ("tester", "admin")
+        made = service.add_key("robot 7", scenes=["room", "lab-*"], rate="600/minute", expires=ends)
+        with Client(url, made, use_proxy=False) as robot:
+            own = robot.own_key()
+            assert (own.name, own.role, own.scenes, own.expires) == ("robot 7", "localize", ("room", "lab-*"), ends)
+            assert own.raw["rate"] == "600/minute"
+            job = robot.submit(photo(), scene="room")
+            link = robot.share(job.id, expires_in_s=60)
+            assert httpx.get(f"{link}/job").json()["job"]["id"] == job.id
+            assert [known.name for known in service.all_keys()] == ["tester", "robot 7"]
+            service.remove_key("robot 7")
+            with pytest.raises(ServiceError) as raised:
+                robot.own_key()
+            assert raised.value.code == "unauthorized"
+        assert httpx.get(f"{link}/job").status_code == 404
+
+    async def same() -> list[str | None]:
+        async with AsyncClient(url, key, use_proxy=False) as service:
+            await service.add_key("other", "read")
+            names = [(await service.own_key()).name, *(known.name for known in await service.all_keys())]
+            await service.remove_key("other")
+            assert "/shared/" in await service.share((await service.jobs(limit=1))[0].id)
+            return names
+
+    assert asyncio.run(same()) == ["tester", "tester", "other"]
 
 
 def test_without_a_key_every_error_has_its_code(keyed):

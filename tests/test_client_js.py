@@ -6,12 +6,15 @@ import base64
 import json
 import re
 
-from api_server import ROOT, photo
+from api_server import ROOT, create_app, fake_estimators, photo, serving, settings, until
 from fake_service import FakeService
 from node import node
+from stand_ins import make_scene
+from test_scenes import ply
 
 from service.live.live_values import LiveFrame
 from service.types import Intrinsics
+from service.web.key_file import add_key
 from service.web.schemas.frame_message import read_frame
 
 CLIENT = ROOT / "service" / "web" / "static" / "client.js"
@@ -56,6 +59,41 @@ console.log(JSON.stringify({ steps, codes, seed: stored.seed, name: stored.photo
     ]
     assert (told["seed"], told["name"], told["rows"], told["picture"]) == (5, "a.jpg", 4, True)
     assert told["scenes"] == ["room"]
+
+
+def test_scenes_links_and_keys_are_managed_in_node(tmp_path):
+    (tmp_path / "attic").mkdir()
+    (tmp_path / "attic" / "scene.ply").write_bytes(ply())
+    boss = add_key(tmp_path / "keys.json", "boss", "admin")
+    changes = {"keys_file": tmp_path / "keys.json", "scenes": [tmp_path / "attic"], "cache_dir": None}
+    module = (
+        IMPORT
+        + """
+const service = new Client(process.argv[2], { key: process.argv[3] });
+const file = new File([Buffer.from(process.argv[4], "base64")], "a.jpg");
+const point = await service.putAnchor("attic", "the door", [1, 2, 3.5]), anchors = await service.anchors("attic");
+await service.deleteAnchor("attic", "the door");
+const made = await service.addKey("robot 7", { scenes: ["room"], queue_share: 0.5 });
+const robot = new Client(process.argv[2], { key: made.key }), own = await robot.ownKey();
+const { id } = await robot.submit(file, { scene: "room" }), link = await robot.share(id, { expiresInS: 60 });
+const refused = await robot.coverage("attic").catch(error => [error.code, error.status]);
+const job = (await (await fetch(`${link.url}/job`)).json()).job.id === id;
+const names = (await service.keys()).map(k => k.name);
+await service.removeKey("robot 7");
+const gone = await robot.ownKey().catch(error => error.code);
+console.log(JSON.stringify({ point, anchors, left: (await service.anchors("attic")).length, own, job, names,
+  refused, gone, coverage: (await service.coverage("attic")).state, valid: link.expires_in_s }));
+"""
+    )
+    with fake_estimators(), serving(create_app(settings(**changes), {"room": make_scene()})) as http:
+        until(lambda: http.get("/scenes/room", headers={"Authorization": f"Bearer {boss}"}).json()["state"] == "ready")
+        told = json.loads(node(module, str(http.base_url), boss, base64.b64encode(photo()).decode()))
+    assert told["point"] == {"name": "the door", "position": [1, 2, 3.5]}
+    assert (told["anchors"], told["left"]) == ([told["point"]], 0)
+    own = {"name": "robot 7", "role": "localize", "scenes": ["room"], "rate": None, "queue_share": 0.5, "expires": None}
+    assert told["own"] == own
+    assert (told["job"], told["valid"], told["names"]) == (True, 60, ["boss", "robot 7"])
+    assert (told["refused"], told["gone"], told["coverage"]) == (["scene_not_found", 404], "unauthorized", "none")
 
 
 def test_a_lost_connection_is_taken_up_where_it_broke():

@@ -23,7 +23,7 @@ from service.geometry import look_at, rotation_from_quat
 from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.types import Camera, Intrinsics
-from service.web.api_keys import add_key
+from service.web.key_file import add_key
 
 TRUTH = pose_at(1.23, 0.1)
 DOCUMENT = (ROOT / "docs" / "clients.md").read_text("utf-8")

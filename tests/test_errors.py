@@ -33,12 +33,15 @@ from test_scenes import TRANSFORMS, ply
 
 import service.jobs.photo_store
 import service.scene_manager.scene_store
+import service.web.key_file
+import service.web.routes.keys
 from service.codec import encode
 from service.errors import BadInput, SceneError, SplatfixError
 from service.estimators import ESTIMATORS
 from service.loaded_scene import LoadedScene
 from service.scene_manager.entry import Entry
-from service.web.api_keys import add_key
+from service.web.api_keys import KeyRing
+from service.web.key_file import add_key
 from service.web.schemas.error_examples import EXAMPLES
 
 OPERATIONS = {operation["operationId"]: (method, path, operation) for method, path, operation in operations()}
@@ -178,6 +181,21 @@ def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> ht
             for writer in writers:
                 writer.execute("PRAGMA query_only = 0")
                 writer.execute("PRAGMA max_page_count = 1000000")
+
+
+def with_keys(s: SimpleNamespace, send: Callable[[], httpx.Response], *, unwritable: bool = False) -> httpx.Response:
+    """As on a service with keys, which this one is not; `unwritable`: their file can't be written."""
+    file = s.folder / "keys.json"
+    if not file.exists():
+        add_key(file, "boss", "admin")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(service.web.routes.keys, "_require_keys", lambda _: None)
+        patch.setattr(s.app.state.app_state.keys, "_path", file)
+        if unwritable:
+            patch.setattr(service.web.key_file, "write_private", full)
+        answer = send()
+    file.unlink()
+    return answer
 
 
 def uploaded(s: SimpleNamespace) -> str:
@@ -377,6 +395,19 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("delete_lens", "lens_not_found"): lambda s: s.client.delete("/lenses/0123456789abcdef"),
     ("delete_lens", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses/0")),
     ("delete_lenses", "storage_failed"): lambda s: with_full_disk(s, lambda: s.client.delete("/lenses")),
+    ("list_keys", "no_keys"): lambda s: s.client.get("/keys"),
+    ("add_key", "invalid_request"): lambda s: s.client.put("/keys/robot", json={"role": "god"}),
+    ("add_key", "bad_request"): lambda s: s.client.put(
+        "/keys/robot", content=b"\xff", headers={"Content-Type": "application/json"}
+    ),
+    ("add_key", "no_keys"): lambda s: s.client.put("/keys/robot", json={}),
+    ("add_key", "storage_failed"): lambda s: with_keys(
+        s, lambda: s.client.put("/keys/robot", json={}), unwritable=True
+    ),
+    ("remove_key", "invalid_request"): lambda s: s.client.delete("/keys/a:b"),
+    ("remove_key", "key_not_found"): lambda s: with_keys(s, lambda: s.client.delete("/keys/robot")),
+    ("remove_key", "no_keys"): lambda s: s.client.delete("/keys/robot"),
+    ("remove_key", "storage_failed"): lambda s: with_keys(s, lambda: s.client.delete("/keys/boss"), unwritable=True),
     ("make_token", "no_keys"): lambda s: s.client.post("/tokens"),
 }
 for _code, _scene in SCENES.items():
@@ -444,6 +475,7 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
         "scene_exists": "upload_scene",
         "no_keys": "make_token",
         "lens_not_found": "delete_lens",
+        "key_not_found": "remove_key",
         "anchor_not_found": "delete_anchor",
         "registration_failed": "register_scene",
         "registration_not_found": "get_registration",
@@ -499,7 +531,7 @@ def test_the_gate_stops_every_operation(stepping, tmp_path):
 
 def test_a_bug_in_any_operation_is_told_without_details(stepping):
     app = create_app(settings(), {"good": make_scene("good")})
-    assert set(telling("internal_error")) == set(OPERATIONS) - {"live", "get_version"}
+    assert set(telling("internal_error")) == set(OPERATIONS) - {"live", "get_version", "get_own_key"}
     with serving(app) as client:
         app_state = app.state.app_state
         del app.state.app_state
@@ -634,7 +666,7 @@ def test_a_viewer_that_is_gone_is_told(stepping):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     app = create_app(settings(), {"good": make_scene("good")})
-    app.include_router(Relay(SimpleNamespace(port=port)).router)
+    app.include_router(Relay(SimpleNamespace(port=port), KeyRing(None)).router)
     with serving(app) as client:
         answer = client.get("/viewer/")
         assert_problem(answer, 503, "unavailable")

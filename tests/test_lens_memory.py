@@ -32,8 +32,8 @@ from service.photos.images import open_photo
 from service.photos.intrinsics import ORIENTATIONS, oriented
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.types import Intrinsics, IntrinsicsSource, Query
-from service.web.api_keys import add_key, remove_key
 from service.web.app import create_app
+from service.web.key_file import add_key, remove_key
 from service.web.schemas.request_body import body_of
 
 TRUE = Intrinsics(4032, 3024, 3050.0, 3050.0, 2016 + 40.0, 1512 - 24.0, "SIMPLE_RADIAL", (-0.06,), "approximate")

@@ -23,7 +23,7 @@ from service.live.live_values import LiveFrame
 from service.live.mailbox import Mailbox
 from service.live.pace import Pace
 from service.live_client import Live, LiveClosed, LiveRefused
-from service.web.api_keys import add_key, remove_key
+from service.web.key_file import add_key, remove_key
 from service.web.routes import live as live_routes
 from service.web.schemas.live import live_schema
 

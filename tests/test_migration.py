@@ -23,10 +23,12 @@ from stand_ins import make_scene
 
 from service.geometry import look_at
 from service.jobs.migrate_0_1 import old_result
+from service.jobs.model import JobFilter
 from service.jobs.sqlite_store import SqliteJobStore
 from service.results import HINTS, Reason
 from service.types import GeoAnchor, Pose
 from service.web.api_keys import KeyRing
+from service.web.key_file import add_key, read_keys, remove_key
 from service.web.schemas.conversion import geopose_out, result_out
 
 FOLDER = Path(__file__).with_name("data") / "data_folder_0_1_0"
@@ -149,6 +151,29 @@ def test_keys_stay(taken_over):
     sent = {"files": {"photo": (FOLDER / "first.jpg").read_bytes()}, "data": {"keep_photo": "true"}}
     again = client.post("/localize", **sent, headers={"Idempotency-Key": "first"}).json()
     assert again["id"] == BY_NAME["photo_00.jpg"]
+
+
+def test_a_key_has_its_jobs_of_before_and_a_later_one_of_its_name_has_none(tmp_path):
+    """A release that kept the key's name alone kept no time of keys either."""
+    shutil.copytree(FOLDER, tmp_path / "data")
+    file = tmp_path / "data" / "keys.json"
+    (name,) = [key.name for key in read_keys(file)]
+
+    def seen(ring: KeyRing) -> int:
+        store = SqliteJobStore(tmp_path / "data" / "jobs.sqlite")
+        for by_name, client in ring.unnamed_clients():
+            store.reassign(by_name, client)
+        of = next(key for key, _ in ring.listed())
+        found = store.page(JobFilter(client=f"key:{name}:{of.id}"), 100)
+        store.close()
+        return len(found)
+
+    kept = file.read_bytes()
+    remove_key(file, name)
+    add_key(file, name, "read")
+    assert seen(KeyRing(file)) == 0
+    file.write_bytes(kept)
+    assert seen(KeyRing(file)) == len(DOCUMENTS)
 
 
 def test_a_second_start_finds_it_done(tmp_path):

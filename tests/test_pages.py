@@ -28,8 +28,9 @@ from service.geometry import look_at, rotation_from_quat
 from service.loaded_scene import LoadedScene
 from service.results import Status
 from service.types import Pose
-from service.web.api_keys import KeyRing, add_key
+from service.web.api_keys import KeyRing
 from service.web.app import create_app
+from service.web.key_file import add_key, read_keys
 from service.web.settings import Settings
 
 pytestmark = NEEDS_CHROMIUM
@@ -463,6 +464,56 @@ def test_a_service_with_keys_asks_for_one(browser: Browser, tmp_path: Path) -> N
         page.goto(f"{url}/?key=sfx_wrong")
         expect(page.get_by_role("alert")).to_contain_text("not valid")
         assert "sfx_wrong" not in page.url
+        page.close()
+
+
+def test_keys_are_made_shown_once_and_revoked_by_admins(browser: Browser, tmp_path: Path) -> None:
+    file, port = tmp_path / "keys.json", free_port()
+    boss, guest = add_key(file, "boss", "admin"), add_key(file, "guest", "localize")
+    app = create_app(Settings(scenes=[], port=port, viewer=False, data_dir=tmp_path / "data", keys_file=file))
+    with served(app, port) as url:
+        page = opened(browser, f"{url}/?key={guest}")
+        page.get_by_text("No scenes yet").wait_for()
+        expect(page.get_by_role("link", name="Keys")).to_be_hidden()
+        page.goto(f"{url}/#/keys")
+        expect(page.get_by_role("alert")).to_contain_text("role is localize")
+        page.close()
+        page = opened(browser, f"{url}/?key={boss}")
+        page.on("dialog", lambda dialog: dialog.accept())
+        page.get_by_role("link", name="Keys").click()
+        expect(page.get_by_role("row", name="boss")).to_contain_text("your key")
+        page.get_by_role("textbox", name="Name").fill("robot 7")
+        page.get_by_role("textbox", name="Scenes").fill("lab, floor-*")
+        page.get_by_role("textbox", name="Rate limit").fill("600/minute")
+        page.get_by_label("Share of the queue").fill("25")
+        page.get_by_role("combobox", name="Ends").select_option("30")
+        _audit(page)
+        page.get_by_role("button", name="Make key").click()
+        key = page.locator(".newkey").inner_text()
+        row = page.get_by_role("row", name="robot 7")
+        for told in ("lab, floor-*", "600/minute", "25 %"):
+            expect(row).to_contain_text(told)
+        made = next(known for known in read_keys(file) if known.name == "robot 7")
+        assert abs((made.limits.expires or 0) - time.time() - 30 * 86_400) < 60
+        assert httpx.get(f"{url}/key", headers={"Authorization": f"Bearer {key}"}).json()["scenes"] == [
+            "lab",
+            "floor-*",
+        ]
+        _audit(page)
+        for width in (1280, 390):
+            page.set_viewport_size({"width": width, "height": 844})
+            assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+        # A name that is taken is told, and what was typed stays.
+        page.get_by_role("textbox", name="Name").fill("guest")
+        page.get_by_role("button", name="Make key").click()
+        expect(page.get_by_role("alert")).to_contain_text("already exists")
+        assert page.get_by_role("textbox", name="Name").input_value() == "guest"
+        page.reload()
+        row.wait_for()
+        assert key not in page.content()
+        page.get_by_role("button", name="Revoke robot 7").click()
+        expect(row).to_have_count(0)
+        assert {known.name for known in read_keys(file)} == {"boss", "guest"}
         page.close()
 
 

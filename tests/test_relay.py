@@ -27,6 +27,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Response
 
 from service.web import problems
+from service.web.api_keys import KeyRing
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
 
@@ -97,7 +98,7 @@ def viewer() -> Iterator[Viewer]:
 @contextmanager
 def relaying(port: int) -> Iterator[str]:
     """host:port of a service that has nothing but the relay."""
-    relay = Relay(Upstream(port))
+    relay = Relay(Upstream(port), KeyRing(None))
     app = FastAPI()
     problems.add_error_handlers(app)
     app.include_router(relay.router)
@@ -188,7 +189,7 @@ def test_a_viewer_that_dies_is_started_again_and_ends_with_its_supervisor(tmp_pa
     )
 
     async def scenario() -> list[int]:
-        child = ViewerChild("http://127.0.0.1:1", "key")
+        child = ViewerChild("http://127.0.0.1:1")
         child.command = [sys.executable, "-c", dies_twice]
         task = asyncio.create_task(child.supervise())
         while not log.exists() or log.read_text().count("\n") < 3:
@@ -209,7 +210,7 @@ def test_the_viewer_ends_when_its_parent_is_killed(tmp_path):
             sys.executable,
             "-c",
             "import asyncio; from service.web.viewer_process import ViewerChild\n"
-            "asyncio.run(ViewerChild('http://127.0.0.1:1', 'key').supervise())",
+            "asyncio.run(ViewerChild('http://127.0.0.1:1').supervise())",
         ],
         cwd=Path(__file__).parents[1],
     )

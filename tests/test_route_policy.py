@@ -16,7 +16,8 @@ from stand_ins import make_scene
 from starlette.routing import Mount, WebSocketRoute
 
 from service.web import app as web_app
-from service.web.api_keys import ROLES, add_key
+from service.web.api_keys import KeyRing
+from service.web.key_file import ROLES, add_key
 from service.web.middleware.limits import Limits
 from service.web.route_policy import RoutePolicy, declare, declared_policy, require_policies
 from service.web.viewer_relay import Relay
@@ -45,8 +46,10 @@ def keys(tmp_path_factory) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def locked(keys) -> FastAPI:
-    app = create_app(settings(estimator="view_index", keys_file=keys["file"]), {"room": make_scene()})
-    app.include_router(Relay(SimpleNamespace(port=9)).router)
+    # Without a rate limit, which a fast machine would reach here.
+    chosen = settings(estimator="view_index", keys_file=keys["file"], rate_limit="")
+    app = create_app(chosen, {"room": make_scene()})
+    app.include_router(Relay(SimpleNamespace(port=9), KeyRing(None)).router)
     return app
 
 
@@ -199,7 +202,7 @@ def test_a_route_without_a_body_gets_none(stepping):
     sent += [{"type": "http.disconnect"}]
     scope = {"type": "http", "method": "GET", "path": "/", "headers": [], "state": {"policy": RoutePolicy("read")}}
 
-    async def no_room(client, key) -> None:
+    async def no_room(client, most, key) -> None:
         raise AssertionError("a job is queued")
 
     asyncio.run(Limits(curious, settings(), no_room)(scope, receive, None))  # type: ignore[arg-type]

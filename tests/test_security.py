@@ -25,7 +25,10 @@ from websockets.sync.client import connect
 
 from service.cli.server import run
 from service.errors import InvalidRequest, QueueFull, StorageFailed
-from service.web.api_keys import ROLES, Caller, KeyRing, add_key, read_keys, remove_key
+from service.jobs.job_order import JobOrder
+from service.jobs.model import JobSpec
+from service.web.api_keys import Caller, KeyRing
+from service.web.key_file import ROLES, UNLIMITED, KeyLimits, add_key, read_keys, remove_key
 from service.web.metrics import Metrics
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Proxy
@@ -42,7 +45,7 @@ def ring(tmp_path) -> dict[str, str]:
 @pytest.fixture
 def locked(stepping, ring, tmp_path):
     app = create_app(settings(keys_file=tmp_path / "keys.json"), {"room": make_scene()})
-    app.include_router(Relay(SimpleNamespace(port=9)).router)  # a viewer that nobody starts
+    app.include_router(Relay(SimpleNamespace(port=9), KeyRing(None)).router)  # a viewer that nobody starts
     with serving(app) as client:
         until_ready(client)
         yield client
@@ -106,7 +109,9 @@ def test_only_hashes_are_stored_and_only_for_the_owner(tmp_path):
     assert stat.S_IMODE(os.stat(path).st_mode) == 0o600
     assert len(key) >= 43  # 256 bits
     ring = KeyRing(path)
-    assert ring.caller(key) == Caller("robot", "localize")
+    robot = ring.caller(key)
+    assert robot
+    assert (robot.name, robot.role, robot.limits) == ("robot", "localize", UNLIMITED)
     assert ring.caller(key + "x") is None
     assert ring.caller("") is None
     with pytest.raises(InvalidRequest, match="already"):
@@ -211,33 +216,39 @@ def test_a_token_opens_the_viewer_for_a_while(locked, ring):
 
 
 def test_tokens_end(tmp_path):
-    add_key(tmp_path / "keys.json", "a", "admin")
+    key = add_key(tmp_path / "keys.json", "a", "admin")
     ring = KeyRing(tmp_path / "keys.json")
-    assert ring.bearer(ring.token(Caller("a", "admin"), 60)) == Caller("a", "admin")
-    assert ring.bearer(ring.token(Caller("a", "admin"), -1)) is None
-    assert ring.bearer(ring.token(Caller("b", "admin"), 60)) is None
-    assert KeyRing(tmp_path / "keys.json").bearer(ring.token(Caller("a", "admin"), 60)) is None  # another process
+    ann = ring.caller(key)
+    assert ann
+    assert ring.bearer(ring.token(ann, 60)) == ann
+    assert ring.bearer(ring.token(ann, -1)) is None
+    assert ring.bearer(ring.token(Caller("b", "admin", "0" * 16), 60)) is None
+    assert KeyRing(tmp_path / "keys.json").bearer(ring.token(ann, 60)) is None  # another process
     for garbage in ("", ".", "a.b", "é.ü"):
         assert ring.bearer(garbage) is None
 
 
 def test_sessions_outlive_a_restart_and_end_with_their_key(tmp_path):
     keys, secret = tmp_path / "keys.json", tmp_path / "sessions.key"
-    add_key(keys, "a", "read")
+    key = add_key(keys, "a", "read")
     before, after = KeyRing(keys), KeyRing(keys)
     for ring in (before, after):
         ring.keep_sessions(secret)
-    token = before.token(Caller("a", "read"), 60)
+    ann = before.caller(key)
+    assert ann
+    token = before.token(ann, 60)
     assert stat.S_IMODE(os.stat(secret).st_mode) == 0o600
-    assert after.bearer(token) == Caller("a", "read")
+    assert after.bearer(token) == ann
     remove_key(keys, "a")
-    add_key(keys, "a", "read")  # somebody else's, of the same name
+    key = add_key(keys, "a", "read")  # somebody else's, of the same name
     later = KeyRing(keys)
     later.keep_sessions(secret)
     assert later.bearer(token) is None
     secret.write_bytes(b"half")
     later.keep_sessions(secret)
-    assert later.bearer(later.token(Caller("a", "read"), 60))
+    bob = later.caller(key)
+    assert bob
+    assert later.bearer(later.token(bob, 60)) == bob
     assert len(secret.read_bytes()) == 32
     with pytest.raises(StorageFailed, match="secret"):
         later.keep_sessions(tmp_path)
@@ -358,6 +369,44 @@ def test_a_client_that_asks_too_often_is_slowed_down(stepping, ring, tmp_path):
         assert client.get("/jobs", headers=bearer(ring["localize"])).status_code == 200  # reading is free
 
 
+def test_a_key_may_have_a_rate_of_its_own(stepping, tmp_path):
+    file = tmp_path / "keys.json"
+    slow, usual = add_key(file, "slow", "localize", KeyLimits(rate="2/hour")), add_key(file, "usual", "localize")
+    with serving(
+        create_app(settings(rate_limit="4/minute", keys_file=file, queue_size=20), {"room": make_scene()})
+    ) as client:
+        assert [send(client, slow).status_code for _ in range(3)] == [202, 202, 429]
+        assert "2/hour" in send(client, slow).json()["detail"]
+        assert [send(client, usual).status_code for _ in range(5)] == [202, 202, 202, 202, 429]
+        stepping.GO_ON.set()
+
+
+def test_a_key_may_have_a_share_of_the_queue(stepping, tmp_path):
+    """Half of a queue of four: two of its jobs wait, whatever else the queue has."""
+    file = tmp_path / "keys.json"
+    half, whole = add_key(file, "half", "localize", KeyLimits(queue_share=0.5)), add_key(file, "whole", "localize")
+    changes = {"rate_limit": "", "keys_file": file, "queue_size": 4}
+    app = create_app(settings(**changes), {"room": make_scene()})
+    with serving(app) as client:
+        until_ready(client)
+        held = {"files": {"photo": photo()}, "data": {"options": '{"hold": true}'}, "headers": bearer(whole)}
+        running = client.post("/localize", **held).headers["location"]
+        until(lambda: client.get(running, headers=bearer(whole)).json()["state"] == "running")
+        mine = [send(client, half, **{"Idempotency-Key": str(n)}) for n in range(3)]
+        assert [answer.status_code for answer in mine] == [202, 202, 503]
+        assert_problem(mine[2], 503, "queue_full")
+        assert "2 jobs of this key" in mine[2].json()["detail"]
+        # The same request again is no new job.
+        assert send(client, half, **{"Idempotency-Key": "1"}).json()["id"] == mine[1].json()["id"]
+        # Many may pass the check of the head at once: the last word is when the job is stored.
+        mine_client = KeyRing(file).caller(half).client  # type: ignore[union-attr]
+        order = JobOrder(photo(), "p.jpg", "0", JobSpec("stepping"), mine_client, None, "0", most_queued=2)
+        with pytest.raises(QueueFull, match="its share"):
+            app.state.app_state.jobs.accept(order)
+        assert [send(client, whole).status_code for _ in range(3)] == [202, 202, 503]
+        stepping.GO_ON.set()
+
+
 def test_few_uploads_at_once():
     """Against the layer itself: three bodies that don't end, of which two have a place."""
 
@@ -369,7 +418,7 @@ def test_few_uploads_at_once():
             await send({"type": "http.response.start", "status": 200, "headers": []})
             await send({"type": "http.response.body", "body": b""})
 
-        async def room(client, key):
+        async def room(client, most, key):
             if key == "full":
                 raise QueueFull("full")
 
@@ -438,7 +487,7 @@ def test_logs_have_ids_and_no_secrets(stepping, ring, tmp_path, caplog):
             client.get("/", params={"key": ring["admin"]})
             answer = send(client, ring["localize"], **{"X-Request-ID": "my-request.1"})
             assert answer.headers["x-request-id"] == "my-request.1"
-            job = finished_with(client, answer.headers["location"], ring["read"])
+            job = finished_with(client, answer.headers["location"], ring["localize"])
             odd = client.get("/livez", headers={"X-Request-ID": "a b\tc"}).headers["x-request-id"]
             assert odd.isalnum()
     finally:
@@ -459,8 +508,10 @@ def finished_with(client: httpx.Client, path: str, key: str) -> dict:
 def test_the_viewers_polling_is_not_logged(stepping, ring, tmp_path, caplog):
     caplog.set_level(logging.INFO, "service")
     keys = KeyRing(tmp_path / "keys.json")
-    viewer = keys.make_temporary("viewer", "read")
+    reader = keys.caller(ring["read"])
+    assert reader
     with serving(create_app(settings(), {"room": make_scene()}, keys)) as client:
+        viewer = keys.viewer_token(reader)
         for path, status in (("/jobs", 200), ("/scenes", 200), ("/jobs/none", 404)):
             assert client.get(path, headers=bearer(viewer)).status_code == status
         client.get("/scenes", headers=bearer(ring["read"]))

@@ -11,7 +11,8 @@ import pytest
 from api_server import assert_problem, create_app, fake_estimators, finished, post, serving, settings, until
 from stand_ins import make_scene
 
-from service.web.api_keys import Caller, KeyRing, add_key, remove_key
+from service.web.api_keys import KeyRing
+from service.web.key_file import add_key, remove_key
 
 
 @pytest.fixture(scope="module")
@@ -76,10 +77,10 @@ def test_nobody_else_may_frame_the_page_unless_the_operator_says_so(service, mon
 def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path, monkeypatch):
     monkeypatch.setattr("service.web.api_keys._RECHECK_S", 0.0)
     file = tmp_path / "keys.json"
-    add_key(file, "ann", "localize")
+    key = add_key(file, "ann", "localize")
     ring = KeyRing(file)
     ring.keep_sessions(tmp_path / "sessions.key")
-    ann = Caller("ann", "localize")
+    ann = ring.caller(key)
     token, unowned = ring.share_token("one", 60, ann), ring.share_token("two", 60, None)
     again = KeyRing(file)
     assert again.shared_job(token) is None  # another secret
@@ -93,11 +94,19 @@ def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path, 
 
 def test_no_token_passes_for_one_of_the_other_kind(tmp_path):
     file = tmp_path / "keys.json"
-    add_key(file, "ann", "admin")
+    key = add_key(file, "ann", "admin")
     ring = KeyRing(file)
-    ann = Caller("ann", "admin")
-    assert ring.bearer(ring.share_token("one", 60, ann)) is None
-    assert ring.shared_job(ring.token(ann, 60)) is None
+    ann = ring.caller(key)
+    assert ann
+    made = {
+        "session": ring.token(ann, 60),
+        "shared": ring.share_token("one", 60, ann),
+        "viewer": ring.viewer_token(ann),
+    }
+    read = {"session": ring.bearer, "shared": ring.shared_job, "viewer": ring.viewer_bearer}
+    for kind, token in made.items():
+        for other, accept in read.items():
+            assert (accept(token) is None) is (kind != other), (kind, other)
 
 
 def test_with_keys_a_link_needs_none_and_opens_nothing_else(tmp_path):

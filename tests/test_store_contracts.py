@@ -298,6 +298,30 @@ def test_pages_are_filtered_and_newest_first(store):
     assert store.ids() == {"0", "1", "2", "3"}
 
 
+def test_jobs_are_reassigned_with_their_keys(store):
+    for name, client, key in (("a", "old", "k"), ("b", "old", None), ("c", "new", None), ("d", "other", "k")):
+        store.accept(new_job(name, client=client, idempotency_key=key))
+    store.reassign("old", "new")
+    assert [job.id for job in store.page(JobFilter(client="new"), 9)] == ["c", "b", "a"]
+    assert store.page(JobFilter(client="old"), 9) == []
+    assert [store.has_key(client, "k") for client in ("old", "new", "other")] == [False, True, True]
+    # An idempotency key that both have used: neither job is lost.
+    store.accept(new_job("e", client="old", idempotency_key="k"))
+    store.reassign("old", "new")
+    assert (store.get("a").client, store.get("e").client) == ("new", "old")
+
+
+def test_jobs_are_listed_and_counted_by_client(store):
+    for name, client in (("a", "key:ann:1"), ("b", "key:bob:2"), ("c", "key:ann:1"), ("d", "key:ann")):
+        store.accept(new_job(name, client=client))
+    assert [job.id for job in store.page(JobFilter(client="key:ann:1"), 9)] == ["c", "a"]
+    assert [job.id for job in store.page(JobFilter(client="key:ann:1"), 1)] == ["c"]
+    assert store.page(JobFilter(client=""), 9) == []
+    store.claim(store.get("a"), time.time() + 60)
+    assert [store.count("queued", client) for client in (None, "key:ann:1", "key:bob:2", "nobody")] == [3, 1, 1, 0]
+    assert [store.count("running", client) for client in (None, "key:ann:1", "key:bob:2")] == [1, 1, 0]
+
+
 @pytest.mark.parametrize(
     ("kept", "left"),
     [

@@ -34,7 +34,7 @@ from viewer.picking import first_surface
 from viewer.playback import Playback
 from viewer.service_lists import ServiceLists
 from viewer.service_values import Job, JobOutcome, ListedJob, Splats, parse_splats, record_of
-from viewer.shared_data import SharedData
+from viewer.shared_data import SharedByToken, SharedData
 
 # ---------------------------------------------------------------- what the service says
 
@@ -547,6 +547,25 @@ def test_a_stream_is_shared_and_ends_with_its_last_listener() -> None:
     until(lambda: not threads("job-c"), "the thread's end")
     assert shared.streams.follow("c", one) is not stream
     shared.close()
+
+
+def test_data_are_shared_between_browsers_of_one_user_alone() -> None:
+    fakes = {"ann": FakeService(), "bob": FakeService()}
+    before = set(threads("job-list"))
+    shared = SharedByToken(lambda token: Client("http://fake", transport=fakes[token].transport))
+    first, second, bobs = shared.take("ann"), shared.take("ann"), shared.take("bob")
+    assert first is second is not bobs
+    bobs.scenes.get("ball")
+    assert not fakes["ann"].asked
+    assert len(set(threads("job-list")) - before) == 2
+    shared.give_back("ann")
+    assert shared.take("ann") is first
+    for token in ("ann", "ann", "bob"):
+        shared.give_back(token)
+    assert len(shared) == 0
+    until(lambda: not set(threads("job-list")) - before, "the threads' end")
+    assert shared.take("ann") is not first
+    shared.give_back("ann")
 
 
 def test_pictures_and_scenes_are_fetched_once() -> None:

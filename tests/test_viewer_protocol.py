@@ -35,6 +35,7 @@ from viewer.job_stream import JobStream
 from viewer.replay import replay_html
 from viewer.requested_page import requested_page
 from viewer.scene_cache import SceneCache
+from viewer.shared_data import SharedData
 from viewer.viewer_server import Viewer
 
 LAST_NODES = {"/splats/splats", "/candidates/cloud", "/match vectors/points"}
@@ -48,9 +49,14 @@ def fake() -> FakeService:
 
 @pytest.fixture
 def viewer(fake: FakeService) -> Iterator[Viewer]:
-    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(lambda _: Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
     yield viewer
     viewer.stop()
+
+
+def _shared(viewer: Viewer) -> SharedData:
+    """What the browsers without a token share."""
+    return viewer._shared._taken[""][0]
 
 
 def _browser(viewer: Viewer, path: str = "/") -> FakeBrowser:
@@ -222,7 +228,7 @@ def test_browsers_do_not_disturb_one_another_and_leave_nothing(fake: FakeService
         assert all(threads(name) for name in names)
     until(lambda: not any(threads(name) for name in names), "the end of all threads")
     assert not viewer._sessions
-    assert len(viewer._shared.streams) == 0
+    until(lambda: len(viewer._shared) == 0, "the end of what its browsers shared")
 
 
 def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: Viewer) -> None:
@@ -255,7 +261,7 @@ def test_buttons_move_the_camera(fake: FakeService, viewer: Viewer) -> None:
         there = records(3)[1].pose.position_in_world
         browser.wait(lambda: np.allclose(client.camera.position, there, atol=1e-6), "looking through")
         browser.set("fly to result", True)
-        ball = viewer._shared.scenes.get("ball")
+        ball = _shared(viewer).scenes.get("ball")
         goal = camera_views.view_from_behind(records(3)[-1].pose, ball.extent, ball.splats.centres)
         # viser leaves out changes below 1e-5 of the value.
         browser.wait(lambda: np.allclose(client.camera.position, goal.position, atol=1e-4), "arrival")
@@ -275,7 +281,7 @@ def test_a_job_is_looked_at_where_it_is_however_long_its_scene_takes(
         job.finish()
         browser.wait(lambda: browser.widget("step")["value"] == 2 and "15 agree" in browser.text(), "the last step")
         (client,) = viewer.server.get_clients().values()
-        ball = viewer._shared.scenes.get("ball")
+        ball = _shared(viewer).scenes.get("ball")
         there = camera_views.view_from_behind(records(3)[-1].pose, ball.extent, ball.splats.centres).position
         assert np.allclose(client.camera.position, there, atol=1e-4)
 
@@ -349,7 +355,7 @@ def test_two_clicks_measure_a_distance_and_a_view_becomes_a_prior(fake: FakeServ
     fake.job("j", 2, finished=True)
     with _browser(viewer, "/jobs/j") as browser:
         browser.wait(lambda: "/splats/splats" in browser.nodes, "the scene")
-        centres = viewer._shared.scenes.get("ball").splats.centres[:2].astype(float)
+        centres = _shared(viewer).scenes.get("ball").splats.centres[:2].astype(float)
         browser.set("measure distances", True)
         browser.set("axes and scale", True)
         for centre in centres:
@@ -595,7 +601,7 @@ def test_no_browser_can_open_a_public_tunnel(
     monkeypatch.setattr(viser.ViserServer, "request_share_url", lambda *_, **__: asked.set())
     if not forbidden:  # shows that the message is the right one: without the ban it has its effect
         monkeypatch.setattr(viewer_server, "disable_public_tunnels", lambda server: None)
-    viewer = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
+    viewer = Viewer(lambda _: Client("http://fake", transport=fake.transport), "127.0.0.1", 0)
     try:
         with _browser(viewer) as browser:
             browser.send(type="ShareUrlRequest")
@@ -616,7 +622,7 @@ def test_a_viser_that_hides_its_tunnel_is_refused() -> None:
 
 def test_a_viewer_that_stops_takes_leave_of_its_browsers(fake: FakeService) -> None:
     """viser reports them as gone while it stops, which ends their sessions."""
-    viewer, gone = Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", 0), threading.Event()
+    viewer, gone = Viewer(lambda _: Client("http://fake", transport=fake.transport), "127.0.0.1", 0), threading.Event()
     viewer.server.on_client_disconnect(lambda client: gone.set())
     with _browser(viewer) as browser:
         browser.wait(lambda: "no job" in browser.text(), "the page")
@@ -628,7 +634,7 @@ def test_a_viewer_that_stops_takes_leave_of_its_browsers(fake: FakeService) -> N
 
 def test_a_taken_port_is_an_error(viewer: Viewer, fake: FakeService) -> None:
     with pytest.raises(OSError, match="is taken"):
-        Viewer(Client("http://fake", transport=fake.transport), "127.0.0.1", viewer.server.get_port())
+        Viewer(lambda _: Client("http://fake", transport=fake.transport), "127.0.0.1", viewer.server.get_port())
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import os
 import signal
 import threading
 from contextlib import redirect_stdout
+from functools import partial
 
 from service.client import Client
 from viewer.viewer_server import Viewer
@@ -31,13 +32,11 @@ def main() -> None:
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: ended.set())
-    # By the environment, since any user of the machine can read the command line.
-    key = os.environ.get("SPLATFIX_VIEWER_KEY", "")
     # No proxy from the environment, since the service is on loopback; a render takes seconds on a busy machine.
     certificate = arguments.certificate
-    service = Client(arguments.service, key, timeout_s=30.0, use_proxy=False, certificate=certificate)
+    connect = partial(Client, arguments.service, timeout_s=30.0, use_proxy=False, certificate=certificate)
     with redirect_stdout(io.StringIO()):  # viser prints its address, which only the relay uses
-        viewer = Viewer(service, arguments.host, arguments.port)
+        viewer = Viewer(connect, arguments.host, arguments.port)
     log.info("the viewer listens on port %s", viewer.server.get_port())
     if arguments.end_with_stdin:
         threading.Thread(target=_wait_for_end_of_stdin, args=[ended], daemon=True).start()
@@ -46,7 +45,6 @@ def main() -> None:
         pass
     with redirect_stdout(io.StringIO()):
         viewer.stop()
-    service.close()
 
 
 def _wait_for_end_of_stdin(ended: threading.Event) -> None:

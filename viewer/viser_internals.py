@@ -19,6 +19,16 @@ def requested_path(server: viser.ViserServer, client_id: int) -> str:
         return "/"
 
 
+def sent_token(server: viser.ViserServer, client_id: int) -> str:
+    """Return the token of a browser's WebSocket request, in whose name to ask the service; "" if there is none."""
+    try:
+        headers = server._websock_server._live_connections[client_id].request.headers  # type: ignore[union-attr]
+    except (AttributeError, KeyError):
+        log.warning("no token is known of client %s; it is shown what needs no key", client_id)
+        return ""
+    return headers.get("Authorization", "").removeprefix("Bearer ")
+
+
 def disable_public_tunnels(server: viser.ViserServer) -> None:
     """Remove viser's handler by which any browser could open a public tunnel to this server.
 

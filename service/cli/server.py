@@ -145,7 +145,7 @@ def _announce(
             time.sleep(0.05)
         app_state = application.state.app_state
         while pending := app_state.engine.readiness().pending:
-            status.update(", ".join(pending))
+            status.update(", ".join(map(str, pending)))
             time.sleep(0.1)
     readiness, url = app_state.engine.readiness(), settings.loopback_url
     query = f"?key={key}" if key else ""

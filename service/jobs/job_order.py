@@ -21,12 +21,14 @@ class JobOrder:
     photo_sha256: str
     spec: JobSpec
     client: str
-    """Who asks: the scope of idempotency keys."""
+    """Who asks, and sees the job: the scope of idempotency keys."""
     idempotency_key: str | None
     digest: str
     """Of the request's meaning: the same for the same request."""
     lens_owner: str = ""
     """Among whose lenses the photo's is; empty: the photo's lens isn't remembered."""
+    most_queued: int | None = None
+    """How many jobs of the client may wait at once; None: as many as the queue takes."""
 
 
 def new_job(order: JobOrder, scene: str, photo: DecodedPhoto) -> NewJob:

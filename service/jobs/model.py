@@ -138,7 +138,7 @@ class NewJob:
 
     id: str
     client: str
-    """Whose it is: the scope of idempotency keys."""
+    """Whose it is: the API key's by name and id, or an address's. The scope of idempotency keys, and who may see it."""
     idempotency_key: str | None
     digest: str
     """SHA-256 of the validated request and its photo: decides whether a repeated key means the same."""
@@ -202,6 +202,7 @@ class JobFilter:
     photo_sha256: str | None = None
     before: int | None = None
     """Only jobs accepted before the one with that number."""
+    client: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,9 @@ _JOBS = """
         PRIMARY KEY (job, attempt, seq)
     )
 """
+_CLIENTS = """
+    CREATE INDEX job_by_client ON jobs (client, number)
+"""
 _PHOTOS = """
     CREATE TABLE photos (job TEXT NOT NULL, original BOOLEAN NOT NULL, data BYTEA NOT NULL, PRIMARY KEY (job, original))
 """
@@ -53,7 +56,7 @@ class PostgresJobStore(SqlJobStore):
 
     def __init__(self, database: PostgresDatabase) -> None:
         """Bring the tables to their present version. Raises StorageFailed."""
-        database.migrate("jobs", _first(_JOBS))
+        database.migrate("jobs", (*_first(_JOBS), *_first(_CLIENTS)))
         super().__init__(database)
         self._listen = database.listen
 

@@ -93,6 +93,7 @@ class Jobs:
         watch, take = store.watch(), self._enqueue_when_ready
         self._shared = SharedJobs(watch, store, engine, self._queue, self._worker, take) if watch else None
         self._left_over = LeftOverPhotos(store, photos)
+        self._sharing = threading.Lock()
         self._renew_at = 0.0
         self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
@@ -137,7 +138,7 @@ class Jobs:
                 lens = LensUse(order.lens_owner, photo.recalled)
                 order = replace(order, spec=replace(order.spec, lens=lens))
             new = new_job(order, scene, photo)
-            job = self._stored(new, order.photo)
+            job = self._stored_within_share(new, order)
         # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
         except BaseException:
             self._release(held)
@@ -175,6 +176,19 @@ class Jobs:
         if self._lenses is None or not order.lens_owner:
             return None
         return partial(self._lenses.recall, order.lens_owner, order.spec.camera_id)
+
+    def _stored_within_share(self, new: NewJob, order: JobOrder) -> StoredJob:
+        """Put a job on disk unless its client has as many waiting as it may. Raises QueueFull, StorageFailed."""
+        if order.most_queued is None:
+            return self._stored(new, order.photo)
+        # One at a time: two jobs that are accepted at once must not both take the last place.
+        with self._sharing:
+            self._require_share(order.client, order.most_queued)
+            return self._stored(new, order.photo)
+
+    def _require_share(self, client: str, most: int | None) -> None:
+        if most is not None and (waiting := self._store.count("queued", client)) >= most:
+            raise QueueFull(f"the queue is full: {waiting} jobs of this key, its share.", hint="Try again later.")
 
     def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
         """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
@@ -261,18 +275,24 @@ class Jobs:
         background = info.background_rgb if info else (0.0, 0.0, 0.0)
         return read_photo(self._photos.original(job.id), job.spec, background, self._config.max_frames).query
 
-    def waiting(self) -> int:
-        """Return how many jobs wait for a worker."""
-        return self._store.count("queued")
+    def waiting(self, client: str | None = None) -> int:
+        """Return how many jobs wait for a worker; of one client, or of all (None)."""
+        return self._store.count("queued", client)
 
-    def running(self) -> int:
-        """Return how many jobs run."""
-        return self._store.count("running")
+    def running(self, client: str | None = None) -> int:
+        """Return how many jobs run; of one client, or of all (None)."""
+        return self._store.count("running", client)
 
-    def require_queue_capacity(self, client: str, key: str | None) -> None:
-        """Raises QueueFull if a new job would be refused; a repeated one never is."""
-        if self._queue.full() and not (key and self._store.has_key(client, key)):
+    def require_queue_capacity(self, client: str, most: int | None, key: str | None) -> None:
+        """Raises QueueFull if a new job would be refused; a repeated one never is.
+
+        `most`: how many jobs of the client may wait at once; None: as many as the queue takes.
+        """
+        if key and self._store.has_key(client, key):
+            return
+        if self._queue.full():
             raise QueueFull(f"the queue is full: {self._queue.waiting()} jobs.", hint="Try again later.")
+        self._require_share(client, most)
 
     def stuck_workers(self) -> int:
         """Return how many workers were given up."""

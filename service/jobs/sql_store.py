@@ -81,6 +81,12 @@ class SqlJobStore:
         with self._database.reading() as reader:
             return bool(_select(reader, "WHERE client = ? AND idempotency_key = ?", client, key))
 
+    def reassign(self, client: str, to: str) -> None:
+        # An idempotency key that both have used stays with whose it is.
+        used = "SELECT 1 FROM jobs AS kept WHERE kept.client = ? AND kept.idempotency_key = jobs.idempotency_key"
+        with self._database.transaction() as writer:
+            writer.execute(f"UPDATE jobs SET client = ? WHERE client = ? AND NOT EXISTS ({used})", (to, client, to))
+
     def probe(self) -> None:
         self._database.probe()
 
@@ -210,15 +216,17 @@ class SqlJobStore:
             "status = ?": wanted.status and str(wanted.status),
             "photo_sha256 = ?": wanted.photo_sha256,
             "number < ?": wanted.before,
+            "client = ?": wanted.client,
         }
         given = {test: value for test, value in tests.items() if value is not None}
         where = f"WHERE {' AND '.join(given)} " if given else ""
         with self._database.reading() as reader:
             return _select(reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
 
-    def count(self, state: JobState) -> int:
+    def count(self, state: JobState, client: str | None = None) -> int:
+        where, values = ("state = ?", [state]) if client is None else ("state = ? AND client = ?", [state, client])
         with self._database.reading() as reader:
-            return reader.execute("SELECT count(*) FROM jobs WHERE state = ?", (state,)).fetchone()[0]
+            return reader.execute(f"SELECT count(*) FROM jobs WHERE {where}", values).fetchone()[0]
 
     def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
         with self._database.reading() as reader:

@@ -58,7 +58,12 @@ def _make_version_2(writer: Connection) -> None:
     writer.execute(f"UPDATE jobs SET bytes = {sizes} WHERE state IN ({_ENDED_SQL})")
 
 
-_MIGRATIONS = (_make_version_1, _make_version_2)
+def _make_version_3(writer: Connection) -> None:
+    """Jobs are listed and counted by client."""
+    writer.execute("CREATE INDEX job_by_client ON jobs (client, number)")
+
+
+_MIGRATIONS = (_make_version_1, _make_version_2, _make_version_3)
 
 
 class SqliteJobStore(SqlJobStore):

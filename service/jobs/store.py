@@ -56,6 +56,10 @@ class JobStore(Protocol):
         """Return whether the client has used that idempotency key."""
         ...
 
+    def reassign(self, client: str, to: str) -> None:
+        """Give all jobs of a client to another one, with their idempotency keys."""
+        ...
+
     def claim(self, job: StoredJob, lease_until: float) -> int | None:
         """Start the next attempt, whose lease ends then; return its number.
 
@@ -107,8 +111,8 @@ class JobStore(Protocol):
         """Return the newest jobs that fit, at most `limit`."""
         ...
 
-    def count(self, state: JobState) -> int:
-        """Return how many jobs are in that state."""
+    def count(self, state: JobState, client: str | None = None) -> int:
+        """Return how many jobs are in that state; of one client, or of all (None)."""
         ...
 
     def records(self, job_id: str, first: int = 0) -> list[JobRecord]:

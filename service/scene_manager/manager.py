@@ -30,7 +30,7 @@ from service.errors import (
 from service.loaded_scene import DEFAULT_MATCHER, LoadedScene
 from service.scene_manager.entry import Entry
 from service.scene_manager.memory_limit import MemoryLimit
-from service.scene_manager.status import AUTO, SceneContents, SceneReadiness
+from service.scene_manager.status import AUTO, SceneContents, SceneNote, SceneReadiness
 from service.scene_manager.warm_up import warm_up
 from service.scene_origin import shifted_camera
 
@@ -107,15 +107,14 @@ class Scenes:
             return list(self._entries.values())
 
     def entry(self, scene_id: str | None) -> Entry:
-        """Return a scene; None: the only one. Raises SceneNotFound, which names the scenes that are there."""
+        """Return a scene; None: the only one. Raises SceneNotFound, which tells of no other scene."""
         with self._lock:
-            known = ", ".join(self._entries) or "none"
             if scene_id is None and len(self._entries) == 1:
                 return next(iter(self._entries.values()))
             if scene_id is None:
-                raise SceneNotFound(f"name a scene; known: {known}.", where="scene")
+                raise SceneNotFound("name a scene.", where="scene")
             if scene_id not in self._entries:
-                raise SceneNotFound(f"unknown scene '{scene_id}'; known: {known}.", where="scene")
+                raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
             return self._entries[scene_id]
 
     def add(self, entry: Entry) -> None:
@@ -274,8 +273,8 @@ class Scenes:
     def readiness(self) -> SceneReadiness:
         """Return whether photos can be localized, what is still loading, and what failed."""
         entries = self.entries()
-        pending = [f"scene {e.id}: {e.state}" for e in entries if e.required and e.awaited]
-        failed = [f"scene {e.id}: {e.error}" for e in entries if e.state == "failed"]
+        pending = [SceneNote(e.id, e.state) for e in entries if e.required and e.awaited]
+        failed = [SceneNote(e.id, str(e.error)) for e in entries if e.state == "failed"]
         usable = any(e.state == "ready" or (e.state == "unloaded" and e.wanted) for e in entries)
         loaded = [e.loaded for e in entries if e.loaded]
         return SceneReadiness(

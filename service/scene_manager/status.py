@@ -62,13 +62,25 @@ class SceneContents:
 
 
 @dataclass(frozen=True, slots=True)
+class SceneNote:
+    """What is to be said of a scene."""
+
+    scene: str
+    text: str
+
+    def __str__(self) -> str:
+        """As people read it."""
+        return f"scene {self.scene}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
 class SceneReadiness:
     """Whether photos can be localized at full speed, and what is missing."""
 
     ready: bool
-    pending: tuple[str, ...]
+    pending: tuple[SceneNote, ...]
     """Scenes that are still being loaded or prepared, with their state."""
-    failed: tuple[str, ...]
+    failed: tuple[SceneNote, ...]
     """Scenes that could not be loaded, with the reason."""
     rasterizers: tuple[str, ...]
     """What the scenes in memory are rendered with."""

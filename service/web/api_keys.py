@@ -1,34 +1,36 @@
-"""API keys with roles, and the short-lived tokens that browsers use in their place.
-
-Only the SHA-256 of a key is stored. It needs no salt: a key is 256 random bits, which can't be guessed from it.
-"""
+"""The keys of a running service, and the tokens that stand for them: of sessions, of share links, of the viewer."""
 
 from __future__ import annotations
 
 import base64
-import hashlib
 import hmac
 import json
-import os
+import math
 import secrets
 import time
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 from service.errors import InvalidRequest, StorageFailed
+from service.web.key_file import (
+    ROLES,
+    UNLIMITED,
+    KeyLimits,
+    Role,
+    StoredKey,
+    add_key,
+    digest,
+    key_exists,
+    new_key,
+    read_keys,
+    remove_key,
+    write_private,
+)
 
-Role = Literal["read", "localize", "admin"]
-ROLES: tuple[Role, ...] = get_args(Role)
-"""In ascending order; each role includes those before it."""
-VIEWER_KEY = "viewer"
-"""Name of the key of the viewer's process."""
-_PREFIX = "sfx_"
-"""Marks a key for people and for secret scanners."""
 _SECRET_BYTES = 32
-_SHARED = "share:"
-"""Before what is signed of a share token: no session's token passes for one, nor the other way round."""
+_SESSION, _SHARED, _VIEWER = "session:", "share:", "viewer:"
+"""Kinds of tokens. They are signed with the kind before them, so that none passes for one of another kind."""
 _RECHECK_S = 1.0
 """Time between two checks of the file."""
 
@@ -40,19 +42,20 @@ class Caller:
     name: str
     """Of the key."""
     role: Role
+    id: str = ""
+    """Of the key: another one of the same name has another."""
+    limits: KeyLimits = UNLIMITED
+    by_viewer: bool = False
+    """The viewer asks, for somebody who looks at it."""
+
+    @property
+    def client(self) -> str:
+        """The key by name and id: whose jobs, lenses and limits these are."""
+        return f"key:{self.name}:{self.id}"
 
     def has_role(self, role: Role) -> bool:
         """Return whether the caller's role includes another."""
         return ROLES.index(self.role) >= ROLES.index(role)
-
-
-@dataclass(frozen=True, slots=True)
-class StoredKey:
-    """An entry of the key file."""
-
-    name: str
-    role: Role
-    sha256: str
 
 
 class KeyRing:
@@ -69,9 +72,9 @@ class KeyRing:
         self._refresh()
 
     def __bool__(self) -> bool:
-        """Return whether a client needs a key: whether there is any but the viewer's own."""
+        """Return whether a client needs a key: whether there is any, be it expired."""
         self._refresh()
-        return bool(self._stored) or any(key.name != VIEWER_KEY for key in self._temporary)
+        return bool(self._stored or self._temporary)
 
     def keep_sessions(self, path: Path) -> None:
         """Sign tokens with the secret in a file, made if it isn't there, so that they outlive a restart.
@@ -82,74 +85,119 @@ class KeyRing:
             secret = path.read_bytes() if path.exists() else b""
             if len(secret) != _SECRET_BYTES:
                 secret = secrets.token_bytes(_SECRET_BYTES)
-                _write_private(path, secret)
+                write_private(path, secret)
         except OSError as error:
             raise StorageFailed(f"the secret of sessions can't be kept: {error.strerror}.", where=path.name) from error
         self._secret = secret
 
-    def make_temporary(self, name: str, role: Role) -> str:
+    def make_temporary(self, name: str, role: Role, limits: KeyLimits = UNLIMITED) -> str:
         """Make a key that is valid until the process ends; return it."""
-        key = _PREFIX + secrets.token_urlsafe(32)
-        self._temporary.append(StoredKey(name, role, _digest(key)))
+        key, stored = new_key(name, role, limits)
+        self._temporary.append(stored)
         return key
 
-    def caller(self, key: str) -> Caller | None:
-        """Return the owner of a key; None for an unknown one. The comparison takes constant time."""
+    def listed(self) -> list[tuple[StoredKey, bool]]:
+        """Return all keys, each with whether it is temporary."""
         self._refresh()
-        digest, found = _digest(key), None
+        return [*((key, False) for key in self._stored), *((key, True) for key in self._temporary)]
+
+    def unnamed_clients(self) -> Iterator[tuple[str, str]]:
+        """Yield, of each key of an earlier release, whose jobs it has: by its name alone, and by name and id.
+
+        Such a release kept no key's time; a key of the same name that was made later has one, and gets no jobs.
+        """
+        for key, _ in self.listed():
+            if key.created is None:
+                yield f"key:{key.name}", _caller(key).client
+
+    def add(self, name: str, role: Role, limits: KeyLimits) -> str:
+        """Make a key and store its hash; return the key. Raises InvalidRequest, StorageFailed."""
+        if any(key.name == name for key in self._temporary):
+            raise key_exists(name)
+        key = add_key(self._stored_in(), name, role, limits)
+        self._read_at = -math.inf
+        return key
+
+    def remove(self, name: str) -> None:
+        """Remove a key, with all that stands for it. Raises KeyNotFound, InvalidRequest, StorageFailed."""
+        left = [key for key in self._temporary if key.name != name]
+        if len(left) < len(self._temporary):
+            self._temporary = left
+            return
+        remove_key(self._stored_in(), name)
+        self._read_at = -math.inf
+
+    def _stored_in(self) -> Path:
+        if self._path is None:
+            raise InvalidRequest("no file of keys is set.", where="keys_file", hint="Set SPLATFIX_KEYS_FILE.")
+        return self._path
+
+    def caller(self, key: str) -> Caller | None:
+        """Return the owner of a key; None for an unknown or expired one. The comparison takes constant time."""
+        self._refresh()
+        sent, found = digest(key), None
         # No early exit: the time must not reveal which key comes close.
         for known in (*self._stored, *self._temporary):
-            if hmac.compare_digest(known.sha256, digest):
-                found = Caller(known.name, known.role)
-        return found
+            if hmac.compare_digest(known.sha256, sent):
+                found = known
+        return _caller(found) if found and found.is_valid() else None
 
-    def key_id(self, caller: Caller) -> str:
-        """Return what tells a key from an earlier one of the same name: digits of its hash; empty if it was removed."""
-        self._refresh()
-        ids = [_key_id(key) for key in (*self._stored, *self._temporary) if key.name == caller.name]
-        return ids[0] if ids else ""
+    def lives(self, caller: Caller) -> bool:
+        """Return whether a caller's key is still there, and has not expired."""
+        return self._find(caller.id) is not None
 
     def token(self, caller: Caller, seconds: float) -> str:
         """Return a signed token that is valid for that time, but no longer than the caller's key."""
-        key = self.key_id(caller)
-        claim = json.dumps({"name": caller.name, "role": caller.role, "key": key, "until": time.time() + seconds})
-        text = base64.urlsafe_b64encode(claim.encode()).decode()
-        return f"{text}.{self._signature(text)}"
+        return self._signed(_SESSION, {"key": caller.id, "until": time.time() + seconds})
 
     def bearer(self, token: str) -> Caller | None:
-        """Return the owner of a token; None if it is forged or expired, or its key was removed."""
-        text, _, signature = token.partition(".")
-        if not hmac.compare_digest(self._signature(text).encode(), signature.encode()):
-            return None
-        claim = json.loads(base64.urlsafe_b64decode(text))
-        caller = Caller(claim["name"], claim["role"])
-        self._refresh()
-        # The signature proves who made the token, not that the key still exists with that role. Its hash counts, too:
-        # a key of the same name that was added later is another one.
-        living = {(key.name, key.role, _key_id(key)) for key in (*self._stored, *self._temporary)}
-        named = caller.name, caller.role, claim["key"]
-        return caller if claim["until"] > time.time() and named in living else None
+        """Return the owner of a token; None if it is forged or expired, or its key was removed or expired."""
+        claim = self._claim(_SESSION, token)
+        # The signature proves who made the token, not that the key still exists. Its hash counts, not its name: a key
+        # of the same name that was added later is another one.
+        key = self._find(claim["key"]) if claim and claim["until"] > time.time() else None
+        return _caller(key) if key else None
+
+    def viewer_token(self, caller: Caller) -> str:
+        """Return the token by which the viewer asks in the caller's name; always the same one of a key."""
+        return self._signed(_VIEWER, {"key": caller.id})
+
+    def viewer_bearer(self, token: str) -> Caller | None:
+        """Return in whose name the viewer asks; None if the token is forged, or its key was removed or expired."""
+        claim = self._claim(_VIEWER, token)
+        key = self._find(claim["key"]) if claim else None
+        return _caller(key, by_viewer=True) if key else None
 
     def share_token(self, job_id: str, seconds: float, caller: Caller | None) -> str:
         """Return a signed token that shows a job to whoever has it, for that time, but no longer than the caller's key.
 
         `caller` is None where the service has no keys.
         """
-        key = [caller.name, caller.role, self.key_id(caller)] if caller else None
-        claim = json.dumps({"job": job_id, "key": key, "until": time.time() + seconds})
-        text = base64.urlsafe_b64encode(claim.encode()).decode().rstrip("=")
-        return f"{text}.{self._signature(_SHARED + text)}"
+        key = caller.id if caller else None
+        return self._signed(_SHARED, {"job": job_id, "key": key, "until": time.time() + seconds})
 
     def shared_job(self, token: str) -> str | None:
-        """Return the id of the job that a share token shows; None if it is forged, expired, or its key was removed."""
-        text, _, signature = token.partition(".")
-        if not hmac.compare_digest(self._signature(_SHARED + text).encode(), signature.encode()):
+        """Return the id of the job that a share token shows; None if it is forged, expired, or its key is not valid."""
+        claim = self._claim(_SHARED, token)
+        if claim is None or claim["until"] <= time.time():
             return None
-        claim = json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
+        return claim["job"] if claim["key"] is None or self._find(claim["key"]) else None
+
+    def _find(self, key_id: str) -> StoredKey | None:
         self._refresh()
-        living = [[key.name, key.role, _key_id(key)] for key in (*self._stored, *self._temporary)]
-        key_lives = claim["key"] is None or claim["key"] in living
-        return claim["job"] if claim["until"] > time.time() and key_lives else None
+        known = (*self._stored, *self._temporary)
+        return next((key for key in known if key.id == key_id and key.is_valid()), None)
+
+    def _signed(self, kind: str, claim: dict[str, object]) -> str:
+        text = base64.urlsafe_b64encode(json.dumps(claim).encode()).decode().rstrip("=")
+        return f"{text}.{self._signature(kind + text)}"
+
+    def _claim(self, kind: str, token: str) -> dict | None:
+        """Return what a token of this kind claims; None if it wasn't signed here, or is of another kind."""
+        text, _, signature = token.partition(".")
+        if not hmac.compare_digest(self._signature(kind + text).encode(), signature.encode()):
+            return None
+        return json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))
 
     def _signature(self, text: str) -> str:
         return hmac.new(self._secret, text.encode(), "sha256").hexdigest()
@@ -169,58 +217,5 @@ class KeyRing:
             self._stored, self._stamp = read_keys(self._path), stamp
 
 
-def read_keys(path: Path) -> list[StoredKey]:
-    """Return a file's keys; none if there is no file. Raises InvalidRequest."""
-    try:
-        entries = json.loads(path.read_text("utf-8")) if path.exists() else []
-        keys = [StoredKey(**entry) for entry in entries]
-    except (OSError, ValueError, TypeError) as error:
-        raise InvalidRequest(f"not a file of keys: {error}.", where=str(path)) from error
-    if not all(key.role in ROLES for key in keys):
-        raise InvalidRequest(f"a role must be one of {', '.join(ROLES)}.", where=str(path))
-    return keys
-
-
-def add_key(path: Path, name: str, role: Role) -> str:
-    """Make a key and store its hash; return the key, which can't be read from the file. Raises InvalidRequest."""
-    keys = read_keys(path)
-    if any(key.name == name for key in keys):
-        raise InvalidRequest(f"key '{name}' already exists.", where="name", hint="Remove it first.")
-    key = _PREFIX + secrets.token_urlsafe(32)
-    _write(path, [*keys, StoredKey(name, role, _digest(key))])
-    return key
-
-
-def remove_key(path: Path, name: str) -> None:
-    """Remove a key; running services refuse it from the next second on. Raises InvalidRequest."""
-    keys = read_keys(path)
-    left = [key for key in keys if key.name != name]
-    if len(left) == len(keys):
-        raise InvalidRequest(f"key '{name}' not found.", where="name")
-    _write(path, left)
-
-
-def _write(path: Path, keys: list[StoredKey]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _write_private(path, json.dumps([asdict(key) for key in keys], indent=1).encode())
-
-
-def _write_private(path: Path, content: bytes) -> None:
-    # Replaced at once: a running service must never read half a file.
-    draft = path.with_name(f"{path.name}.{os.getpid()}")
-    try:
-        # Mode 600 from the start: a chmod afterwards would leave the file readable for a moment.
-        with os.fdopen(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
-            file.write(content)
-        draft.replace(path)
-    finally:
-        with suppress(FileNotFoundError):
-            draft.unlink()
-
-
-def _key_id(key: StoredKey) -> str:
-    return key.sha256[:16]
-
-
-def _digest(key: str) -> str:
-    return hashlib.sha256(key.encode()).hexdigest()
+def _caller(key: StoredKey, *, by_viewer: bool = False) -> Caller:
+    return Caller(key.name, key.role, key.id, key.limits, by_viewer)

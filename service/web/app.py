@@ -39,7 +39,7 @@ from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.anchor_store import FileAnchorStore
 from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.status import StoredScene
-from service.web.api_keys import VIEWER_KEY, KeyRing
+from service.web.api_keys import KeyRing
 from service.web.api_page import add_api_page
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
@@ -73,8 +73,8 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     for scene in named:
         engine.add(scene, required=settings.preload is None or scene.id in settings.preload)
     keys, metrics = keys or KeyRing(settings.keys_file), Metrics()
-    viewer = _viewer(settings, keys) if settings.viewer else None
-    relay = Relay(viewer) if viewer else None
+    viewer = _viewer(settings) if settings.viewer else None
+    relay = Relay(viewer, keys) if viewer else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -109,9 +109,9 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     return app
 
 
-def _viewer(settings: Settings, keys: KeyRing) -> ViewerChild:
+def _viewer(settings: Settings) -> ViewerChild:
     certificate = settings.certificate if settings.https else None
-    return ViewerChild(settings.loopback_url, keys.make_temporary(VIEWER_KEY, "read"), certificate)
+    return ViewerChild(settings.loopback_url, certificate)
 
 
 def _check_plugins(settings: Settings) -> None:
@@ -143,6 +143,8 @@ async def _start(
         if scene.uploaded:
             engine.add(scene)
     store, photos, lenses = await to_thread.run_sync(_stores, settings, folder)
+    for by_name, client in keys.unnamed_clients():
+        await to_thread.run_sync(store.reassign, by_name, client)
     stack.callback(lenses.close)
     # The store is opened in any case: with none to keep it deletes what it had.
     memory = LensMemory(lenses) if settings.keep_lenses else None
@@ -184,8 +186,8 @@ def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, Len
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
     """Add the layers from the innermost to the outermost, which a request passes first."""
 
-    async def check_queue(client: str, idempotency_key: str | None) -> None:
-        await to_thread.run_sync(app.state.app_state.jobs.require_queue_capacity, client, idempotency_key)
+    async def check_queue(client: str, most: int | None, idempotency_key: str | None) -> None:
+        await to_thread.run_sync(app.state.app_state.jobs.require_queue_capacity, client, most, idempotency_key)
 
     app.add_middleware(Limits, settings=settings, check_queue=check_queue)
     app.add_middleware(Authentication, rules=access_rules(settings, keys))

@@ -72,6 +72,7 @@ _BY_CODE: Mapping[str, str] = {
     "job_not_found": "GET /jobs lists the jobs that are kept.",
     "job_not_ready": "Wait for the job: GET /jobs/ID/events, or send Prefer: wait=30.",
     "anchor_not_found": "GET /scenes/{id}/anchors lists them.",
+    "key_not_found": "GET /keys lists them.",
     "lens_not_found": "GET /lenses lists yours.",
     "method_not_allowed": "The header Allow has the methods of this path.",
     "no_geo_anchor": "Add geo_anchor to the scene's scene.json, and localize again.",

@@ -12,8 +12,9 @@ from prometheus_client import (
     ProcessCollector,
     generate_latest,
 )
-from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
+from prometheus_client.registry import Collector
 
 METRICS_TYPE = CONTENT_TYPE_LATEST
 # From a rendered thumbnail to the longest searches.
@@ -127,8 +128,26 @@ class Metrics:
         """Return all metrics in Prometheus text format."""
         return generate_latest(self._registry)
 
+    def exposition_of(self, sees: Callable[[str], bool]) -> bytes:
+        """Return the metrics of those scenes alone that `sees` is true of, in Prometheus text format."""
+        return generate_latest(_ScenesAlone(self._registry, sees))
+
 
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
+
+
+class _ScenesAlone(Collector):
+    """The samples of a registry that have a scene's name as a label, of scenes that may be seen."""
+
+    def __init__(self, registry: CollectorRegistry, sees: Callable[[str], bool]) -> None:
+        self._registry, self._sees = registry, sees
+
+    def collect(self) -> Iterator[Metric]:
+        for family in self._registry.collect():
+            seen = [s for s in family.samples if "scene" in s.labels and self._sees(s.labels["scene"])]
+            if seen:
+                family.samples = seen
+                yield family
 
 
 class _Gauge:

@@ -15,7 +15,7 @@ from fastapi.routing import iter_route_contexts
 from starlette.routing import BaseRoute, Match
 from starlette.types import Scope
 
-from service.web.api_keys import Role
+from service.web.key_file import Role
 from service.web.settings import Settings
 
 SAFE_METHODS = ("GET", "HEAD", "OPTIONS")
@@ -97,7 +97,16 @@ def require_policies(routes: Sequence[BaseRoute]) -> None:
             raise TypeError(f"the route {found.path} declares no policy")
 
 
-def find_policy(routes: Sequence[BaseRoute], scope: Scope) -> RoutePolicy:
+@dataclass(frozen=True, slots=True)
+class FoundRoute:
+    """What is known of a request's route before the request is answered."""
+
+    policy: RoutePolicy
+    scene_id: str | None = None
+    """In the path: the scene that the request is about."""
+
+
+def find_route(routes: Sequence[BaseRoute], scope: Scope) -> FoundRoute:
     """Find the route of an HTTP or WebSocket request, as the router will, and return its policy.
 
     HEAD and OPTIONS have the policy of GET at their path. A mount serves safe methods only. Where no route matches, the
@@ -111,9 +120,10 @@ def find_policy(routes: Sequence[BaseRoute], scope: Scope) -> RoutePolicy:
         scope = {**scope, "path": scope["path"] + "/"}
     # As many matches as the router itself makes; 30 regular expressions take some microseconds.
     for found in iter_route_contexts(routes):
-        if found.matches(scope)[0] is Match.FULL:
+        match, matched = found.matches(scope)
+        if match is Match.FULL:
             policy = declared_policy(found.original_route)
             # A mount matches every method, and has no list of its own.
             if policy and (is_safe or found.methods):
-                return policy
-    return DENIED_READ if is_safe else DENIED_WRITE
+                return FoundRoute(policy, matched.get("path_params", {}).get("scene_id"))
+    return FoundRoute(DENIED_READ if is_safe else DENIED_WRITE)

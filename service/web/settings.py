@@ -26,7 +26,7 @@ DATA_HOME = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "sh
 CONFIG_HOME = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "splatfix"
 """Folder of the settings' file and of the API keys."""
 
-_OTHER_VARIABLES = frozenset({"config", "plugins_dir", "weights_dir", "viewer_key", "key"})
+_OTHER_VARIABLES = frozenset({"config", "plugins_dir", "weights_dir", "key"})
 """Of the environment, in lower case: read elsewhere, or by the commands that we print."""
 
 

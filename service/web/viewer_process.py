@@ -26,15 +26,14 @@ _GRACE_S = 3.0
 class ViewerChild:
     """Supervises one viewer process."""
 
-    def __init__(self, service_url: str, key: str, certificate: Path | None = None) -> None:
-        """`key` is the viewer's API key. It is passed in the environment: other users can see a process's arguments.
+    def __init__(self, service_url: str, certificate: Path | None = None) -> None:
+        """`certificate` is the service's, if it serves HTTPS.
 
-        `certificate` is the service's, if it serves HTTPS.
+        The viewer has no key of its own: the relay tells it for each browser in whose name to ask.
         """
         # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
         # It finds modules where this process does, and not (-P) in a working directory that has a `viewer` of its own.
-        self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ
-        self._environment |= {"SPLATFIX_VIEWER_KEY": key, "PYTHONPATH": os.pathsep.join(sys.path)}
+        self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         self.port = _free_port()
         self.run = ""
         self.command = [sys.executable, "-P", "-m", "viewer", "--service", service_url]

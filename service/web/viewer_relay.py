@@ -2,9 +2,10 @@
 
 The viewer's page derives the address of its WebSocket from its own: the page /viewer/jobs/ID/ connects to
 /viewer/jobs/ID. The path after /viewer is passed on, and names the job to show. All pages are the same file, so the
-relay returns it for every path that the viewer has no file for. A script (`static/viewer.js`) sets cookies that tell
-whether the browser has a GPU and its time zone; the relay passes them on as query parameters. The same script asks
-`/viewer-run` whether the viewer is still the one that the page was opened with.
+relay returns it for every path that the viewer has no file for. A header has the token with which the viewer asks the
+service: in the name of the browser's user, so that it shows what that one may see. A script (`static/viewer.js`) sets
+cookies that tell whether the browser has a GPU and its time zone; the relay passes them on as query parameters. The
+same script asks `/viewer-run` whether the viewer is still the one that the page was opened with.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.typing import Subprotocol
 
+from service.web.api_keys import Caller, KeyRing
 from service.web.route_policy import route_policy
 
 _log = logging.getLogger(__name__)
@@ -47,8 +49,9 @@ class Upstream(Protocol):
 class Relay:
     """Passes requests and messages on; `router` has the routes to include in an app."""
 
-    def __init__(self, upstream: Upstream) -> None:
-        self._upstream = upstream
+    def __init__(self, upstream: Upstream, keys: KeyRing) -> None:
+        """`keys` sign in whose name the viewer asks for what a browser sees."""
+        self._upstream, self._keys = upstream, keys
         # trust_env: HTTP_PROXY must not apply to loopback.
         self._http = httpx.AsyncClient(trust_env=False, timeout=30.0)
         self.router = APIRouter(include_in_schema=False)
@@ -91,10 +94,17 @@ class Relay:
         told = {"gl": browser.cookies.get("splatfix_gl"), "zone": unquote(browser.cookies.get("splatfix_zone", ""))}
         query = urlencode({name: value for name, value in told.items() if value})
         uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{'?' if query else ''}{query}"
+        caller: Caller | None = getattr(browser.state, "caller", None)
+        told_by = {"Authorization": f"Bearer {self._keys.viewer_token(caller)}"} if caller else None
         try:
             # No size limit and no compression: messages contain whole scenes, on loopback.
             async with connect(
-                uri, subprotocols=offered or None, max_size=None, compression=None, proxy=None
+                uri,
+                subprotocols=offered or None,
+                additional_headers=told_by,
+                max_size=None,
+                compression=None,
+                proxy=None,
             ) as viewer:
                 await browser.accept(viewer.subprotocol)
                 await _first_of(_to_viewer(browser, viewer), _to_browser(viewer, browser))

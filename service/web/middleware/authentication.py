@@ -1,4 +1,4 @@
-"""Host, origin, API key and role of a request are checked before its body is read.
+"""Host, origin, API key, role and scene of a request are checked before its body is read.
 
 A browser can't send a header with a page or a WebSocket. It sends `?key=` (an API key) or `?token=` (from
 `POST /tokens`) once, and gets a cookie with a token that stands for the key.
@@ -16,8 +16,9 @@ from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.errors import Forbidden, Unauthorized
-from service.web.api_keys import Caller, KeyRing, Role
+from service.errors import Forbidden, SceneNotFound, Unauthorized
+from service.web.api_keys import Caller, KeyRing
+from service.web.key_file import Role
 from service.web.problems import problem_response, refuse
 from service.web.route_policy import SAFE_METHODS, RoutePolicy
 from service.web.settings import is_loopback
@@ -58,14 +59,16 @@ class Authentication:
             if caller and query and scope["type"] == "http":
                 await self._redirect_with_cookie(scope, caller)(scope, receive, send)
                 return
+            # Before the checks: what is refused is logged with its caller, too.
+            scope["state"].update(caller=caller, open=self._rules.open)
             self._check_role(policy.role, caller)
-        except (Unauthorized, Forbidden) as error:
+            _check_scene(scope["state"].get("scene_id"), caller)
+        except (Unauthorized, Forbidden, SceneNotFound) as error:
             if isinstance(error, Unauthorized) and policy.key_in_address and _opens_page(scope):
                 await _redirect_to_form(scope)(scope, receive, send)
             else:
                 await _refuse(error, scope, receive, send)
             return
-        scope["state"]["caller"] = caller
         await self._app(scope, receive, send)
 
     def _check_site(self, scope: Scope) -> None:
@@ -97,7 +100,7 @@ class Authentication:
         if given:
             # Other schemes, e.g. Basic, are refused like a wrong key.
             key = given.partition(" ")[2].strip() if given.lower().startswith("bearer ") else ""
-            caller = keys.caller(key) or keys.bearer(key)
+            caller = keys.caller(key) or keys.bearer(key) or keys.viewer_bearer(key)
         elif query:
             caller = keys.caller(query.get("key", "")) or keys.bearer(query.get("token", ""))
         else:
@@ -133,6 +136,13 @@ class Authentication:
         return response
 
 
+def _check_scene(scene_id: str | None, caller: Caller | None) -> None:
+    """Answer for every scene that the key doesn't cover as for one that isn't there. Raises SceneNotFound."""
+    # Here, for each route whose path names a scene, and not in the routes: a new one can't forget it.
+    if scene_id is not None and caller is not None and not caller.limits.cover(scene_id):
+        raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
+
+
 def _opens_page(scope: Scope) -> bool:
     """Return whether a person opens a page, to whom a problem document in JSON would tell nothing."""
     return scope["type"] == "http" and "text/html" in Headers(scope=scope).get("accept", "")
@@ -159,7 +169,7 @@ def allowed_hosts(listens_on: str, given: Sequence[str], *, open_to_all: bool) -
     return _LOOPBACK if open_to_all and is_loopback(listens_on) else ()
 
 
-async def _refuse(error: Unauthorized | Forbidden, scope: Scope, receive: Receive, send: Send) -> None:
+async def _refuse(error: Unauthorized | Forbidden | SceneNotFound, scope: Scope, receive: Receive, send: Send) -> None:
     response = problem_response(error, scope["path"])
     if isinstance(error, Unauthorized):
         response.headers["WWW-Authenticate"] = "Bearer"

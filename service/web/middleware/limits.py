@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 
-from limits import RateLimitItem, parse
+from limits import parse
 from limits.storage import MemoryStorage
 from limits.strategies import SlidingWindowCounterRateLimiter
 from starlette.datastructures import Headers
@@ -20,6 +20,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import QueueFull, RateLimited, SplatfixError
+from service.web.api_keys import Caller
 from service.web.problems import problem_response, refuse
 from service.web.route_policy import RoutePolicy
 from service.web.settings import Settings
@@ -28,14 +29,14 @@ from service.web.settings import Settings
 class Limits:
     """ASGI middleware. Needs the route's policy in the request's state, and the caller if there is one.
 
-    `check_queue(client, idempotency key)` raises QueueFull if one more job can't be queued.
+    `check_queue(client, most queued, idempotency key)` raises QueueFull if one more job can't be queued.
     """
 
     def __init__(
-        self, app: ASGIApp, settings: Settings, check_queue: Callable[[str, str | None], Awaitable[None]]
+        self, app: ASGIApp, settings: Settings, check_queue: Callable[[str, int | None, str | None], Awaitable[None]]
     ) -> None:
         self._app, self._settings, self._check_queue = app, settings, check_queue
-        self._limit: RateLimitItem | None = parse(settings.rate_limit) if settings.rate_limit else None
+        parse(settings.rate_limit or "1/second")  # raises for what is no rate
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
         self._uploads = 0
 
@@ -73,16 +74,23 @@ class Limits:
         if policy.body:
             _check_length(scope, policy.body.max_bytes(self._settings))
         if policy.queues_job:
-            await self._check_queue(client_of(scope), Headers(scope=scope).get("idempotency-key"))
+            caller: Caller | None = scope["state"].get("caller")
+            most = most_queued(caller, self._settings.queue_size)
+            await self._check_queue(client_of(scope), most, Headers(scope=scope).get("idempotency-key"))
         if policy.body and self._uploads >= self._settings.max_uploads:
             raise QueueFull(f"too many uploads at once ({self._uploads}).", hint="Try again later.")
 
     def _check_rate(self, scope: Scope) -> None:
-        client = client_of(scope)
-        if self._limit and not self._limiter.hit(self._limit, client):
-            reset = self._limiter.get_window_stats(self._limit, client).reset_time
+        caller: Caller | None = scope["state"].get("caller")
+        client, rate = client_of(scope), (caller and caller.limits.rate) or self._settings.rate_limit
+        if not rate:
+            return
+        # Some microseconds each time; keys come and go, with their rates.
+        limit = parse(rate)
+        if not self._limiter.hit(limit, client):
+            reset = self._limiter.get_window_stats(limit, client).reset_time
             raise RateLimited(
-                f"more than {self._settings.rate_limit} requests of yours.",
+                f"more than {rate} requests of yours.",
                 hint="Slow down.",
                 retry_after_s=max(1, math.ceil(reset - time.time())),
             )
@@ -139,10 +147,16 @@ class _Body:
 
 
 def client_of(scope: Scope) -> str:
-    """Return what identifies a client for limits and idempotency keys: the key's name, else the IP address."""
-    caller = scope.get("state", {}).get("caller")
+    """Return whose a request is, its jobs, lenses and limits: the key's, by name and id, else the IP address's."""
+    caller: Caller | None = scope.get("state", {}).get("caller")
     address = scope.get("client")
-    return f"key:{caller.name}" if caller else f"address:{address[0] if address else ''}"
+    return caller.client if caller else f"address:{address[0] if address else ''}"
+
+
+def most_queued(caller: Caller | None, queue_size: int) -> int | None:
+    """Return how many jobs a caller may have waiting at once, at least one; None: as many as the queue takes."""
+    share = caller and caller.limits.queue_share
+    return None if share is None else max(1, math.floor(share * queue_size))
 
 
 def _check_length(scope: Scope, limit: int) -> None:

@@ -7,16 +7,20 @@ import logging
 import re
 import secrets
 import time
+from urllib.parse import quote
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.logs import bound
-from service.web.api_keys import VIEWER_KEY
+from service.web.api_keys import Caller
 from service.web.metrics import Metrics
 from service.web.problems import problem_response
+from service.web.route_policy import SAFE_METHODS, RoutePolicy
 
 _log = logging.getLogger(__name__)
+_audit = logging.getLogger("service.audit")
+"""One line for each act of an administrator, or attempt at one with a key."""
 
 REQUEST_ID = "X-Request-ID"
 _HEADERS = {
@@ -91,10 +95,21 @@ class Proxy:
         self._metrics.request(scope["method"], route, status, seconds)
         caller = scope["state"].get("caller")
         # The viewer asks twice a second whether there are new jobs.
-        polls = caller is not None and caller.name == VIEWER_KEY and scope["method"] == "GET" and status < 400
+        polls = caller is not None and caller.by_viewer and scope["method"] == "GET" and status < 400
+        _audit_act(scope, caller, status)
         if not polls and not path.startswith(_NOT_LOGGED):
             # Without the query, which may contain a key.
             _log.info("%s %s %d %.0f ms", scope["method"], scope["path"], status, 1000 * seconds)
+
+
+def _audit_act(scope: Scope, caller: Caller | None, status: int) -> None:
+    policy: RoutePolicy | None = scope["state"].get("policy")
+    if policy is None or policy.role != "admin" or scope["method"] in SAFE_METHODS or status == 401:
+        return
+    address = (scope.get("client") or ("?",))[0]
+    who = f"key '{caller.name}' ({caller.id})" if caller else "anybody"
+    # The path names what it is done to. Quoted: no line can be forged.
+    _audit.info("%s from %s: %s %s %d", who, address, scope["method"], quote(scope["path"]), status)
 
 
 class _Response:

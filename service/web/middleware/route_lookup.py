@@ -1,4 +1,4 @@
-"""Finds the route of a request, and puts the route's policy into the request's state for the layers behind."""
+"""Finds the route of a request, and puts its policy and the scene that it names into the request's state."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.web.route_policy import find_policy
+from service.web.route_policy import find_route
 
 
 class RouteLookup:
@@ -19,5 +19,6 @@ class RouteLookup:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] in ("http", "websocket"):
             # Starlette's `request.state` shows the same dictionary to the routes.
-            scope.setdefault("state", {})["policy"] = find_policy(self._routes, scope)
+            found = find_route(self._routes, scope)
+            scope.setdefault("state", {}).update(policy=found.policy, scene_id=found.scene_id)
         await self._app(scope, receive, send)

@@ -21,6 +21,7 @@ GET    /scenes/{id}/anchors                   named points; PUT, DELETE .../anch
 POST   /scenes/{id}/registration              where the scene is; GET, DELETE (undo)
 WS     /scenes/{id}/live                      a moving camera's frames to poses, see docs/live.md
 GET    /lenses                                DELETE /lenses, /lenses/{id}
+GET    /keys                                  PUT, DELETE /keys/{name}; GET /key: the caller's own
 POST   /tokens                                short-lived, for pages
 GET    /capabilities, /version, /livez, /readyz, /metrics
 """
@@ -34,6 +35,7 @@ from service.web.routes import (
     coverage,
     geopose,
     jobs,
+    keys,
     lenses,
     live,
     localize,
@@ -44,5 +46,5 @@ from service.web.routes import (
 )
 
 router = APIRouter()
-for part in (localize, geopose, jobs, shared, scenes, anchors, coverage, registrations, live, lenses, system):
+for part in (localize, geopose, jobs, shared, scenes, anchors, coverage, registrations, live, lenses, keys, system):
     router.include_router(part.router)

@@ -13,16 +13,17 @@ import anyio
 from anyio import to_thread
 from fastapi import Depends, Path, Request
 
-from service.errors import CorruptScene
+from service.errors import CorruptScene, JobNotFound, SceneNotFound
 from service.jobs.engine import Engine
 from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
 from service.lenses.lens_store import LensStore
 from service.scene_manager.anchor_store import Anchor, AnchorStore
 from service.scene_manager.scene_store import SceneStore
+from service.scene_manager.status import AUTO, SceneStatus
 from service.web.api_keys import Caller, KeyRing
+from service.web.key_file import UNLIMITED, KeyLimits
 from service.web.metrics import Metrics
-from service.web.middleware.limits import client_of
 from service.web.schemas import resources
 from service.web.schemas.jobs import JobOut
 from service.web.settings import Settings
@@ -57,6 +58,60 @@ class AppState:
         return picture
 
 
+@dataclass(frozen=True, slots=True)
+class Visible:
+    """What a caller may see. Of the rest everything answers as if it weren't there."""
+
+    owner: str | None
+    """Whose jobs and lenses; None: everybody's, for an admin, and where there are no keys."""
+    limits: KeyLimits | None = UNLIMITED
+    """Those of the caller's key, which name its scenes; None: it sees none."""
+
+    @property
+    def all_scenes(self) -> bool:
+        """Whether no scene is hidden."""
+        return self.limits is not None and self.limits.scenes is None
+
+    def scene(self, scene_id: str) -> bool:
+        """Return whether a scene of that name may be seen, be it there or not."""
+        return self.limits is not None and self.limits.cover(scene_id)
+
+    def job(self, job: StoredJob) -> bool:
+        """Return whether a job may be seen: its own key's, or any by an admin."""
+        return self.owner is None or job.client == self.owner
+
+    def scenes(self, known: Sequence[SceneStatus]) -> list[SceneStatus]:
+        """Return those of the scenes that may be seen."""
+        return [scene for scene in known if self.scene(scene.id)]
+
+    def asked(self, asked: str | tuple[str, ...] | None, known: Sequence[SceneStatus]) -> str | tuple[str, ...] | None:
+        """Return the scenes to look in for those that a request asks for.
+
+        Raises SceneNotFound, which names those that may be seen.
+        """
+        usable = [scene.id for scene in self.scenes(known)]
+        names = ", ".join(usable) or "none"
+        if asked is None:
+            if len(usable) != 1:
+                raise SceneNotFound(f"name a scene; known: {names}.", where="scene")
+            return None if self.all_scenes else usable[0]
+        if asked == AUTO:
+            return asked if self.all_scenes else self._auto(known)
+        for name in (asked,) if isinstance(asked, str) else asked:
+            if name not in usable:
+                raise SceneNotFound(f"unknown scene '{name}'; known: {names}.", where="scene")
+        return asked
+
+    def _auto(self, known: Sequence[SceneStatus]) -> tuple[str, ...]:
+        """Return the scenes that `auto` stands for: as the engine means it, it would look in all."""
+        found = tuple(scene.id for scene in self.scenes(known) if scene.state not in ("failed", "unloaded"))
+        if not found:
+            raise SceneNotFound(
+                "no scene can be searched: none is there, or all failed or were unloaded.", where="scene"
+            )
+        return found
+
+
 def _app_state(request: Request) -> AppState:
     return request.app.state.app_state
 
@@ -65,24 +120,26 @@ def _root(request: Request) -> str:
     return request.scope.get("root_path", "")
 
 
-def _job(app_state: AppStateOf, job_id: Annotated[str, Path(description="The job's id.")]) -> StoredJob:
-    return app_state.jobs.get(job_id)  # not async: reads the disk
-
-
 def _caller(request: Request) -> Caller | None:
     return request.state.caller
 
 
-def lens_owner(request: Request, app_state: AppState) -> str:
-    """Return whose lenses the caller's photos are taken with: the API key's, by name and hash, else the address's."""
-    caller, client = _caller(request), client_of(request.scope)
-    # A name can be given to another key later, whose owner must not see what was learnt with the first one.
-    return f"{client}:{app_state.keys.key_id(caller)}" if caller else client
+def _visible(request: Request) -> Visible:
+    caller: Caller | None = request.state.caller
+    if caller is not None:
+        return Visible(None if caller.has_role("admin") else caller.client, caller.limits)
+    # Without a key on a service that has keys, on what is public: denied by default.
+    return Visible(None) if request.state.open else Visible("", None)
 
 
-def _visible_owner(request: Request, app_state: AppStateOf) -> str | None:
-    caller = _caller(request)
-    return None if caller is None or caller.has_role("admin") else lens_owner(request, app_state)
+def _job(
+    app_state: AppStateOf, visible: VisibleOf, job_id: Annotated[str, Path(description="The job's id.")]
+) -> StoredJob:
+    job = app_state.jobs.get(job_id)  # not async: reads the disk
+    if not visible.job(job):
+        # As the store says it of a job that isn't there.
+        raise JobNotFound(f"job '{job_id}' not found or expired.", where="job")
+    return job
 
 
 def job_document(app_state: AppState, job_id: str, root: str) -> JobOut:
@@ -105,9 +162,9 @@ def known_anchors(app_state: AppState, scene_id: str) -> Sequence[Anchor]:
 AppStateOf = Annotated[AppState, Depends(_app_state)]
 CallerOf = Annotated[Caller | None, Depends(_caller)]
 RootOf = Annotated[str, Depends(_root)]
+VisibleOf = Annotated[Visible, Depends(_visible)]
 JobOf = Annotated[StoredJob, Depends(_job)]
-VisibleOwnerOf = Annotated[str | None, Depends(_visible_owner)]
-"""Whose lenses the caller may see and delete; None: anybody's, for an admin, and where there are no keys."""
+"""The job of the path, if the caller may see it."""
 
 
 JPEG = {200: {"description": "JPEG", "content": {"image/jpeg": {}}}}

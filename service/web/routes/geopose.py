@@ -11,7 +11,7 @@ from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
 from service.photos.sequence import is_sequence
 from service.web.problems import problem_answer, problem_of_failure
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import AppStateOf
+from service.web.routes.dependencies import AppStateOf, VisibleOf
 from service.web.routes.localize import create_job
 from service.web.schemas import geopose_protocol as gpp
 from service.web.schemas import resources
@@ -49,6 +49,7 @@ async def geopose(
     wanted: gpp.GeoPoseRequest,
     request: Request,
     app_state: AppStateOf,
+    visible: VisibleOf,
     scene: Annotated[str | None, Query(description="Default: the nearest scene with a `geo_anchor`.")] = None,
     accept: Annotated[str, Header(description=f"`{GEOPOSE}`: return only the pose, as OGC GeoPose 1.0")] = "",
 ) -> Response:
@@ -61,7 +62,10 @@ async def geopose(
     # The protocol has one image for each reading.
     if is_sequence(photo):
         raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
-    named = scene or gpp.nearest_scene(await to_thread.run_sync(app_state.engine.scenes), wanted)
+    known = await to_thread.run_sync(app_state.engine.scenes)
+    if scene:
+        visible.asked(scene, known)  # raises SceneNotFound
+    named = scene or gpp.nearest_scene(visible.scenes(known), wanted)
     scene_id = (await to_thread.run_sync(app_state.engine.scene, named)).id
     anchor = (await to_thread.run_sync(app_state.engine.require, scene_id)).geo_anchor
     if anchor is None:
@@ -70,7 +74,7 @@ async def geopose(
     fields = LocalizeFields(
         scene=scene_id, intrinsics=intrinsics, prior=gpp.prior_of(wanted, anchor), deadline_s=wait_s
     )
-    job = await create_job(request, app_state, Body(photo, "", {}), fields)
+    job = await create_job(request, app_state, visible, Body(photo, "", {}), fields)
     if live := await to_thread.run_sync(app_state.jobs.live, job):
         await live.wait(wait_s)
     job = await to_thread.run_sync(app_state.jobs.get, job.id)

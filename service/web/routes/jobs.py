@@ -19,7 +19,7 @@ from service.jobs.model import JobFilter, JobRecord, JobState
 from service.results import Status
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SMALL_BODY, route_policy
-from service.web.routes.dependencies import JPEG, AppStateOf, JobOf, RootOf, job_document
+from service.web.routes.dependencies import JPEG, AppStateOf, JobOf, RootOf, VisibleOf, job_document
 from service.web.schemas import resources
 from service.web.schemas.conversion import record_camera, record_out, result_out
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
@@ -33,6 +33,7 @@ router = APIRouter()
 @route_policy(role="read")
 def list_jobs(
     app_state: AppStateOf,
+    visible: VisibleOf,
     root: RootOf,
     scene: str | None = None,
     estimator: str | None = None,
@@ -42,8 +43,8 @@ def list_jobs(
     before: Annotated[int | None, Query(ge=0, lt=2**63, description="Start of the page, as `next` has it.")] = None,
     limit: Annotated[int, Query(ge=1, le=500)] = 100,
 ) -> JobList:
-    """List the stored jobs that match all given filters, newest first, in pages."""
-    wanted = JobFilter(scene, estimator, state, status, photo, before)
+    """List the stored jobs that match all given filters, newest first, in pages: the own key's; an admin's are all."""
+    wanted = JobFilter(scene, estimator, state, status, photo, before, visible.owner)
     # One more than the page has: whether there is a next page.
     page = app_state.jobs.page(wanted, limit + 1)
     given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
@@ -52,8 +53,8 @@ def list_jobs(
     return JobList(
         jobs=[resources.job_summary_out(job, root) for job in page[:limit]],
         next=more,
-        queued=app_state.jobs.waiting(),
-        running=app_state.jobs.running(),
+        queued=app_state.jobs.waiting(visible.owner),
+        running=app_state.jobs.running(visible.owner),
     )
 
 

@@ -210,16 +210,12 @@ class _Session:
 
     async def _watch(self) -> None:
         """End the session when nothing comes any more, or its key is gone. Raises _End."""
-        key = self._key_id()
         while True:
             await asyncio.sleep(min(1.0, self._settings.live_idle_s / 4))
             if self._loop.time() - self._heard_at > self._settings.live_idle_s:
                 raise _End(TIMEOUT, f"no frame came for {self._settings.live_idle_s:g} s.")
-            if self._key_id() != key:
+            if self._caller and not self._state.keys.lives(self._caller):
                 raise _End(KEY_GONE, "the session's key is not valid any more.")
-
-    def _key_id(self) -> str:
-        return self._state.keys.key_id(self._caller) if self._caller else ""
 
     async def _receive(self) -> str | bytes:
         """Return the next message. Raises _End if it is too large, WebSocketDisconnect."""

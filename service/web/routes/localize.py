@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from dataclasses import replace
 from typing import Annotated, Any
 
 from anyio import to_thread
@@ -11,9 +12,9 @@ from fastapi import APIRouter, Header, Request, Response
 
 from service.jobs.job_order import JobOrder
 from service.jobs.model import ENDED, StoredJob
-from service.web.middleware.limits import client_of, too_large
+from service.web.middleware.limits import client_of, most_queued, too_large
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import AppState, AppStateOf, RootOf, job_document, lens_owner
+from service.web.routes.dependencies import AppState, AppStateOf, RootOf, Visible, VisibleOf, job_document
 from service.web.schemas.error_examples import AWAITED_SCENE_ERRORS, errors
 from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
@@ -91,6 +92,7 @@ async def localize_photo(
     request: Request,
     response: Response,
     app_state: AppStateOf,
+    visible: VisibleOf,
     root: RootOf,
     prefer: Annotated[str, Header(description="`wait=N`: wait up to N s for the job to end before answering")] = "",
     idempotency_key: Annotated[
@@ -108,7 +110,7 @@ async def localize_photo(
     `record` has each frame's answer, and `frames` of the result has all of them.
     """
     body = await read_body(request, app_state.settings.max_frames)
-    job = await create_job(request, app_state, body, read_fields(body.fields), idempotency_key)
+    job = await create_job(request, app_state, visible, body, read_fields(body.fields), idempotency_key)
     wait_s = min(wait_preference(prefer), app_state.settings.max_wait_s)
     if wait_s:
         if live := await to_thread.run_sync(app_state.jobs.live, job):
@@ -121,7 +123,12 @@ async def localize_photo(
 
 
 async def create_job(
-    request: Request, app_state: AppState, body: Body, fields: LocalizeFields, idempotency_key: str | None = None
+    request: Request,
+    app_state: AppState,
+    visible: Visible,
+    body: Body,
+    fields: LocalizeFields,
+    idempotency_key: str | None = None,
 ) -> StoredJob:
     """Validate a request, queue its job. Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed;
     HTTPException 413.
@@ -139,8 +146,9 @@ async def create_job(
         absent = {name for name in ("camera_id", "accuracy") if getattr(fields, name) is None}
         digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
-        owner = lens_owner(request, app_state)
-        order = JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest, owner)
+        spec = replace(spec, scene=visible.asked(spec.scene, app_state.engine.scenes()))
+        most = most_queued(request.state.caller, app_state.settings.queue_size)
+        order = JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest, client, most)
         return app_state.jobs.accept(order)
 
     # Decoding takes up to seconds: not on the event loop.

@@ -13,7 +13,7 @@ from service.scene_manager import splat_sample as splats
 from service.scene_manager.scene_images import PICTURE_TYPES
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
-from service.web.routes.dependencies import JPEG, AppStateOf, RootOf
+from service.web.routes.dependencies import JPEG, AppStateOf, RootOf, VisibleOf
 from service.web.schemas import resources
 from service.web.schemas.error_examples import SCENE_ERRORS, errors
 from service.web.schemas.job_spec import checked_intrinsics, pose_from
@@ -27,9 +27,10 @@ router = APIRouter()
 
 @router.get("/scenes", tags=["scenes"], responses=errors())
 @route_policy(role="read")
-def list_scenes(app_state: AppStateOf, root: RootOf) -> SceneList:
-    """List the scenes with their states."""
-    return SceneList(scenes=[resources.scene_summary_out(scene, root) for scene in app_state.engine.scenes()])
+def list_scenes(app_state: AppStateOf, visible: VisibleOf, root: RootOf) -> SceneList:
+    """List the scenes that the key may use, with their states."""
+    known = visible.scenes(app_state.engine.scenes())
+    return SceneList(scenes=[resources.scene_summary_out(scene, root) for scene in known])
 
 
 @router.get("/scenes/{scene_id}", tags=["scenes"], responses=errors("scene_not_found"))

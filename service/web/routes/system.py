@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from fastapi import APIRouter, Response
 
 from service.errors import NoKeys
+from service.scene_manager.status import SceneNote
 from service.versions import versions
 from service.web.metrics import METRICS_TYPE
 from service.web.route_policy import SMALL_BODY, route_policy
-from service.web.routes.dependencies import AppStateOf, CallerOf
+from service.web.routes.dependencies import AppStateOf, CallerOf, Visible, VisibleOf
 from service.web.schemas import resources
 from service.web.schemas.error_examples import errors
 from service.web.schemas.system import Capabilities, Liveness, Readiness, Token
@@ -42,19 +45,27 @@ async def live() -> Liveness:
 
 @router.get("/readyz", tags=["service"], responses={503: {"model": Readiness, "description": "Not ready"}} | errors())
 @route_policy(role=None)
-def ready(app_state: AppStateOf, response: Response) -> Readiness:
-    """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work."""
+def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Readiness:
+    """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work.
+
+    Scenes that the caller may not see are told without their names.
+    """
     scenes, problems = app_state.engine.readiness(), app_state.jobs.problems()
     readiness = Readiness(
         ready=scenes.ready and not problems,
-        pending=list(scenes.pending),
-        failed=[*scenes.failed, *problems],
+        pending=_told(scenes.pending, visible),
+        failed=[*_told(scenes.failed, visible), *problems],
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
     # Load balancers look at the status only.
     response.status_code = 200 if readiness.ready else 503
     return readiness
+
+
+def _told(notes: Sequence[SceneNote], visible: Visible) -> list[str]:
+    hidden = "a scene that this key may not use"
+    return [str(note) if visible.scene(note.scene) else hidden for note in notes]
 
 
 @router.get(
@@ -64,9 +75,14 @@ def ready(app_state: AppStateOf, response: Response) -> Readiness:
     responses={200: {"description": "Prometheus text format", "content": {"text/plain": {}}}} | errors(),
 )
 @route_policy(role="read")
-def get_metrics(app_state: AppStateOf) -> Response:
-    """Return the metrics: requests, queue, jobs by stage and status, memory by scene, workers."""
-    return Response(app_state.metrics.exposition(), media_type=METRICS_TYPE)
+def get_metrics(app_state: AppStateOf, visible: VisibleOf) -> Response:
+    """Return the metrics: requests, queue, jobs by stage and status, memory by scene, workers.
+
+    To a key with scenes: of its scenes alone.
+    """
+    metrics = app_state.metrics
+    found = metrics.exposition() if visible.all_scenes else metrics.exposition_of(visible.scene)
+    return Response(found, media_type=METRICS_TYPE)
 
 
 @router.post("/tokens", tags=["service"], responses=errors("no_keys", body=True))

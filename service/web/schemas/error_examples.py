@@ -55,7 +55,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.RateLimited("more than 30/second requests of yours.", hint="Slow down.", retry_after_s=1), "/localize"),
     (e.StorageFailed("the service can't write the photo to disk: No space left on device."), "/localize"),
     (e.BadInput("the scene has no file to reload it from.", where="scene"), f"{_SCENE}/unload"),
-    (e.SceneNotFound("unknown scene 'attic'; known: studio.", where="scene"), "/scenes/attic"),
+    (e.SceneNotFound("unknown scene 'attic'.", where="scene"), "/scenes/attic"),
     (
         e.SceneNotReady("scene 'studio' is loading.", where="scene", hint=_AGAIN),
         f"{_SCENE}/render",
@@ -92,6 +92,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         f"{_JOB}/iterations/12/render.jpg",
     ),
     (e.AnchorNotFound("anchor 'door' not found.", where="name"), f"{_SCENE}/anchors/door"),
+    (e.KeyNotFound("key 'robot' not found.", where="name"), "/keys/robot"),
     (e.LensNotFound("lens '0123456789abcdef' not found.", where="lens"), "/lenses/0123456789abcdef"),
     (
         e.RegistrationFailed(

@@ -21,6 +21,7 @@ _LINKS = {
     ("list_jobs", "200"): ("job_id", "$response.body#/jobs/0/id", _JOB),
     ("upload_scene", "201"): ("scene_id", "$response.body#/id", _SCENE),
     ("list_scenes", "200"): ("scene_id", "$response.body#/scenes/0/id", _SCENE),
+    ("list_keys", "200"): ("name", "$response.body#/keys/0/name", ("remove_key",)),
     ("list_lenses", "200"): ("lens_id", "$response.body#/lenses/0/id", ("delete_lens",)),
 }
 

@@ -27,6 +27,10 @@
  * @typedef {{index: number, stage: string, elapsed_s: number, world_from_camera: number[][],
  *   frame: Frame | null}} Step
  * @typedef {{id: string, name: string, state: string, gaussians: number | null, cameras: number | null}} Scene
+ * @typedef {{name: string, position: number[]}} Anchor
+ * @typedef {{name: string | null, role: "read" | "localize" | "admin", scenes: string[] | null, rate: string | null,
+ *   queue_share: number | null, expires: string | null}} OwnKey
+ * @typedef {OwnKey & {name: string, created: string | null, expired: boolean, temporary: boolean}} Key
  * @typedef {object} Watch
  * @property {(step: Step) => void} [onRecord]  called with each step
  * @property {() => void} [onRestart]  the job is tried again: the steps before don't count any more
@@ -55,6 +59,7 @@
 
 /** States of a job that has ended. */
 export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
+const JSON_TYPE = { "Content-Type": "application/json" };
 const RETRY_MS = 1000;
 const SILENT_MS = 45_000;  // three of the service's pings
 
@@ -232,10 +237,65 @@ export class Client {
    * @param {Record<string, number>} [intrinsics]
    */
   async render(id, pose, intrinsics) {
-    const headers = { "Content-Type": "application/json" };
     const body = JSON.stringify({ pose, intrinsics, format: "jpeg" });
-    return (await this.send(`scenes/${encodeURIComponent(id)}/render`, { method: "POST", headers, body })).blob();
+    return (await this.send(`scenes/${encodeURIComponent(id)}/render`, { method: "POST", headers: JSON_TYPE, body })).blob();
   }
+
+  /**
+   * A scene's coverage map, or how far it is measured; `measure` begins that, for which the key has the role admin.
+   * @param {string} id
+   * @param {{measure?: boolean}} [options]
+   */
+  coverage(id, { measure = false } = {}) {
+    return this.ask(`scenes/${encodeURIComponent(id)}/coverage`, { method: measure ? "POST" : "GET" });
+  }
+
+  /** The named points of a scene. @param {string} id @returns {Promise<Anchor[]>} */
+  async anchors(id) { return (await this.ask(`scenes/${encodeURIComponent(id)}/anchors`)).anchors; }
+
+  /**
+   * Add a named point to a scene, or move the one of that name; for which the key has the role admin.
+   * @param {string} id
+   * @param {string} name
+   * @param {number[]} position  in the scene's world
+   * @returns {Promise<Anchor>}
+   */
+  putAnchor(id, name, position) { return this.#put(anchorPath(id, name), { position }); }
+
+  /** @param {string} id @param {string} name */
+  async deleteAnchor(id, name) { await this.send(anchorPath(id, name), { method: "DELETE" }); }
+
+  /**
+   * Make a link that shows a job, read-only, to whoever has it.
+   * @param {string} id
+   * @param {{expiresInS?: number}} [options]  by default 7 days
+   * @returns {Promise<{url: string, token: string, expires_in_s: number}>}
+   */
+  async share(id, { expiresInS } = {}) {
+    const body = JSON.stringify({ expires_in_s: expiresInS });
+    const made = await this.ask(`jobs/${encodeURIComponent(id)}/share`, { method: "POST", headers: JSON_TYPE, body });
+    return { url: new URL(made.link, this.base).href, token: made.token, expires_in_s: made.expires_in_s };
+  }
+
+  /** What the key may do that requests are sent with. @returns {Promise<OwnKey>} */
+  ownKey() { return this.ask("key"); }
+
+  /** The keys of the service, for admins. @returns {Promise<Key[]>} */
+  async keys() { return (await this.ask("keys")).keys; }
+
+  /**
+   * Make a key; the answer has it in `key`, this once.
+   * @param {string} name
+   * @param {Partial<Pick<Key, "role" | "scenes" | "rate" | "queue_share" | "expires">>} [what]
+   * @returns {Promise<Key & {key: string}>}
+   */
+  addKey(name, what = {}) { return this.#put(`keys/${encodeURIComponent(name)}`, what); }
+
+  /** Revoke a key, with its sessions and share links. @param {string} name */
+  async removeKey(name) { await this.send(`keys/${encodeURIComponent(name)}`, { method: "DELETE" }); }
+
+  /** @param {string} path @param {unknown} value */
+  #put(path, value) { return this.ask(path, { method: "PUT", headers: JSON_TYPE, body: JSON.stringify(value) }); }
 
   /**
    * Begin a live session: a moving camera's frames go in, poses come out (docs/live.md). Rejects with a ServiceError
@@ -331,6 +391,9 @@ export function liveMessage(id, timeS, jpeg, lens, odomFromCamera, upInCamera) {
   message.set(new Uint8Array(jpeg), length);
   return message;
 }
+
+/** @param {string} id @param {string} name */
+const anchorPath = (id, name) => `scenes/${encodeURIComponent(id)}/anchors/${encodeURIComponent(name)}`;
 
 /** @param {Response} response */
 async function failure(response) {

@@ -3,13 +3,15 @@
 import * as batch from "./batch.js";
 import * as compare from "./compare.js";
 import * as history from "./history.js";
-import * as key from "./key.js";
 import * as job from "./job.js";
+import * as key from "./key.js";
+import * as keys from "./keys.js";
 import * as scene from "./scene.js";
 import * as start from "./start.js";
 
 const ROUTES = [
   [/^#\/key$/, key.show],
+  [/^#\/keys$/, keys.show],
   [/^#\/batch\/([\w,-]*)$/, batch.show],
   [/^#\/jobs$/, history.show],
   [/^#\/jobs\/([\w-]+)$/, job.show],
@@ -57,4 +59,5 @@ function submitted(files) {
   start.submit([...files]).catch(start.told);
 }
 
+keys.mayManage().then(may => { document.querySelector("#keys").hidden = !may; });
 route();

@@ -128,9 +128,7 @@ function sharing(job) {
   button.addEventListener("click", async () => {
     button.disabled = true;
     try {
-      const init = { method: "POST", headers: { "Content-Type": "application/json" }, body: "{}" };
-      const { link, expires_in_s: valid } = await service.ask(`jobs/${job.id}/share`, init);
-      const address = new URL(link, location.href).href;
+      const { url: address, expires_in_s: valid } = await service.share(job.id);
       place.replaceChildren(h("p", { class: "quiet" }, `Shows photo and result to whoever has it, for ${Math.round(valid / 86400)} days.`),
         h("div", { class: "poserow" }, h("pre", { class: "curl", tabIndex: 0 }, h("a", { href: address }, address)), copyButton(() => address, "the share link")));
     } catch (error) {

@@ -32,7 +32,7 @@ async function begin(state, title) {
   state.scene = scene;
   state.axes = planAxes(scene);
   await refresh(state);
-  [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), anchorsOf(state)]);
+  [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), service.anchors(state.id)]);
   draw(state);
 }
 
@@ -42,18 +42,12 @@ function pointOf(query) {
   return point.length === 3 && point.every(Number.isFinite) ? point : null;
 }
 
-const anchorsPath = state => `scenes/${encodeURIComponent(state.id)}/anchors`;
-
-async function anchorsOf(state) {
-  return (await service.ask(anchorsPath(state))).anchors;
-}
-
 /** The anchors with a button to delete each, and a form for the point that was picked in the viewer. */
 function anchorParts(state) {
-  const change = async (name, init, done) => {
+  const change = async (name, act, done) => {
     try {
-      await service.send(`${anchorsPath(state)}/${encodeURIComponent(name)}`, init);
-      state.anchors = await anchorsOf(state);
+      await act();
+      state.anchors = await service.anchors(state.id);
       say(`${name}: ${done}`);
       draw(state);
     } catch (error) {
@@ -62,7 +56,7 @@ function anchorParts(state) {
   };
   const rows = state.anchors.map(({ name, position }) => {
     const remove = h("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
-    remove.addEventListener("click", () => change(name, { method: "DELETE" }, "deleted"));
+    remove.addEventListener("click", () => change(name, () => service.deleteAnchor(state.id, name), "deleted"));
     return h("li", {}, h("span", {}, h("strong", {}, name), " ", h("span", { class: "quiet" }, position.map(x => Number(x.toPrecision(4))).join(", "))), remove);
   });
   const parts = [h("h2", {}, "Anchors"), rows.length
@@ -79,17 +73,16 @@ function namingForm(state, change) {
     const { point } = state;
     state.point = null;
     name.blur();
-    change(name.value.trim(), { method: "PUT", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ position: point }) }, "saved");
+    const named = name.value.trim();
+    change(named, () => service.putAnchor(state.id, named, point), "saved");
   });
   return form;
 }
 
-const path = state => `scenes/${encodeURIComponent(state.id)}/coverage`;
-
 /** Ask for the coverage map, again and again while it is measured. */
 async function refresh(state) {
   const before = state.coverage?.state;
-  state.coverage = await service.ask(path(state));
+  state.coverage = await service.coverage(state.id);
   if (state.stopped) return;
   if (before === "running" && state.coverage.state === "ready") say("The coverage map is ready");
   draw(state);
@@ -152,7 +145,7 @@ function coverageParts(state, map) {
 async function measure(state, button) {
   button.disabled = true;
   try {
-    await service.send(path(state), { method: "POST" });
+    await service.coverage(state.id, { measure: true });
     await refresh(state);
   } catch (error) {
     button.disabled = false;
