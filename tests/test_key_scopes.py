@@ -141,7 +141,7 @@ def site(tmp_path_factory) -> Iterator[Site]:
                 owner = ring.caller(keys[who])
                 assert owner
                 lens = LensKey(owner.client, f"camera of {who}", "", "", "", None, None, 1.0, 1.5, is_video=False)
-                seen = LensEstimate((0.0,) * 4, (0.01,) * 4, 5, 5, viewpoint(0.0))
+                seen = LensEstimate((0.0, 0.0, 0.0, 0.0), (0.01, 0.01, 0.01, 0.01), 5, 5, viewpoint(0.0))
                 app.state.app_state.lenses.change(lens, lambda _, seen=seen: seen)
                 made.lenses[who] = lens.id
             yield made
