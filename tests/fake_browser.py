@@ -31,9 +31,13 @@ CAMERA = {
 class FakeBrowser:
     """Connected while used as a context."""
 
-    def __init__(self, port: int, path: str = "/") -> None:
+    def __init__(self, port: int, path: str = "/", key: str = "") -> None:
         protocol = Subprotocol(f"viser-v{viser.__version__}")
-        self._socket = connect(f"ws://127.0.0.1:{port}{path}", subprotocols=[protocol], max_size=None)
+        header = {"Authorization": f"Bearer {key}"} if key else None
+        address = f"ws://127.0.0.1:{port}{path}"
+        self._socket = connect(
+            address, subprotocols=[protocol], additional_headers=header, max_size=None, compression=None, proxy=None
+        )
         self.nodes: dict[str, dict[str, Any]] = {}
         """Scene nodes by name, as they are now."""
         self.widgets: dict[str, dict[str, Any]] = {}

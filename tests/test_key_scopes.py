@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import httpx
 import pytest
 import websockets.sync.client
 from api_server import assert_problem, create_app, fake_estimators, photo, serving, settings, until, until_ready
+from fake_browser import FakeBrowser
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
 from stand_ins import make_scene
@@ -18,12 +21,14 @@ from test_lenses import viewpoint
 from websockets.exceptions import InvalidStatus
 from websockets.sync.server import serve
 
+from service.client import Client
 from service.lenses.lens_estimate import LensEstimate
 from service.lenses.lens_key import LensKey
 from service.scene_manager.status import SceneNote
 from service.web.api_keys import KeyRing
 from service.web.key_file import KeyLimits, add_key
 from service.web.viewer_relay import Relay
+from viewer.viewer_server import Viewer
 
 # Every route has a decision; what is missing here fails the test.
 NOTHING = """
@@ -287,6 +292,32 @@ def test_the_viewer_asks_in_the_name_of_its_user(site):
         assert [found["id"] for found in seen] == [scene]
     # It is good for nothing that needs no header.
     assert_problem(site.client.get("/jobs", headers={"Cookie": f"splatfix_session={room}"}), 401, "unauthorized")
+
+
+@pytest.mark.ci
+def test_the_viewer_shows_what_its_user_may_see(site):
+    """viser and all: two users of one viewer, each through the relay with a key of their own."""
+    url = str(site.client.base_url)
+    viewer = Viewer(lambda token: Client(url, token, use_proxy=False), "127.0.0.1", 0)
+    ring = site.app.state.app_state.keys
+    app = create_app(settings(estimator="view_index"), keys=ring)
+    app.include_router(Relay(SimpleNamespace(port=viewer.server.get_port(), run="1"), ring).router)
+    try:
+        with serving(app) as front, ExitStack() as opened:
+            # The job of `vault` is asked for by both.
+            path = f"/viewer/jobs/{site.jobs['vault']}"
+            seen = {
+                who: opened.enter_context(FakeBrowser(front.base_url.port or 0, path, site.keys[who]))
+                for who in ("room", "vault")
+            }
+            for who, browser in seen.items():
+                browser.wait(lambda who=who, at=browser: list(at.widget("scene")["options"]) == [who], "its scene", 60)
+            seen["room"].wait(lambda: "The service has no job" in seen["room"].text(), "the foreign job's error", 60)
+            seen["vault"].wait(lambda: "/splats/splats" in seen["vault"].nodes, "its own job's scene", 60)
+            assert not any(name.startswith("/splats") for name in seen["room"].nodes)
+            assert "vault" not in str(seen["room"].widgets).replace(site.jobs["vault"], "")
+    finally:
+        viewer.stop()
 
 
 def test_readiness_names_no_scene_to_others(site, monkeypatch):

@@ -52,7 +52,12 @@ class Viewer:
     def _open(self, client: viser.ClientHandle) -> None:
         token = sent_token(self.server, client.client_id)
         page = requested_page(requested_path(self.server, client.client_id))
-        session = BrowserSession(client, self._shared.take(token), page)
+        shared = self._shared.take(token)
+        try:
+            session = BrowserSession(client, shared, page)
+        except BaseException:  # the browser has left already
+            self._shared.give_back(token)
+            raise
         with self._lock:
             self._sessions[client.client_id] = session, token
         session.start()
