@@ -19,7 +19,7 @@ from jaxtyping import Int64
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Request, localize
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.retrieval.index import ViewIndex
@@ -121,7 +121,7 @@ def _inliers(images: QueryImages, loaded: LoadedScene, roll_steps_45deg: int, co
     index: ViewIndex = loaded.prepare(DEFAULT_ESTIMATOR)
     features, query = images.features(roll_steps_45deg=roll_steps_45deg), images.query
     max_error_px = config.approximate_max_error_px if query.lens_prior else config.max_error_px
-    pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
+    pixels = scaled_px(max_error_px, query.intrinsics)
     scores = retrieval_scores(features.descriptors, [view.features.descriptors for view in index.views])
     most = 0
     for i in top_indices(scores, config.views):

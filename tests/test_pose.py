@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from service.geometry import look_at, moved, pose_distance, project, reprojection_error_px, transformed
 from service.interfaces import Features, Frame, SceneGradients, Tools
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.image_sizes import PHOTO_PX, sized
+from service.pose.features.image_sizes import PHOTO_PX, scaled_px, sized
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer, backprojected, to_uint8
 from service.pose.matching.correspondences import correspondences
@@ -224,6 +224,11 @@ def test_sized_cameras_see_the_same_at_multiples_of_32(width: int, height: int, 
     assert small.long_side == long_side
     for a, b, size_a, size_b in ((lens.fx, small.fx, width, small.width), (lens.cy, small.cy, height, small.height)):
         assert np.isclose(a / size_a, b / size_b)
+
+
+def test_a_threshold_of_4_px_is_the_same_share_of_an_image_of_any_size() -> None:
+    for width, height, expected in ((416, 312, 4.0), (312, 416, 4.0), (832, 600, 8.0), (104, 78, 1.0)):
+        assert scaled_px(4.0, Intrinsics(width, height, 400.0, 400.0, width / 2, height / 2)) == expected
 
 
 def test_a_job_renders_and_describes_once() -> None:

@@ -14,7 +14,7 @@ from service.estimators.search_state import SearchState, VerifiedPose, changed
 from service.photos.intrinsics import has_distortion, taken_through
 from service.pose.absolute_pose.fisheye import LensModelFit, LensModels, fit_lens_models
 from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.refine_stage import rematch_and_refine
 from service.pose.verification.gate import doubted
@@ -68,7 +68,7 @@ def _fitted_models(state: SearchState, best: VerifiedPose) -> LensModels | None:
     if len(matches.photo_px) < state.config.min_lens_matches:
         return None
     start = AbsolutePose(refined.pose, np.zeros(len(matches.photo_px), bool), correction)
-    error_px = state.config.matching.rematch_error_px * images.query.intrinsics.long_side / PHOTO_PX
+    error_px = scaled_px(state.config.matching.rematch_error_px, images.query.intrinsics)
     return fit_lens_models(matches.photo_px, matches.points_in_world, images.query.intrinsics, start, error_px)
 
 

@@ -28,7 +28,7 @@ from service.estimators.search_state import (
     seen_from,
 )
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_intrinsics
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, to_uint8
@@ -95,7 +95,7 @@ def _refined_mirror_image(
     features = images.matcher.extract(np.ascontiguousarray(to_uint8(rendered.frame.rgb)[:, ::-1]), VIEWS.max_features)
     views = state.tools.prepared.views
     scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
-    error_px = MATCH_ERROR_PX * camera.long_side / PHOTO_PX
+    error_px = scaled_px(MATCH_ERROR_PX, camera)
     best: AbsolutePose | None = None
     for i in top_indices(scores, config.rival_views):
         matches = correspondences(features, views[i], images.matcher)
@@ -120,7 +120,7 @@ def _rivals(state: SearchState, answer: VerifiedPose, seen: PoseAtDistance) -> I
     view = state.renderer.at(images.query, seen.pose).view(images.matcher)
     camera, views = view.camera.intrinsics, tools.prepared.views
     scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
-    error_px = MATCH_ERROR_PX * camera.long_side / PHOTO_PX
+    error_px = scaled_px(MATCH_ERROR_PX, camera)
     config = state.config.ambiguity
     alike = ambiguous_hypotheses(
         view.features, camera, seen, views, scores, images.matcher, error_px, config.min_inliers, config
@@ -132,7 +132,7 @@ def _shifted(state: SearchState, images: QueryImages, seen: PoseAtDistance) -> I
     """Yield poses near the answer that show other things in the places of those that it shows."""
     assert state.best is not None
     retrieval, variant, camera = state.retrieval, state.best.variant, images.query.intrinsics
-    error_px = variant.max_error_px * camera.long_side / PHOTO_PX
+    error_px = scaled_px(variant.max_error_px, camera)
     features, scores = retrieval.features(variant), retrieval.scores(variant)
     return shifted_hypotheses(
         features, camera, seen, retrieval.index.views, scores, images.matcher, error_px, state.config.ambiguity

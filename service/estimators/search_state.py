@@ -15,7 +15,7 @@ import numpy as np
 from service.estimators.search_config import SearchConfig
 from service.interfaces import Answer, Tools
 from service.pose.absolute_pose.pnp import AbsolutePose
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, ViewRenderer
@@ -378,7 +378,7 @@ def hypotheses_of_photo(
         state.retrieval.index.views,
         state.retrieval.scores(variant),
         images.matcher,
-        variant.max_error_px * images.query.intrinsics.long_side / PHOTO_PX,
+        scaled_px(variant.max_error_px, images.query.intrinsics),
         config.min_inliers_if_explained if whole else config.min_inliers,
         config,
     )

@@ -13,6 +13,11 @@ PHOTO_PX = 416
 """Long side at which the photo's features are extracted, and to which pixel thresholds of matching refer."""
 
 
+def scaled_px(at_photo_px: float, intrinsics: Intrinsics) -> float:
+    """Return a pixel threshold of matching in an image of this size; it is given at PHOTO_PX."""
+    return at_photo_px * intrinsics.long_side / PHOTO_PX
+
+
 def sized(intrinsics: Intrinsics, long_side: int) -> Intrinsics:
     """Return the camera of the image resampled to about this long side (px), both sides multiples of 32."""
     # At least one multiple: very wide images would have no height otherwise.

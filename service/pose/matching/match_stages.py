@@ -23,7 +23,7 @@ from service.pose.absolute_pose.unknown_lens import (
     refine_with_lens,
     without_distortion,
 )
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import View, ViewRenderer
 from service.pose.matching.correspondences import Correspondences, correspondences
@@ -159,7 +159,7 @@ def solve_matches(matches: Correspondences, query: Query, max_error_px: float, m
 
     `max_error_px` is at PHOTO_PX. None if there is no such pose, or the query's prior region excludes it.
     """
-    pixels = max_error_px * query.intrinsics.long_side / PHOTO_PX
+    pixels = scaled_px(max_error_px, query.intrinsics)
     given = (matches.photo_px, matches.points_in_world)
     if query.lens_prior:
         found = absolute_pose_unknown_lens(*given, query.intrinsics, query.lens_prior, pixels)
@@ -194,7 +194,7 @@ def solve_matches_near(
 def _solve_with_lens(
     near: AbsolutePose, matches: Correspondences, query: Query, prior: LensPrior, config: MatchingConfig
 ) -> AbsolutePose | None:
-    pixels = config.rematch_error_px * query.intrinsics.long_side / PHOTO_PX
+    pixels = scaled_px(config.rematch_error_px, query.intrinsics)
     camera = query.intrinsics.corrected(near.correction)
     straight = without_distortion(matches.photo_px, query.intrinsics, near.correction)
     found = estimate_absolute_pose(

@@ -14,7 +14,7 @@ import numpy as np
 
 from service.interfaces import Matcher, Rasterizer
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_intrinsics
 from service.pose.features.rendered_views import VIEWS, View, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
@@ -61,7 +61,7 @@ def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher, conf
     intrinsics, pose = view.camera.intrinsics, view.camera.pose
     distance = float(np.median(np.linalg.norm(view.points_in_world - pose.position_in_world, axis=1)))
     scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
-    error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX
+    error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
     # The view's own pose is the answer that others are compared with.
     own = PoseAtDistance(pose, distance)
     found = ambiguous_hypotheses(
@@ -95,7 +95,7 @@ def _mirrored_inliers(
     # Mirroring the image changes its features, so they can't be taken from the index.
     features = matcher.extract(np.ascontiguousarray(to_uint8(frame.rgb)[:, ::-1]), VIEWS.max_features)
     scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
-    error_px = MATCH_ERROR_PX * intrinsics.long_side / PHOTO_PX
+    error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
     most = 0
     for i in top_indices(scores, config.mirror_tries):
         found = correspondences(features, views[i], matcher)
