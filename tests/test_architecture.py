@@ -23,7 +23,7 @@ FLOORS = {
         {
             *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "codec"),
             *("client", "live_client"),
-            "operating_system",
+            *("disk_cache", "operating_system"),
         },
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
@@ -48,7 +48,7 @@ FLOORS = {
         {"problems", "route_policy"},
         {"schemas"},
         {"middleware"},
-        {"routes", "openapi", "pages", "api_page", "viewer_relay"},
+        {"routes", "openapi", "pages", "api_page", "gauges", "viewer_relay"},
         {"app"},
     ],
 }

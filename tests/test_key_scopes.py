@@ -242,6 +242,20 @@ def test_lists_show_nothing_of_others(site, route):
         assert "vault" in seen
 
 
+def test_metrics_are_of_ones_own_scenes_and_jobs(site):
+    def samples(who: str) -> set[str]:
+        lines = site.ask(who, "GET", "/metrics").text.splitlines()
+        return {line.rpartition(" ")[0] for line in lines if not line.startswith("#")}
+
+    own = 'splatfix_jobs_by_key_total{key="room",scene="room",state="succeeded"}'
+    foreign = 'splatfix_jobs_by_key_total{key="vault",scene="vault",state="succeeded"}'
+    assert {own, foreign} <= samples("admin")
+    seen = samples("room")
+    assert own in seen
+    assert all('scene="room"' in sample for sample in seen)
+    assert not any('key="' in sample and 'key="room"' not in sample for sample in seen)
+
+
 def test_filters_and_counts_are_of_ones_own(site):
     found = site.ask("room", "GET", "/jobs", params={"scene": "vault"}).json()
     assert (found["jobs"], found["queued"], found["running"]) == ([], 0, 0)

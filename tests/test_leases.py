@@ -29,8 +29,8 @@ class CountingObserver:
     def started(self, waited_s: float) -> None:
         self.seen["started"] += 1
 
-    def ended(self, estimator: str, state: str, status: str | None, seconds: float | None) -> None:
-        self.seen[f"{estimator} {state} {status}"] += 1
+    def ended(self, job: StoredJob, seconds: float | None) -> None:
+        self.seen[f"{job.estimator} {job.state} {job.status}"] += 1
 
     def stage(self, estimator: str, stage: str, seconds: float) -> None:
         self.seen[f"stage {stage}"] += 1

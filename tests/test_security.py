@@ -531,6 +531,27 @@ def test_the_photos_own_name_reaches_no_path(client, tmp_path, monkeypatch):
     assert read_keys(tmp_path / "none.json") == []
 
 
+def test_a_label_has_a_bounded_number_of_values():
+    """Each is a time series for ever: a thousand keys and scenes become a hundred of each, and the others."""
+    metrics = Metrics()
+
+    def ended(client: str, scene: str) -> None:
+        job = SimpleNamespace(estimator="e", state="succeeded", status=None, client=client, scene=scene)
+        metrics.ended(job, 2.0)  # type: ignore[arg-type]
+
+    for number in range(1000):
+        ended(f"key:k{number}:0", f"s{number}")
+        metrics.rendered(f"s{number}", 0.1)
+    ended("address:1.2.3.4", "s1")
+    lines = metrics.exposition().decode().splitlines()
+    jobs = [line for line in lines if line.startswith("splatfix_jobs_by_key_total")]
+    assert len(jobs) == 102  # with that of the address
+    assert 'splatfix_jobs_by_key_total{key="(others)",scene="(others)",state="succeeded"} 900.0' in jobs
+    assert 'splatfix_job_seconds_by_key_total{key="k7",scene="s7"} 2.0' in lines
+    assert len([line for line in lines if line.startswith("splatfix_render_seconds_count")]) == 101
+    assert not any("1.2.3.4" in line for line in lines)
+
+
 def test_metrics_tell_what_happened(client, stepping):
     job = finished(client, post(client, prefer="").headers["location"])
     client.get(job["links"]["render"])

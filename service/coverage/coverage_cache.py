@@ -14,6 +14,7 @@ from service.codec import decode, encode
 from service.coverage.coverage_map import CoverageMap
 from service.coverage.held_out_photos import HeldOutPhoto
 from service.coverage.measurement import COVERAGE, CoverageConfig
+from service.disk_cache import mark_used
 from service.types import GaussianScene
 
 VERSION = 1
@@ -39,7 +40,9 @@ def coverage_file(
 def read_coverage(path: Path) -> CoverageMap | None:
     """Return a stored map; None if there is none, or none that can be read."""
     try:
-        return decode(CoverageMap, path.read_text("utf-8"))
+        found = decode(CoverageMap, path.read_text("utf-8"))
+        mark_used(path)
+        return found
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from service.jobs.model import StoredJob
 from service.jobs.read_photo import MAX_FRAMES
 
 
@@ -44,7 +45,7 @@ class Observer(Protocol):
         """A job was started, so long after it was accepted."""
         ...
 
-    def ended(self, estimator: str, state: str, status: str | None, seconds: float | None) -> None:
+    def ended(self, job: StoredJob, seconds: float | None) -> None:
         """A job ended, `seconds` after its start; None if it never started."""
         ...
 

@@ -51,6 +51,8 @@ class EngineConfig:
     """None: the first that can run here."""
     cache_dir: Path | None = None
     """Where view indexes and scenes in mappable form are kept between runs; None: nowhere."""
+    cache_bytes: int | None = None
+    """Size limit of that folder; None: none."""
     memory_bytes: int | None = None
     """Of all scenes together; None: any number."""
     data_folder: Path | None = None
@@ -75,6 +77,7 @@ class EmbeddedEngine:
             matcher=config.matcher,
             rasterizer=config.rasterizer,
             memory_bytes=config.memory_bytes,
+            cache_bytes=config.cache_bytes,
         )
         self._registrations = SceneRegistrations(config.data_folder)
         self._coverages = SceneCoverages(self._manager)

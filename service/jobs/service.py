@@ -301,8 +301,9 @@ class Jobs:
     def problems(self) -> list[str]:
         """Return what keeps jobs from running, as sentences; a supervisor should restart the process."""
         stuck, storage_error = self._queue.stuck(), self._worker.storage_error
-        found = [f"{stuck} workers are stuck"] if stuck >= _STUCK_LIMIT else []
-        return [*found, *([storage_error] if storage_error else [])]
+        found = [f"{stuck} workers are stuck: restart the service."] if stuck >= _STUCK_LIMIT else []
+        cure = "Free space on the disk of the data folder, and check that it is writable."
+        return [*found, *([f"{storage_error} {cure}"] if storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended.

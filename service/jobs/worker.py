@@ -231,7 +231,7 @@ class Worker:
         """Free an ended job's memory and scenes, and replace its upload by the image that people are shown."""
         job = self._store.get(live.id)
         took_s = job.finished - job.started if job.finished and job.started else None
-        self._observer.ended(job.estimator, job.state, job.status, took_s)
+        self._observer.ended(job, took_s)
         wanted = live.shown is not None and (job.keep_photo or self._config.photo_grace_s > 0)
         self._photos.discard_original(live.id, encode_image(live.shown.rgb) if wanted and live.shown else None)
         # After the photo is replaced: until then it is returned from memory.

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from service.codec import decode, encode
+from service.disk_cache import mark_used
 from service.scene_formats.folder import load_scene
 from service.scene_formats.layouts import files_of
 from service.types import GaussianScene, NamedCamera, SceneInfo
@@ -43,7 +44,9 @@ def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
         return load_scene(path)
     folder = cache_dir / "scenes" / _key(path)
     try:
-        return _opened(folder)
+        opened = _opened(folder)
+        mark_used(folder)
+        return opened
     except FileNotFoundError:
         pass
     except (OSError, ValueError, TypeError, KeyError) as error:

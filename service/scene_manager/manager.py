@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.disk_cache import evict
 from service.errors import (
     BadInput,
     SceneInUse,
@@ -71,10 +72,15 @@ class Scenes:
         matcher: str = DEFAULT_MATCHER,
         rasterizer: str | None = None,
         memory_bytes: int | None = None,
+        cache_bytes: int | None = None,
     ) -> None:
-        """`estimator` is the one that scenes are prepared for; `memory_bytes` limits them all together."""
+        """`estimator` is the one that scenes are prepared for.
+
+        `memory_bytes` limits all scenes together, `cache_bytes` the folder `cache_dir`.
+        """
         self._estimator, self._matcher, self._rasterizer = estimator, matcher, rasterizer
-        self._cache_dir, self._limit = cache_dir, MemoryLimit(memory_bytes)
+        self._cache_dir, self._cache_bytes = cache_dir, cache_bytes
+        self._limit = MemoryLimit(memory_bytes)
         self._entries: dict[str, Entry] = {}
         # Reentrant: methods that hold it call others that take it. Notified when a scene may fit now, or is asked for.
         self._lock = threading.Condition(threading.RLock())
@@ -374,6 +380,8 @@ class Scenes:
             entry.loaded.prepare(self._estimator)
             # Compiles and loads what the first photo would wait for.
             warm_up(entry.loaded, self._estimator)
+            if self._cache_dir and self._cache_bytes is not None:
+                evict(self._cache_dir, self._cache_bytes)
         with self._lock:
             entry.state, entry.failures = "ready", 0
             if not entry.wanted:

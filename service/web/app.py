@@ -41,6 +41,7 @@ from service.scene_manager.scene_store import FolderSceneStore, named_scenes
 from service.scene_manager.status import StoredScene
 from service.web.api_keys import KeyRing
 from service.web.api_page import add_api_page
+from service.web.gauges import add_gauges
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
 from service.web.middleware.head_requests import HeadRequests
@@ -155,7 +156,7 @@ async def _start(
     stack.push_async_callback(to_thread.run_sync, jobs.close)
     await to_thread.run_sync(jobs.start)
     limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
-    _add_gauges(metrics, engine, jobs, settings.workers)
+    add_gauges(metrics, settings, engine, jobs, folder)
     anchors = FileAnchorStore(scene_store.find, settings.data_dir)
     state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
     metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
@@ -239,19 +240,6 @@ def access_rules(settings: Settings, keys: KeyRing) -> AccessRules:
         )
     hosts = allowed_hosts(settings.host, settings.allowed_hosts, open_to_all=is_open)
     return AccessRules(keys, is_open, hosts, settings.cors_origins)
-
-
-def _add_gauges(metrics: Metrics, engine: Engine, jobs: Jobs, workers: int) -> None:
-    """Add gauges of the queue, the workers and the scenes."""
-    metrics.gauge("jobs_queued", "Queued jobs", (), lambda: {(): jobs.waiting()})
-    metrics.gauge("jobs_running", "Running jobs", (), lambda: {(): jobs.running()})
-    metrics.gauge("workers", "Worker threads", (), lambda: {(): workers})
-    metrics.gauge("workers_stuck", "Stuck workers", (), lambda: {(): jobs.stuck_workers()})
-    metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), lambda: _scene_bytes(engine))
-
-
-def _scene_bytes(engine: Engine) -> dict[tuple[str, ...], float]:
-    return {(scene.id,): float(scene.memory_bytes) for scene in engine.scenes() if scene.memory_bytes is not None}
 
 
 def _named_scenes(settings: Settings) -> list[StoredScene]:

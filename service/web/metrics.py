@@ -16,11 +16,16 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.exposition import CONTENT_TYPE_LATEST
 from prometheus_client.registry import Collector
 
+from service.jobs.model import StoredJob
+
 METRICS_TYPE = CONTENT_TYPE_LATEST
 # From a rendered thumbnail to the longest searches.
 _SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60, 120)
 
 _FRAME_SECONDS = (0.005, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.12, 0.2, 0.5, 1, 2)
+
+_MOST_VALUES = 100
+_OTHERS = "(others)"
 
 GaugeValues = Mapping[tuple[str, ...], float]
 """Values of a gauge by the values of its labels."""
@@ -43,6 +48,13 @@ class Metrics:
             registry=registry,
         )
         self._jobs = Counter("splatfix_jobs", "Finished jobs", ["estimator", "state", "status"], registry=registry)
+        self._by_key = Counter(
+            "splatfix_jobs_by_key", "Finished jobs by API key and scene", ["key", "scene", "state"], registry=registry
+        )
+        self._seconds_by_key = Counter(
+            "splatfix_job_seconds_by_key", "Time of workers by API key and scene", ["key", "scene"], registry=registry
+        )
+        self._keys, self._scenes = _Bounded(), _Bounded()
         self._wait_s = Histogram(
             "splatfix_job_wait_seconds", "Time of a job from acceptance to start", buckets=_SECONDS, registry=registry
         )
@@ -91,11 +103,14 @@ class Metrics:
         """Count a job that started, and its time in the queue."""
         self._wait_s.observe(waited_s)
 
-    def ended(self, estimator: str, state: str, status: str | None, seconds: float | None) -> None:
-        """Count a job that ended. `status` is its result's; `seconds` since its start, None if it never started."""
-        self._jobs.labels(estimator, state, status or "none").inc()
+    def ended(self, job: StoredJob, seconds: float | None) -> None:
+        """Count a job that ended, `seconds` after its start; None if it never started."""
+        self._jobs.labels(job.estimator, job.state, job.status or "none").inc()
+        key, scene = self._keys.label(_key_name(job.client)), self._scenes.label(job.scene)
+        self._by_key.labels(key, scene, job.state).inc()
         if seconds is not None:
-            self._job_s.labels(estimator).observe(seconds)
+            self._job_s.labels(job.estimator).observe(seconds)
+            self._seconds_by_key.labels(key, scene).inc(seconds)
 
     def stage(self, estimator: str, stage: str, seconds: float) -> None:
         """Count the time that a job spent on a stage."""
@@ -107,7 +122,7 @@ class Metrics:
 
     def rendered(self, scene: str, seconds: float) -> None:
         """Count an image that was rendered for a client."""
-        self._render_s.labels(scene).observe(seconds)
+        self._render_s.labels(self._scenes.label(scene)).observe(seconds)
 
     def live_frame(self, mode: str, status: str, seconds: float, dropped: int) -> None:
         """Count a frame of a live session that was answered, and those dropped before it."""
@@ -128,26 +143,47 @@ class Metrics:
         """Return all metrics in Prometheus text format."""
         return generate_latest(self._registry)
 
-    def exposition_of(self, sees: Callable[[str], bool]) -> bytes:
-        """Return the metrics of those scenes alone that `sees` is true of, in Prometheus text format."""
-        return generate_latest(_ScenesAlone(self._registry, sees))
+    def exposition_of(self, client: str, sees: Callable[[str], bool]) -> bytes:
+        """Return what one key may see, in the same format: its own jobs, and the scenes that `sees` is true of."""
+        return generate_latest(_Seen(self._registry, _key_name(client), sees))
 
 
 _METHODS = ("GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS")
 
 
-class _ScenesAlone(Collector):
-    """The samples of a registry that have a scene's name as a label, of scenes that may be seen."""
+class _Seen(Collector):
+    """The samples of a registry that are of a scene that may be seen, and if they are of a key, of one's own."""
 
-    def __init__(self, registry: CollectorRegistry, sees: Callable[[str], bool]) -> None:
-        self._registry, self._sees = registry, sees
+    def __init__(self, registry: CollectorRegistry, key: str, sees: Callable[[str], bool]) -> None:
+        self._registry, self._key, self._sees = registry, key, sees
 
     def collect(self) -> Iterator[Metric]:
         for family in self._registry.collect():
-            seen = [s for s in family.samples if "scene" in s.labels and self._sees(s.labels["scene"])]
-            if seen:
-                family.samples = seen
+            family.samples = [sample for sample in family.samples if self._shows(sample.labels)]
+            if family.samples:
                 yield family
+
+    def _shows(self, labels: Mapping[str, str]) -> bool:
+        of_scene = "scene" in labels and labels["scene"] != _OTHERS and self._sees(labels["scene"])
+        return of_scene and labels.get("key", self._key) == self._key
+
+
+class _Bounded:
+    """The values of a label: the first ones by name, all later ones together, since each is a time series for ever."""
+
+    def __init__(self) -> None:
+        self._known: set[str] = set()
+
+    def label(self, value: str) -> str:
+        if len(self._known) < _MOST_VALUES:
+            self._known.add(value)
+        return value if value in self._known else _OTHERS
+
+
+def _key_name(client: str) -> str:
+    """Return the name of the key that a client is; the same for all clients without a key."""
+    # Of `key:NAME:ID`. Addresses would be a value each.
+    return client.split(":")[1] if client.startswith("key:") else "none"
 
 
 class _Gauge:

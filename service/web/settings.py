@@ -153,6 +153,8 @@ class Settings(BaseSettings):
     """The longest `Prefer: wait=N` that is honoured."""
     cache_dir: Path | None = Path.home() / ".cache" / "splatfix"
     """Cache folder of view indexes and of scenes in mappable form; None: no cache."""
+    cache_bytes: int = Field(default=10_000_000_000, ge=0)
+    """Size limit of the cache folder: what was not used for longest is deleted when a scene has been loaded."""
     keys_file: Path | None = CONFIG_HOME / "keys.json"
     """File of API keys, as `splatfix keys add` writes it. If it has keys, every client needs one."""
     open: bool = False
@@ -201,6 +203,7 @@ class Settings(BaseSettings):
             self.matcher,
             self.rasterizer,
             self.cache_dir,
+            self.cache_bytes,
             memory_bytes=self.scene_memory_bytes,
             data_folder=self.data_dir,
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from service.disk_cache import mark_used
 from service.interfaces import Features
 from service.pose.features.rendered_views import View
 from service.types import Camera, Intrinsics, Pose
@@ -51,6 +52,7 @@ def read_views(path: Path | None) -> tuple[tuple[View, ...], dict[str, np.ndarra
     try:
         with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
             stored = {name: file[name] for name in file.files}
+        mark_used(path)
         return tuple(_views_of(stored)), stored
     except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         log.warning("computing anew what %s, which can't be read, holds (%s)", path.name, error)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from fastapi import APIRouter, Response
 
-from service.errors import NoKeys
+from service.errors import Failure, NoKeys
 from service.scene_manager.status import SceneNote
 from service.versions import versions
+from service.web.hints import hint_for
 from service.web.metrics import METRICS_TYPE
 from service.web.route_policy import SMALL_BODY, route_policy
 from service.web.routes.dependencies import AppStateOf, CallerOf, Visible, VisibleOf
@@ -17,6 +18,7 @@ from service.web.schemas.error_examples import errors
 from service.web.schemas.system import Capabilities, Liveness, Readiness, Token
 
 TOKEN_S = 300.0
+_NO_SCENE = "no scene can be used: load one (POST /scenes/ID/load), upload one, or name some in SPLATFIX_SCENES."
 _CANNOT_FAIL = ("unauthorized", "forbidden")
 
 router = APIRouter()
@@ -51,10 +53,13 @@ def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Read
     Scenes that the caller may not see are told without their names.
     """
     scenes, problems = app_state.engine.readiness(), app_state.jobs.problems()
+    cures = {s.id: _cure(s.failure) for s in app_state.engine.scenes() if s.failure}
+    if not scenes.ready and not scenes.pending and not scenes.failed:
+        problems = [*problems, _NO_SCENE]
     readiness = Readiness(
         ready=scenes.ready and not problems,
-        pending=_told(scenes.pending, visible),
-        failed=[*_told(scenes.failed, visible), *problems],
+        pending=_told(scenes.pending, visible, {}),
+        failed=[*_told(scenes.failed, visible, cures), *problems],
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
@@ -63,9 +68,16 @@ def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Read
     return readiness
 
 
-def _told(notes: Sequence[SceneNote], visible: Visible) -> list[str]:
+def _told(notes: Sequence[SceneNote], visible: Visible, cures: Mapping[str, str]) -> list[str]:
+    """Return notes as sentences, each with what to do."""
     hidden = "a scene that this key may not use"
-    return [str(note) if visible.scene(note.scene) else hidden for note in notes]
+    told = [(note, f"{note} {cures.get(note.scene, '')}".rstrip()) for note in notes]
+    return [text if visible.scene(note.scene) else hidden for note, text in told]
+
+
+def _cure(failure: Failure) -> str:
+    """Return what helps against a scene's failure, unless its text says so itself."""
+    return "" if failure.hint else hint_for(failure.code, failure.where)
 
 
 @router.get(
@@ -78,10 +90,10 @@ def _told(notes: Sequence[SceneNote], visible: Visible) -> list[str]:
 def get_metrics(app_state: AppStateOf, visible: VisibleOf) -> Response:
     """Return the metrics: requests, queue, jobs by stage and status, memory by scene, workers.
 
-    To a key with scenes: of its scenes alone.
+    To a key with scenes: of its scenes, and of its own jobs, alone.
     """
     metrics = app_state.metrics
-    found = metrics.exposition() if visible.all_scenes else metrics.exposition_of(visible.scene)
+    found = metrics.exposition() if visible.all_scenes else metrics.exposition_of(visible.owner or "", visible.scene)
     return Response(found, media_type=METRICS_TYPE)
 
 

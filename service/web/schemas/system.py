@@ -48,7 +48,7 @@ class Readiness(Model):
     pending: list[str]
     """What is not done yet; empty when ready."""
     failed: list[str]
-    """Scenes that could not be loaded, storage that can't be written to, stuck workers; each with the reason."""
+    """Scenes that could not be loaded, storage that can't be written to, stuck workers; each with reason and cure."""
     rasterizers: list[str]
     """Renderers of the scenes in memory: `cpu`, `gsplat_cuda`."""
     skipped_rasterizers: list[str]
