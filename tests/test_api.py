@@ -451,6 +451,13 @@ def test_the_only_scene_needs_no_name_but_one_of_two_does(stepping):
         assert "attic, cellar" in unnamed.json()["detail"]
 
 
+def test_a_service_without_a_usable_scene_says_what_to_do(stepping):
+    with serving(create_app(settings())) as client:
+        told = client.get("/readyz")
+        assert (told.status_code, told.json()["pending"]) == (503, [])
+        assert "SPLATFIX_SCENES" in told.json()["failed"][0]
+
+
 def test_a_corrupt_scene_is_told_and_harms_no_other(stepping, tmp_path):
     for name, text in (("torn", b"ply\nformat binary_little_endian 1.0\nelement vertex 9\n"), ("odd", b"?")):
         (tmp_path / name).mkdir()
@@ -459,6 +466,9 @@ def test_a_corrupt_scene_is_told_and_harms_no_other(stepping, tmp_path):
         until(lambda: not client.get("/readyz").json()["pending"], 120)
         ready = client.get("/readyz")
         assert (ready.status_code, len(ready.json()["failed"])) == (503, 2)
+        # Each with what to do.
+        assert "Copy or export the file again." in next(text for text in ready.json()["failed"] if "torn" in text)
+        assert "GET /capabilities lists" in next(text for text in ready.json()["failed"] if "odd" in text)
         states = {s["id"]: (s["state"], s["error"]["code"]) for s in client.get("/scenes").json()["scenes"]}
         assert states == {"torn": ("failed", "corrupt_scene"), "odd": ("failed", "unsupported_format")}
         for name, code in (("torn", "corrupt_scene"), ("odd", "unsupported_format")):

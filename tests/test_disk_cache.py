@@ -88,16 +88,16 @@ def test_a_service_keeps_its_cache_within_the_limit_and_tells_of_it(stepping, tm
     (tmp_path / "hall" / "scene.ply").write_bytes(ply())
     (tmp_path / "hall" / "transforms.json").write_text(json.dumps(TRANSFORMS))
     cache = tmp_path / "cache"
-    for limit in (10**9, 0):
-        chosen = settings(scenes=[tmp_path / "hall"], cache_dir=cache, cache_bytes=limit, data_dir=tmp_path / "data")
-        with serving(create_app(chosen)) as client:
-            until_ready(client)
-            lines = client.get("/metrics").text.splitlines()
-        told = dict(line.rsplit(" ", 1) for line in lines if line.startswith("splatfix_"))
-        assert float(told["splatfix_cache_limit_bytes"]) == limit
-        assert float(told["splatfix_cache_bytes"]) == cache_bytes(cache)
-        assert (cache_bytes(cache) > 0) is (limit > 0)
-        assert float(told["splatfix_ready"]) == 1
-        for folder in ("data", "cache"):
-            free = float(told[f'splatfix_disk_free_bytes{{folder="{folder}"}}'])
-            assert abs(free - shutil.disk_usage(tmp_path).free) < 1e9
+    mapped_scene(tmp_path / "hall", cache)
+    assert cache_bytes(cache) > 0
+    chosen = settings(scenes=[tmp_path / "hall"], cache_dir=cache, cache_bytes=0, data_dir=tmp_path / "data")
+    with serving(create_app(chosen)) as client:
+        until_ready(client)
+        lines = client.get("/metrics").text.splitlines()
+    assert cache_bytes(cache) == 0
+    told = dict(line.rsplit(" ", 1) for line in lines if line.startswith("splatfix_"))
+    for name, value in (("cache_limit_bytes", 0), ("cache_bytes", 0), ("ready", 1)):
+        assert float(told[f"splatfix_{name}"]) == value
+    for folder in ("data", "cache"):
+        free = float(told[f'splatfix_disk_free_bytes{{folder="{folder}"}}'])
+        assert abs(free - shutil.disk_usage(tmp_path).free) < 1e9

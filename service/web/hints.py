@@ -101,6 +101,9 @@ _BY_CODE: Mapping[str, str] = {
 def hint_for(code: str, where: str) -> str:
     """Return the hint of an error by its field, else by its code; never empty for the API's own codes."""
     field = where.partition(".")[0]
+    # Of a scene that can't be read `where` is a file, as scene.ply, and no field.
+    if code in ("corrupt_scene", "unsupported_format"):
+        return _BY_CODE[code]
     if field in _ALLOWED and code != "scene_not_found":
         return f"{_ALLOWED[field]} Example: {field}={_written(EXAMPLES[field])}"
     return _ELSEWHERE.get(field) or _BY_CODE.get(code, "See /docs.")
