@@ -244,7 +244,7 @@ def test_a_stuck_worker_is_replaced_and_two_are_told(stepping, tmp_path):
             assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
             assert post(client).json()["state"] == "succeeded"
         told = client.get("/readyz")
-        assert (told.status_code, told.json()["failed"]) == (503, ["2 workers are stuck"])
+        assert (told.status_code, told.json()["failed"]) == (503, ["2 workers are stuck: restart the service."])
         stepping.GO_ON.set()
         time.sleep(0.2)  # the abandoned threads come back, too late
         assert {job["state"] for job in client.get("/jobs").json()["jobs"]} == {"interrupted", "succeeded"}

@@ -9,6 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ import httpx
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, PATIENCE_MS, free_port, launched, opened, served
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, behind_nginx, free_port, launched, opened, served
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
@@ -588,24 +589,40 @@ def test_a_sequences_photo_is_the_one_of_the_shown_pose(page: Page, url: str) ->
     assert httpx.get(f"{url}{shown}", trust_env=False).status_code == 200
 
 
-def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path: Path) -> None:
+@pytest.mark.parametrize("nginx", [False, True], ids=["direct", "nginx"])
+@pytest.mark.parametrize("keys", [True, False], ids=["keys", "open"])
+def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path: Path, keys: bool, nginx: bool) -> None:
     port, room = free_port(), write_room(tmp_path / "room")
-    keys_file = tmp_path / "keys.json"
-    key = add_key(keys_file, "tester", "localize")
-    settings = Settings(
-        scenes=[room], port=port, cache_dir=None, data_dir=tmp_path / "data", keys_file=keys_file, shutdown_s=0
+    key = add_key(tmp_path / "keys.json", "tester", "localize") if keys else ""
+    chosen = Settings(
+        scenes=[room],
+        port=port,
+        cache_dir=None,
+        data_dir=tmp_path / "data",
+        keys_file=tmp_path / "keys.json",
+        shutdown_s=0,
     )
+    front = behind_nginx(port, tmp_path / "nginx") if nginx else nullcontext(f"http://127.0.0.1:{port}")
+    with front as url:
+        _restarted(browser, chosen, url, key)
+
+
+def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None:
+    """Open a page and a viewer of a job that runs, end the service, and start it again. Without a key it needs none."""
+    port = settings.port
     slow = {"estimator": "mc_do", "options": json.dumps({"hypotheses": 4096, "refinement_steps": 10000})}
-    with served(create_app(settings), port) as url:
+    with served(create_app(settings), port):
         until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
         context = browser.new_context(viewport={"width": 1000, "height": 700})
         page, viewer = context.new_page(), context.new_page()
         page.bring_to_front()
-        page.goto(f"{url}/#/key")
-        page.get_by_label("API key").fill(key)
-        page.get_by_label("API key").press("Enter")
+        page.goto(f"{url}/#/key" if key else f"{url}/")
+        if key:
+            page.get_by_label("API key").fill(key)
+            page.get_by_label("API key").press("Enter")
         page.get_by_role("radio").wait_for()
-        asked = {"files": {"photo": PHOTO.read_bytes()}, "headers": {"Authorization": f"Bearer {key}"}}
+        asked: dict = {"files": {"photo": PHOTO.read_bytes()}}
+        asked |= {"headers": {"Authorization": f"Bearer {key}"}} if key else {}
         job = httpx.post(f"{url}/localize", data=slow, trust_env=False, timeout=90, **asked).json()
         page.goto(f"{url}/#/jobs/{job['id']}")
         expect(page.locator(".line")).to_contain_text("step ")
