@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import os
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -330,6 +332,8 @@ class TestReport:
             png = (tmp_path / "page" / f"figure{number}.png").read_bytes()
             assert png.startswith(b"\x89PNG")
             assert len(png) < 2_000_000
+            assert base64.b64encode(png).decode() in html
+        assert all(f'<img alt="{escape(report.FIGURES[f"figure{number}"])}"' in html for number in (1, 2, 3, 4))
         stored = json.loads((tmp_path / "page" / "tables.json").read_text())
         assert {"table2_hard", "table3", "times"} <= {table["name"] for table in stored["tables"]}
 
