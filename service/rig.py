@@ -1,0 +1,354 @@
+"""Several photos, one answer: photos whose poses relative to one another are known are localized as one query.
+
+    each photo: the views of the index most like it -> matches with each
+    -> poses of the rig that many matches of all photos agree with (`rig_pose`)
+    -> render at each photo's pose, match again, solve together -> the pose with most matches is the answer
+    -> refine photometrically: each photo's normal equations, summed in the rig's twist
+    -> each photo is verified at its pose, and the verdicts are combined (`rig_gate`)
+
+Photos that can't be localized by themselves, because half is hidden or what they show is repeated, have right matches
+among the wrong ones; the wrong ones of different photos don't agree with one pose of the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from service.errors import InvalidRequest
+from service.geometry import hat, moved, pose_distance, se3_log
+from service.interfaces import RenderTally
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
+from service.pose.absolute_pose.rig_pose import RigMatches, RigPose, estimate_rig_pose
+from service.pose.features.image_sizes import PHOTO_PX, RENDER_PX, sized
+from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import ViewRenderer
+from service.pose.matching.correspondences import Correspondences, correspondences
+from service.pose.refinement.photometric import refine_photometric
+from service.pose.refinement.uncertainty import pose_uncertainty
+from service.pose.retrieval.image_variant import Retrieval
+from service.pose.retrieval.index import ViewIndex
+from service.pose.retrieval.scores import top_indices
+from service.pose.verification.gate import verify
+from service.pose.verification.precision import AskedBounds
+from service.pose.verification.rig_gate import rig_verdict
+from service.pose.verification.signals import typical_depth
+from service.render.render_counter import Counted
+from service.results import IterationRecord, PoseEstimate, StageTiming, Verdict
+from service.scene_origin import estimate_in_world, query_in_scene, record_in_world, shifted
+from service.types import Camera, Pose, Query
+
+MOST_PHOTOS = 8
+
+
+@dataclass(frozen=True, slots=True)
+class RigConfig:
+    """How a rig is searched for."""
+
+    rounds: tuple[tuple[int, float], ...] = ((5, 1.0), (16, 1.0), (32, 1.25))
+    """Index views that each photo is matched with, and the photo's size relative to the usual one; in each round, until
+    many fresh matches agree."""
+    trials: int = 1000
+    """Of RANSAC, of each camera."""
+    hypotheses: int = 3
+    """Poses that are tried in a round: the best one, and the best ones of the matches that don't agree with it."""
+    rematch_error_px: float = 3.0
+    """Reprojection error of an inlier with a render at the pose, at PHOTO_PX."""
+    rematches: int = 2
+    min_inliers: int = 60
+    min_inlier_share: float = 0.15
+    """Fresh matches that agree, of all photos, and their share, from which on nothing more is searched: right poses of
+    photos that are hidden by two thirds have 300 and 0.3, wrong ones 22 and 0.07."""
+    same_deg: float = 3.0
+    same_share: float = 0.05
+    """Poses nearer than this (share of the distance to what is seen) are the same hypothesis."""
+    refined_px: tuple[int, ...] = (256, RENDER_PX, RENDER_PX)
+    """Long sides of the renders that are refined on, one after the other."""
+
+
+RIG = RigConfig()
+
+
+@dataclass(frozen=True, slots=True)
+class RigPhoto:
+    """One photo of a rig."""
+
+    query: Query
+    """With exact intrinsics."""
+    rig_from_camera: Pose
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RigEstimate:
+    """A rig's pose."""
+
+    world_from_rig: Pose
+    estimate: PoseEstimate
+    """Of the first photo; its verdict is that on the rig."""
+    photos: tuple[tuple[Pose, Verdict], ...]
+    """Where each photo was taken, and the gate's verdict on it by itself there."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Hypothesis:
+    """A pose of the rig, after matching with renders there."""
+
+    world_from_rig: Pose
+    inliers: int
+    matches: int
+
+
+def localize_rig(
+    photos: Sequence[RigPhoto],
+    loaded: LoadedScene,
+    request: Request | None = None,
+    on_record: Callable[[IterationRecord], None] | None = None,
+    config: RigConfig = RIG,
+    *,
+    metric: bool = False,
+) -> RigEstimate:
+    """Localize 2 to 8 photos together.
+
+    `rig_from_camera` is in scene units, or, `metric`, in metres. Poses are in the world. Raises InvalidRequest for a
+    rig in metres in a scene without a scale, Cancelled, InvalidAccuracy.
+    """
+    request = request or Request()
+    origin, per_metre = loaded.scene.info.origin_in_world, _units_per_metre(loaded) if metric else 1.0
+    own = [
+        replace(photo, query=asked_of(query_in_scene(photo.query, origin), loaded, request),
+                rig_from_camera=_scaled(photo.rig_from_camera, per_metre))
+        for photo in photos
+    ]  # fmt: skip
+
+    def report(record: IterationRecord) -> None:
+        if on_record:
+            on_record(record_in_world(record, origin))
+
+    found = _Search(own, loaded, request, report, config).run()
+    return RigEstimate(
+        shifted(found.world_from_rig, origin),
+        estimate_in_world(found.estimate, origin),
+        tuple((shifted(pose, origin), verdict) for pose, verdict in found.photos),
+    )
+
+
+def _units_per_metre(loaded: LoadedScene) -> float:
+    info = loaded.scene.info
+    if info.metres_per_unit is None:
+        raise InvalidRequest(
+            f"scene '{info.name}' doesn't say how long its unit is.",
+            where="rig.metric",
+            hint="Send the rig in scene units, or register the scene.",
+        )
+    return 1 / info.metres_per_unit
+
+
+def _scaled(pose: Pose, factor: float) -> Pose:
+    matrix = pose.world_from_camera.copy()
+    matrix[:3, 3] *= factor
+    return Pose(matrix)
+
+
+class _Search:
+    """One rig's search; positions are relative to the scene's origin."""
+
+    def __init__(
+        self,
+        photos: Sequence[RigPhoto],
+        loaded: LoadedScene,
+        request: Request,
+        report: Callable[[IterationRecord], None],
+        config: RigConfig,
+    ) -> None:
+        self._photos, self._request, self._report, self._config = photos, request, report, config
+        self._loaded = loaded.as_seen_by(photos[0].query)
+        self._index: ViewIndex = self._loaded.prepare(DEFAULT_ESTIMATOR)
+        self._images = [QueryImages(photo.query, self._loaded.matcher) for photo in photos]
+        self._retrievals = [Retrieval(images, self._index) for images in self._images]
+        self._clock, self._tally = Clock(), RenderTally()
+        self._renderer = ViewRenderer(Counted(rasterizer_for(photos[0].query, self._loaded), self._tally))
+        self._records: list[IterationRecord] = []
+
+    def run(self) -> RigEstimate:
+        best, rivals = self._searched()
+        pose, covariance = self._refined(best.world_from_rig)
+        found, depth = [], 1.0
+        for photo, images in zip(self._photos, self._images, strict=True):
+            own = _pose_of(pose, photo)
+            rendered = self._renderer.at(photo.query, own)
+            # Of the first photo, whose pose is told.
+            depth = depth if found else typical_depth(rendered.frame)
+            found.append((own, verify(images, own, rendered)))
+        first = self._photos[0]
+        if covariance is not None:
+            to_camera = _adjoint(first.rig_from_camera.camera_from_world)
+            covariance = to_camera @ covariance @ to_camera.T
+        rival = max((one.inliers for one in rivals), default=0) / max(best.inliers, 1)
+        verdicts = [verdict for _, verdict in found]
+        verdict = rig_verdict(verdicts, covariance, AskedBounds.of(first.query.accuracy, depth), rival)
+        self._add("verify_rig", pose, verdict.inliers)
+        timings = [StageTiming("rig", self._clock.wall_s, self._clock.cpu_s)]
+        estimate = estimate_of(
+            first.query, self._loaded, self._request, verdict, self._records, timings=timings, renders=self._tally.count
+        )
+        return RigEstimate(pose, estimate, tuple(found))
+
+    # ------------------------------------------------------------------ search
+
+    def _searched(self) -> tuple[_Hypothesis, list[_Hypothesis]]:
+        """Return the hypothesis with most fresh matches, and the others that are elsewhere."""
+        tried: list[_Hypothesis] = []
+        for views, factor in self._config.rounds:
+            for found in self._hypotheses(views, factor):
+                self._add("match_rig", found.world_from_rig, found.num_inliers)
+                tried.append(self._rematched(found))
+            best = max(tried, key=lambda one: one.inliers, default=None)
+            if best and self._is_sure(best):
+                break
+            if self._request.budget_s is not None and self._clock.wall_s > self._request.budget_s:
+                break
+        if not tried:
+            tried.append(_Hypothesis(self._likeliest(), 0, 0))
+        best = max(tried, key=lambda one: one.inliers)
+        return best, [one for one in tried if one is not best and not self._is_same(one, best)]
+
+    def _is_sure(self, found: _Hypothesis) -> bool:
+        config = self._config
+        return found.inliers >= max(config.min_inliers, config.min_inlier_share * found.matches)
+
+    def _is_same(self, a: _Hypothesis, b: _Hypothesis) -> bool:
+        turned, way = pose_distance(a.world_from_rig, b.world_from_rig)
+        first = _pose_of(b.world_from_rig, self._photos[0])
+        depth = typical_depth(self._renderer.at(self._photos[0].query, first).frame)
+        return turned < self._config.same_deg and way < self._config.same_share * depth
+
+    def _likeliest(self) -> Pose:
+        """Return the rig's pose with its first photo at the view most like it: an answer where nothing matches."""
+        retrieval, photo = self._retrievals[0], self._photos[0]
+        view = self._index.views[top_indices(retrieval.scores(retrieval.upright_variant()), 1)[0]]
+        return Pose(view.camera.pose.world_from_camera @ photo.rig_from_camera.camera_from_world)
+
+    def _hypotheses(self, views: int, factor: float) -> Iterator[RigPose]:
+        """Match each photo with views; yield poses of the rig, each by the matches that agree with none before."""
+        matches = []
+        for photo, retrieval in zip(self._photos, self._retrievals, strict=True):
+            self._check()
+            variant = retrieval.rotated_variant(retrieval.upright_variant()).scaled(factor)
+            features = retrieval.features(variant)
+            chosen = top_indices(retrieval.scores(variant), views)
+            parts = [correspondences(features, self._index.views[i], self._loaded.matcher) for i in chosen]
+            matches.append(_matches(photo, Correspondences.pooled(parts), variant.max_error_px))
+        for _ in range(self._config.hypotheses):
+            found = estimate_rig_pose(matches, self._config.trials)
+            if found is None:
+                return
+            yield found
+            matches = [
+                replace(one, photo_px=one.photo_px[~agree], points_in_world=one.points_in_world[~agree])
+                for one, agree in zip(matches, found.inliers, strict=True)
+            ]
+
+    def _rematched(self, found: RigPose) -> _Hypothesis:
+        """Render each photo at the pose, match, and solve all again; no matches agree where that fails."""
+        inliers = count = 0
+        for _ in range(self._config.rematches):
+            matches = []
+            for photo, images in zip(self._photos, self._images, strict=True):
+                self._check()
+                view = self._renderer.at(photo.query, _pose_of(found.world_from_rig, photo)).view(images.matcher)
+                fresh = correspondences(images.features(), view, images.matcher)
+                matches.append(_matches(photo, fresh, self._config.rematch_error_px))
+            count = sum(len(one.photo_px) for one in matches)
+            again = estimate_rig_pose(matches, self._config.trials)
+            if again is None:
+                return _Hypothesis(found.world_from_rig, 0, count)
+            found, inliers = again, again.num_inliers
+            self._add("rematch_rig", found.world_from_rig, inliers)
+        return _Hypothesis(found.world_from_rig, inliers, count)
+
+    # ------------------------------------------------------------------ refinement
+
+    def _refined(self, world_from_rig: Pose) -> tuple[Pose, Float64[np.ndarray, "6 6"] | None]:
+        """Return the pose after joint refinement, and the covariance of its twist; None where no photo determines it.
+
+        Each photo is refined on a render; its covariance weighs the twist that it asks for.
+        """
+        covariance = None
+        for number, size_px in enumerate(self._config.refined_px):
+            information, pull = np.zeros((6, 6)), np.zeros(6)
+            for photo, images in zip(self._photos, self._images, strict=True):
+                self._check()
+                asked = self._asked_by(photo, images, _pose_of(world_from_rig, photo), size_px, 1 if number else 2)
+                if asked is None:
+                    continue
+                to_camera = _adjoint(photo.rig_from_camera.camera_from_world)
+                weighed = to_camera.T @ np.linalg.inv(asked[1])
+                information += weighed @ to_camera
+                pull += weighed @ asked[0]
+            if not information.any():
+                return world_from_rig, covariance
+            covariance = np.linalg.inv(information)
+            world_from_rig = moved(world_from_rig, covariance @ pull)
+            self._add("refine_rig", world_from_rig, None)
+        return world_from_rig, covariance
+
+    def _asked_by(
+        self, photo: RigPhoto, images: QueryImages, pose: Pose, size_px: int, levels: int
+    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 6"]] | None:
+        """Return the twist by which a photo would be moved, and its covariance; None: it doesn't determine its pose."""
+        size = sized(photo.query.intrinsics, size_px)
+        rgb, valid = images.resized(size), images.valid_mask(size)
+        rendered = self._renderer.render(Camera(size, pose))
+        frame, camera = rendered.frame, rendered.camera
+        result = refine_photometric(rgb, frame, camera, camera, levels, valid_mask=valid)
+        if not np.isfinite(result.loss):
+            return None
+        found = pose_uncertainty(rgb, frame, camera, Camera(size, result.pose), None, valid, result)
+        if found is None:
+            return None
+        goal = moved(result.pose, found.last_step)
+        return se3_log(pose.camera_from_world @ goal.world_from_camera), found.covariance[:6, :6]
+
+    # ------------------------------------------------------------------ records
+
+    def _check(self) -> None:
+        """Raise Cancelled if the request is."""
+        if self._request.cancel is not None and self._request.cancel.is_set():
+            raise Cancelled
+
+    def _add(self, stage: str, world_from_rig: Pose, inliers: int | None) -> None:
+        record = IterationRecord(
+            stage,
+            _pose_of(world_from_rig, self._photos[0]),
+            num_inliers=inliers,
+            index=len(self._records),
+            elapsed_s=self._clock.wall_s,
+            cpu_s=self._clock.cpu_s,
+        )
+        self._records.append(record)
+        self._report(record)
+
+
+def _pose_of(world_from_rig: Pose, photo: RigPhoto) -> Pose:
+    return moved(Pose(world_from_rig.world_from_camera @ photo.rig_from_camera.world_from_camera), np.zeros(6))
+
+
+def _matches(photo: RigPhoto, found: Correspondences, error_px: float) -> RigMatches:
+    """Return matches for the solver; `error_px` is at PHOTO_PX."""
+    lens = photo.query.intrinsics
+    return RigMatches(
+        found.photo_px, found.points_in_world, lens, photo.rig_from_camera, error_px * lens.long_side / PHOTO_PX
+    )
+
+
+def _adjoint(motion: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
+    """Return the matrix that takes a twist (rotation, translation) through a motion."""
+    rotation, result = motion[:3, :3], np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[3:, :3] = hat(motion[:3, 3]) @ rotation
+    return result
