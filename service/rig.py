@@ -23,7 +23,8 @@ from service.geometry import hat, moved, pose_distance, se3_log
 from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
-from service.pose.absolute_pose.rig_pose import RigMatches, RigPose, estimate_rig_pose
+from service.pose.absolute_pose.pnp import estimate_absolute_pose
+from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
 from service.pose.features.image_sizes import PHOTO_PX, RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
@@ -49,16 +50,23 @@ MOST_PHOTOS = 8
 class RigConfig:
     """How a rig is searched for."""
 
-    rounds: tuple[tuple[int, float], ...] = ((5, 1.0), (16, 1.0), (32, 1.25))
+    rounds: tuple[tuple[int, float], ...] = ((5, 1.0), (16, 1.0), (48, 1.0))
     """Index views that each photo is matched with, and the photo's size relative to the usual one; in each round, until
     many fresh matches agree."""
     trials: int = 1000
     """Of RANSAC, of each camera."""
+    view_trials: int = 300
+    view_inliers: int = 10
+    """Of RANSAC with the matches of one view; inliers from which on its pose is tried."""
     hypotheses: int = 3
-    """Poses that are tried in a round: the best one, and the best ones of the matches that don't agree with it."""
+    """Poses of all matches that are tried in a round, and as many of matches with one view."""
+    support: float = 2.0
+    """Weight of what the other photos say of a view, relative to its own score."""
     rematch_error_px: float = 3.0
     """Reprojection error of an inlier with a render at the pose, at PHOTO_PX."""
     rematches: int = 2
+    hopeless_inliers: int = 12
+    """With fewer a pose isn't rendered again: they are chance."""
     min_inliers: int = 60
     min_inlier_share: float = 0.15
     """Fresh matches that agree, of all photos, and their share, from which on nothing more is searched: right poses of
@@ -173,6 +181,16 @@ class _Search:
         self._clock, self._tally = Clock(), RenderTally()
         self._renderer = ViewRenderer(Counted(rasterizer_for(photos[0].query, self._loaded), self._tally))
         self._records: list[IterationRecord] = []
+        self._supported: Float64[np.ndarray, "photos views"] | None = None
+        self._reach = float(
+            np.median(
+                [
+                    np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1))
+                    for v in self._index.views
+                    if len(v.points_in_world)
+                ]
+            )
+        )
 
     def run(self) -> RigEstimate:
         best, rivals = self._searched()
@@ -204,11 +222,10 @@ class _Search:
         """Return the hypothesis with most fresh matches, and the others that are elsewhere."""
         tried: list[_Hypothesis] = []
         for views, factor in self._config.rounds:
-            for found in self._hypotheses(views, factor):
-                self._add("match_rig", found.world_from_rig, found.num_inliers)
-                tried.append(self._rematched(found))
-            best = max(tried, key=lambda one: one.inliers, default=None)
-            if best and self._is_sure(best):
+            for pose, inliers in self._hypotheses(views, factor):
+                self._add("match_rig", pose, inliers)
+                tried.append(self._rematched(pose))
+            if any(map(self._is_sure, tried)):
                 break
             if self._request.budget_s is not None and self._clock.wall_s > self._request.budget_s:
                 break
@@ -233,43 +250,83 @@ class _Search:
         view = self._index.views[top_indices(retrieval.scores(retrieval.upright_variant()), 1)[0]]
         return Pose(view.camera.pose.world_from_camera @ photo.rig_from_camera.camera_from_world)
 
-    def _hypotheses(self, views: int, factor: float) -> Iterator[RigPose]:
-        """Match each photo with views; yield poses of the rig, each by the matches that agree with none before."""
-        matches = []
-        for photo, retrieval in zip(self._photos, self._retrievals, strict=True):
+    def _hypotheses(self, views: int, factor: float) -> Iterator[tuple[Pose, int]]:
+        """Match each photo with views; yield poses of the rig and how many matches agree with each.
+
+        First that which most matches of all agree with, then those which many matches with one view led to, then the
+        best ones of the matches that agree with none before.
+        """
+        matches, starts = [], []
+        for photo, retrieval, support in zip(self._photos, self._retrievals, self._support(), strict=True):
             self._check()
             variant = retrieval.rotated_variant(retrieval.upright_variant()).scaled(factor)
             features = retrieval.features(variant)
-            chosen = top_indices(retrieval.scores(variant), views)
+            chosen = top_indices(retrieval.scores(variant) + self._config.support * support, views)
             parts = [correspondences(features, self._index.views[i], self._loaded.matcher) for i in chosen]
             matches.append(_matches(photo, Correspondences.pooled(parts), variant.max_error_px))
-        for _ in range(self._config.hypotheses):
-            found = estimate_rig_pose(matches, self._config.trials)
+            starts += self._starts(photo, parts, variant.max_error_px)
+        # By chance more of all matches agree with any pose than of those with one view with the right one.
+        starts.sort(key=lambda start: -start[1])
+        for number in range(self._config.hypotheses):
+            found = estimate_rig_pose(matches, self._config.trials, [] if number else [pose for pose, _ in starts])
             if found is None:
                 return
-            yield found
+            yield found.world_from_rig, found.num_inliers
+            if not number:
+                yield from starts[: self._config.hypotheses]
             matches = [
                 replace(one, photo_px=one.photo_px[~agree], points_in_world=one.points_in_world[~agree])
                 for one, agree in zip(matches, found.inliers, strict=True)
             ]
 
-    def _rematched(self, found: RigPose) -> _Hypothesis:
+    def _starts(self, photo: RigPhoto, parts: Sequence[Correspondences], error_px: float) -> list[tuple[Pose, int]]:
+        """Return poses of the rig that the matches of a photo with one view lead to, and how many of them agree."""
+        found = []
+        for part in parts:
+            one = _matches(photo, part, error_px)
+            alone = estimate_absolute_pose(
+                one.photo_px, one.points_in_world, one.intrinsics, one.max_error_px, self._config.view_trials
+            )
+            if alone is not None and alone.num_inliers >= self._config.view_inliers:
+                pose = Pose(alone.pose.world_from_camera @ photo.rig_from_camera.camera_from_world)
+                found.append((pose, alone.num_inliers))
+        return found
+
+    def _support(self) -> Float64[np.ndarray, "photos views"]:
+        """Return for each photo how much the other photos speak for each view: a view of another photo that puts this
+        one's camera near it counts with its score, the best of each."""
+        if self._supported is None:
+            views = np.stack([view.camera.pose.world_from_camera for view in self._index.views])
+            scores = [one.scores(one.upright_variant()) for one in self._retrievals]
+            found = np.zeros((len(scores), len(views)))
+            for own, photo in zip(found, self._photos, strict=True):
+                for other, given in zip(self._photos, scores, strict=True):
+                    if other is photo:
+                        continue
+                    between = other.rig_from_camera.camera_from_world @ photo.rig_from_camera.world_from_camera
+                    own += (_nearness(views @ between, views, self._reach) * given[:, None]).max(0)
+            self._supported = found
+        return self._supported
+
+    def _rematched(self, pose: Pose) -> _Hypothesis:
         """Render each photo at the pose, match, and solve all again; no matches agree where that fails."""
         inliers = count = 0
         for _ in range(self._config.rematches):
             matches = []
             for photo, images in zip(self._photos, self._images, strict=True):
                 self._check()
-                view = self._renderer.at(photo.query, _pose_of(found.world_from_rig, photo)).view(images.matcher)
+                view = self._renderer.at(photo.query, _pose_of(pose, photo)).view(images.matcher)
                 fresh = correspondences(images.features(), view, images.matcher)
                 matches.append(_matches(photo, fresh, self._config.rematch_error_px))
             count = sum(len(one.photo_px) for one in matches)
-            again = estimate_rig_pose(matches, self._config.trials)
+            again = estimate_rig_pose(matches, self._config.trials, [pose])
             if again is None:
-                return _Hypothesis(found.world_from_rig, 0, count)
-            found, inliers = again, again.num_inliers
-            self._add("rematch_rig", found.world_from_rig, inliers)
-        return _Hypothesis(found.world_from_rig, inliers, count)
+                return _Hypothesis(pose, 0, count)
+            pose, inliers = again.world_from_rig, again.num_inliers
+            self._add("rematch_rig", pose, inliers)
+            if inliers < self._config.hopeless_inliers:
+                break
+        return _Hypothesis(pose, inliers, count)
 
     # ------------------------------------------------------------------ refinement
 
@@ -332,6 +389,15 @@ class _Search:
         )
         self._records.append(record)
         self._report(record)
+
+
+def _nearness(
+    a: Float64[np.ndarray, "n 4 4"], b: Float64[np.ndarray, "m 4 4"], reach: float
+) -> Float64[np.ndarray, "n m"]:
+    """Return how near poses are, 1 to 0: by half a radian, or half of the distance to what is seen, 0.4."""
+    turn = np.arccos(np.clip((np.einsum("iab,jab->ij", a[:, :3, :3], b[:, :3, :3]) - 1) / 2, -1, 1))
+    way = np.linalg.norm(a[:, None, :3, 3] - b[None, :, :3, 3], axis=2)
+    return np.exp(-((turn / 0.5) ** 2) - (way / (0.5 * reach)) ** 2)
 
 
 def _pose_of(world_from_rig: Pose, photo: RigPhoto) -> Pose:

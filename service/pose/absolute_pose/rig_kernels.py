@@ -9,6 +9,7 @@ camera in turn as in `ransac`; refinement minimizes the errors in all cameras ov
     counts (c)            matches of each camera
     rotations (c, 3, 3), translations (c, 3)   camera_from_rig
     focals (c, 2), limits (c)                  pixels
+    starts (s, 4, 3)      poses that are tried first: rotation, and translation as the last row
     pose                  rotation (3, 3), translation (3): rig_from_world
 """
 
@@ -165,12 +166,34 @@ def refine_rig(columns, rotations, translations, focals, limits, loss, steps, to
 
 
 @inline
+def draw_three(columns, count, trial, pool, growth, share, c, state, chosen, rays, points):
+    """Write the rays and points of three matches of camera c, drawn from its pool, which grows."""
+    if trial > growth[c] and pool[c] < count:
+        larger = share[c] * (pool[c] + 1.0) / (pool[c] - 2.0)
+        growth[c] += math.ceil(larger - share[c])
+        share[c] = larger
+        pool[c] += 1
+    if pool[c] < count and trial <= growth[c] and pool[c] > 3:
+        draw(state, pool[c] - 1, 2, chosen)
+        chosen[2] = pool[c] - 1
+    else:
+        draw(state, pool[c], 3, chosen)
+    for i in range(3):
+        u, v = columns[0, chosen[i]], columns[1, chosen[i]]
+        norm = 1.0 / math.sqrt(u * u + v * v + 1.0)
+        rays[i, 0], rays[i, 1], rays[i, 2] = u * norm, v * norm, norm
+        for k in range(3):
+            points[i, k] = columns[2 + k, chosen[i]]
+
+
+@inline
 def search_rig(
-    columns, counts, rotations, translations, focals, limits, fewest, most, confidence, factor, refine_steps, seed,
-    rotation, translation,
+    columns, counts, rotations, translations, focals, limits, starts, fewest, most, confidence, factor, refine_steps,
+    seed, rotation, translation,
 ):  # fmt: skip
     """Write the rig's pose of the lowest cost that was found; return how many inliers it has; 0: none.
 
+    First the starts are refined.
     Each camera with four matches or more has `most` trials, in turn with the others; its pool of matches grows as in
     `search_pose`. The search ends when the inliers of any one camera say that it was enough for that camera.
     """
@@ -185,63 +208,51 @@ def search_rig(
         for i in range(3):
             share[c] *= (3.0 - i) / max(counts[c] - i, 1)
     best_cost, best_inliers, minimal_cost = math.inf, 0.0, math.inf
-    needed, trial = most, 0
-    while trial < most and trial < needed:
-        trial += 1
-        for c in range(cameras):
-            if counts[c] < 4:
-                continue
-            if trial > growth[c] and pool[c] < counts[c]:
-                larger = share[c] * (pool[c] + 1.0) / (pool[c] - 2.0)
-                growth[c] += math.ceil(larger - share[c])
-                share[c] = larger
-                pool[c] += 1
-            if pool[c] < counts[c] and trial <= growth[c] and pool[c] > 3:
-                draw(state, pool[c] - 1, 2, chosen)
-                chosen[2] = pool[c] - 1
-            else:
-                draw(state, pool[c], 3, chosen)
-            for i in range(3):
-                u, v = columns[c, 0, chosen[i]], columns[c, 1, chosen[i]]
-                norm = 1.0 / math.sqrt(u * u + v * v + 1.0)
-                rays[i, 0], rays[i, 1], rays[i, 2] = u * norm, v * norm, norm
-                for k in range(3):
-                    points[i, k] = columns[c, 2 + k, chosen[i]]
-            improved = False
-            for i in range(solve_p3p(rays, points, work, p3p_rotations, p3p_translations)):
-                after_inverse(rotations[c], translations[c], p3p_rotations[i], p3p_translations[i], own[:3], own[3])
-                cost, inliers = score_rig(
-                    columns, rotations, translations, focals, limits, own[:3], own[3], work[:3, :3], work[3, :3]
-                )
-                if cost < minimal_cost:
-                    minimal_cost, improved = cost, True
-                    copy_pose(own[:3], own[3], candidate[:3], candidate[3])
-            if not improved:
-                continue
-            refine_rig(
-                columns, rotations, translations, focals, limits, TRUNCATED, refine_steps, 1e-6, candidate[:3],
-                candidate[3],
-            )  # fmt: skip
-            cost, inliers = score_rig(
-                columns, rotations, translations, focals, limits, candidate[:3], candidate[3], own[:3], own[3]
-            )
-            if cost < best_cost:
-                best_cost, best_inliers = cost, inliers
-                copy_pose(candidate[:3], candidate[3], rotation, translation)
-                needed = most
-                for k in range(cameras):
-                    compose(rotations[k], translations[k], rotation, translation, own[:3], own[3])
-                    _, own_inliers = score_pose(columns[k], own[:3], own[3], focals[k], limits[k])
-                    if counts[k] >= 4:
-                        enough = enough_trials(own_inliers / counts[k], confidence, factor, fewest, most)
-                        needed = min(needed, enough)
+    needed, trial, c = most, 0, -1
+    number = 0
+    while number < len(starts) or (trial < most and trial < needed):
+        improved = number < len(starts)
+        if improved:
+            copy_pose(starts[number, :3], starts[number, 3], candidate[:3], candidate[3])
+            number += 1
+        else:
+            c = (c + 1) % cameras
+            trial += c == 0
+            if counts[c] >= 4:
+                draw_three(columns[c], counts[c], trial, pool, growth, share, c, state, chosen, rays, points)
+                for i in range(solve_p3p(rays, points, work, p3p_rotations, p3p_translations)):
+                    after_inverse(rotations[c], translations[c], p3p_rotations[i], p3p_translations[i], own[:3], own[3])
+                    cost, inliers = score_rig(
+                        columns, rotations, translations, focals, limits, own[:3], own[3], work[:3, :3], work[3, :3]
+                    )
+                    if cost < minimal_cost:
+                        minimal_cost, improved = cost, True
+                        copy_pose(own[:3], own[3], candidate[:3], candidate[3])
+        if not improved:
+            continue
+        refine_rig(
+            columns, rotations, translations, focals, limits, TRUNCATED, refine_steps, 1e-6, candidate[:3], candidate[3]
+        )  # fmt: skip
+        cost, inliers = score_rig(
+            columns, rotations, translations, focals, limits, candidate[:3], candidate[3], own[:3], own[3]
+        )
+        if cost < best_cost:
+            best_cost, best_inliers = cost, inliers
+            copy_pose(candidate[:3], candidate[3], rotation, translation)
+            needed = most
+            for k in range(cameras):
+                compose(rotations[k], translations[k], rotation, translation, own[:3], own[3])
+                _, own_inliers = score_pose(columns[k], own[:3], own[3], focals[k], limits[k])
+                if counts[k] >= 4:
+                    needed = min(needed, enough_trials(own_inliers / counts[k], confidence, factor, fewest, most))
     return np.int64(best_inliers)
 
 
 @kernel
 def solve_rig(
-    columns, counts, rotations, translations, focals, limits, trials, chances, steps, seed, loss_scale, tolerance
-):
+    columns, counts, rotations, translations, focals, limits, starts, trials, chances, steps, seed, loss_scale,
+    tolerance,
+):  # fmt: skip
     """Return rig_from_world, rotation and translation, and which correspondences are its inliers; none: no pose.
 
     The arguments are those of `solve_pnp`; `loss_scale` is in limits.
@@ -250,7 +261,7 @@ def solve_rig(
     inlier = np.zeros((cameras, width), np.bool_)
     rotation, translation, own = np.zeros((3, 3)), np.zeros(3), np.zeros((4, 3))
     found = search_rig(
-        columns, counts, rotations, translations, focals, limits, trials[0], trials[1], chances[0], chances[1],
+        columns, counts, rotations, translations, focals, limits, starts, trials[0], trials[1], chances[0], chances[1],
         steps[0], seed, rotation, translation,
     )  # fmt: skip
     if found == 0:

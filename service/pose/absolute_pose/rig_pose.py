@@ -42,13 +42,16 @@ class RigPose:
 
 
 def estimate_rig_pose(
-    cameras: Sequence[RigMatches], max_trials: int, config: AbsolutePoseConfig = ABSOLUTE_POSE
+    cameras: Sequence[RigMatches],
+    max_trials: int,
+    starts: Sequence[Pose] = (),
+    config: AbsolutePoseConfig = ABSOLUTE_POSE,
 ) -> RigPose | None:
     """Estimate a rig's pose from pixels of its photos and the scene points seen there.
 
     P3P in each camera in turn, scored in all of them, in locally optimized RANSAC with progressive sampling; then
-    Levenberg-Marquardt on the inliers of all cameras with a Cauchy loss. `max_trials` are each camera's. Deterministic.
-    None if no pose has enough inliers.
+    Levenberg-Marquardt on the inliers of all cameras with a Cauchy loss. `max_trials` are each camera's; `starts`,
+    world_from_rig, are tried first. Deterministic. None if no pose has enough inliers.
     """
     most = max((len(camera.photo_px) for camera in cameras), default=0)
     if most < config.min_points:
@@ -60,6 +63,9 @@ def estimate_rig_pose(
         own[1, :count] = (camera.photo_px[:, 1] - k.cy) / k.fy
         own[2:, :count] = camera.points_in_world.T
     camera_from_rig = np.stack([camera.rig_from_camera.camera_from_world for camera in cameras])
+    rig_from_world = np.zeros((len(starts), 4, 3))
+    for start, pose in zip(rig_from_world, starts, strict=True):
+        start[:3], start[3] = pose.camera_from_world[:3, :3], pose.camera_from_world[:3, 3]
     rotation, translation, inlier = solve_rig(
         columns,
         np.array([len(camera.photo_px) for camera in cameras]),
@@ -67,6 +73,7 @@ def estimate_rig_pose(
         np.ascontiguousarray(camera_from_rig[:, :3, 3]),
         np.array([[camera.intrinsics.fx, camera.intrinsics.fy] for camera in cameras]),
         np.array([float(camera.max_error_px) for camera in cameras]),
+        rig_from_world,
         (config.min_trials, max_trials),
         (config.confidence, config.trials_factor),
         (config.search_steps, config.final_steps),

@@ -4,7 +4,7 @@ The wrong matches of different cameras don't agree with one pose of a rig. So ma
 itself, and how much of it is hidden counts less: a photo *agrees* where many fresh matches with a render at its pose
 agree with the pose that all photos gave, and colours agree where gradients do; it *contradicts* where the matches agree
 and the colours don't, as for one of a row of like things seen one further; else it *can't tell*: it may be hidden. The
-rig is accepted if several photos agree, none contradicts, and no other pose of the rig has nearly as many matches.
+rig is accepted if several photos agree, more than contradict, and no other pose of the rig has nearly as many matches.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ class RigGateConfig:
     65 and 0.3 and more; at wrong ones 20 and 0.1 at most."""
     min_colour: float = 0.97
     """Local colour correlation of a photo that agrees; with less its matches contradict."""
+    least_place: float = 0.6
+    """Probability of the right place by a photo that agrees, at least: the model takes what is hidden for wrong."""
     min_agreeing: int = 2
     min_total_inliers: int = 80
     max_rival_share: float = 0.5
@@ -56,14 +58,15 @@ def rig_verdict(
     agree = [one for one in photos if _matches(one, config) and one.signals[LOCAL_COLOUR] >= config.min_colour]
     contradict = [one for one in photos if _matches(one, config) and one.signals[LOCAL_COLOUR] < config.min_colour]
     total = sum(one.inliers for one in photos)
-    # As if each photo that agrees were evidence by itself: the model's probabilities without its floors.
-    place = 1.0 - float(np.prod([1.0 - gate.model.probability(one.signals) for one in agree]))
+    # As if each photo that agrees were evidence by itself: by the model, without its floors.
+    alone = [max(gate.model.probability(one.signals), config.least_place) for one in agree]
+    place = 1.0 - float(np.prod([1.0 - one for one in alone]))
     precise = 0.0 if covariance is None else probability_within(covariance, asked.deg, asked.units)
     reason = Reason.VERIFIED
-    if len(agree) < config.min_agreeing or total < config.min_total_inliers or place < gate.min_localized:
+    if len(agree) < config.min_agreeing or total < config.min_total_inliers:
         reason = Reason.FEW_INLIERS if total else Reason.NO_MATCHING_VIEW
         place = min(place, gate.doubtful_score)
-    elif contradict:
+    elif len(contradict) >= len(agree):
         reason, place = Reason.RENDER_MISMATCH, min(place, gate.doubtful_score)
     elif rival_share > config.max_rival_share:
         reason, place = Reason.AMBIGUOUS, min(place, gate.doubtful_score)
