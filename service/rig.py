@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.errors import InvalidRequest
-from service.geometry import hat, moved, pose_distance, se3_log
+from service.geometry import hat, moved, pose_distance, se3_log, transformed
 from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
@@ -74,6 +74,8 @@ class RigConfig:
     same_deg: float = 3.0
     same_share: float = 0.05
     """Poses nearer than this (share of the distance to what is seen) are the same hypothesis."""
+    match_sigma_px: float = 4.0
+    """Standard deviation of a match, at PHOTO_PX: neighbours err alike, so 1.5 px count as more."""
     refined_px: tuple[int, ...] = (256, RENDER_PX, RENDER_PX)
     """Long sides of the renders that are refined on, one after the other."""
 
@@ -99,7 +101,7 @@ class RigEstimate:
     estimate: PoseEstimate
     """Of the first photo; its verdict is that on the rig."""
     photos: tuple[tuple[Pose, Verdict], ...]
-    """Where each photo was taken, and the gate's verdict on it by itself there."""
+    """Where each photo was taken, and the gate's verdict on it by itself there; its covariance is by all photos."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,8 @@ class _Hypothesis:
     world_from_rig: Pose
     inliers: int
     matches: int
+    information: Float64[np.ndarray, "6 6"]
+    """Of the rig's twist, by the matches that agree."""
 
 
 def localize_rig(
@@ -194,7 +198,7 @@ class _Search:
 
     def run(self) -> RigEstimate:
         best, rivals = self._searched()
-        pose, covariance = self._refined(best.world_from_rig)
+        pose, covariance = self._refined(best)
         found, depth = [], 1.0
         for photo, images in zip(self._photos, self._images, strict=True):
             own = _pose_of(pose, photo)
@@ -204,8 +208,10 @@ class _Search:
             found.append((own, verify(images, own, rendered)))
         first = self._photos[0]
         if covariance is not None:
-            to_camera = _adjoint(first.rig_from_camera.camera_from_world)
-            covariance = to_camera @ covariance @ to_camera.T
+            to_cameras = [_adjoint(photo.rig_from_camera.camera_from_world) for photo in self._photos]
+            covariances = [one @ covariance @ one.T for one in to_cameras]
+            found = [(own, replace(one, covariance=c)) for (own, one), c in zip(found, covariances, strict=True)]
+            covariance = covariances[0]
         rival = max((one.inliers for one in rivals), default=0) / max(best.inliers, 1)
         verdicts = [verdict for _, verdict in found]
         verdict = rig_verdict(verdicts, covariance, AskedBounds.of(first.query.accuracy, depth), rival)
@@ -230,7 +236,7 @@ class _Search:
             if self._request.budget_s is not None and self._clock.wall_s > self._request.budget_s:
                 break
         if not tried:
-            tried.append(_Hypothesis(self._likeliest(), 0, 0))
+            tried.append(_Hypothesis(self._likeliest(), 0, 0, np.zeros((6, 6))))
         best = max(tried, key=lambda one: one.inliers)
         return best, [one for one in tried if one is not best and not self._is_same(one, best)]
 
@@ -310,7 +316,7 @@ class _Search:
 
     def _rematched(self, pose: Pose) -> _Hypothesis:
         """Render each photo at the pose, match, and solve all again; no matches agree where that fails."""
-        inliers = count = 0
+        inliers, count, information = 0, 0, np.zeros((6, 6))
         for _ in range(self._config.rematches):
             matches = []
             for photo, images in zip(self._photos, self._images, strict=True):
@@ -321,33 +327,37 @@ class _Search:
             count = sum(len(one.photo_px) for one in matches)
             again = estimate_rig_pose(matches, self._config.trials, [pose])
             if again is None:
-                return _Hypothesis(pose, 0, count)
+                return _Hypothesis(pose, 0, count, np.zeros((6, 6)))
             pose, inliers = again.world_from_rig, again.num_inliers
             self._add("rematch_rig", pose, inliers)
+            information = _information(matches, again, self._config.match_sigma_px)
             if inliers < self._config.hopeless_inliers:
                 break
-        return _Hypothesis(pose, inliers, count)
+        return _Hypothesis(pose, inliers, count, information)
 
     # ------------------------------------------------------------------ refinement
 
-    def _refined(self, world_from_rig: Pose) -> tuple[Pose, Float64[np.ndarray, "6 6"] | None]:
-        """Return the pose after joint refinement, and the covariance of its twist; None where no photo determines it.
+    def _refined(self, matched: _Hypothesis) -> tuple[Pose, Float64[np.ndarray, "6 6"] | None]:
+        """Return the pose after joint refinement, and the covariance of its twist; None where nothing determines it.
 
-        Each photo is refined on a render; its covariance weighs the twist that it asks for.
+        Each photo is refined on a render; its covariance weighs the twist that it asks for. The matches' normal
+        equations are added, so that the pixels of what hides the scene can't lead away from them.
         """
-        covariance = None
+        covariance, world_from_rig = None, matched.world_from_rig
         for number, size_px in enumerate(self._config.refined_px):
-            information, pull = np.zeros((6, 6)), np.zeros(6)
+            back = se3_log(world_from_rig.camera_from_world @ matched.world_from_rig.world_from_camera)
+            information, pull = matched.information.copy(), matched.information @ back
             for photo, images in zip(self._photos, self._images, strict=True):
                 self._check()
                 asked = self._asked_by(photo, images, _pose_of(world_from_rig, photo), size_px, 1 if number else 2)
                 if asked is None:
                     continue
                 to_camera = _adjoint(photo.rig_from_camera.camera_from_world)
-                weighed = to_camera.T @ np.linalg.inv(asked[1])
+                weight = _agreement(to_camera @ back - asked[0], to_camera, asked[1], matched.information)
+                weighed = weight * to_camera.T @ np.linalg.inv(asked[1])
                 information += weighed @ to_camera
                 pull += weighed @ asked[0]
-            if not information.any():
+            if np.linalg.matrix_rank(information) < len(information):
                 return world_from_rig, covariance
             covariance = np.linalg.inv(information)
             world_from_rig = moved(world_from_rig, covariance @ pull)
@@ -410,6 +420,40 @@ def _matches(photo: RigPhoto, found: Correspondences, error_px: float) -> RigMat
     return RigMatches(
         found.photo_px, found.points_in_world, lens, photo.rig_from_camera, error_px * lens.long_side / PHOTO_PX
     )
+
+
+def _information(cameras: Sequence[RigMatches], found: RigPose, sigma_px: float) -> Float64[np.ndarray, "6 6"]:
+    """Return the information of the rig's twist by the matches that agree; `sigma_px` is at PHOTO_PX."""
+    total = np.zeros((6, 6))
+    for camera, agree in zip(cameras, found.inliers, strict=True):
+        pose = found.world_from_rig.world_from_camera @ camera.rig_from_camera.world_from_camera
+        points = transformed(np.linalg.inv(pose), camera.points_in_world[agree].astype(np.float64))
+        x, y, z = points.T
+        zero, lens = np.zeros_like(x), camera.intrinsics
+        of_point = np.stack(
+            [lens.fx / z, zero, -lens.fx * x / z**2, zero, lens.fy / z, -lens.fy * y / z**2], 1
+        ).reshape(-1, 2, 3)
+        # A camera that turns by w and moves by v sees a point X move by X x w - v.
+        turned = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+        jacobian = np.concatenate([of_point @ turned, -of_point], 2).reshape(-1, 6)
+        sigma = sigma_px * lens.long_side / PHOTO_PX
+        to_camera = _adjoint(camera.rig_from_camera.camera_from_world)
+        total += to_camera.T @ (jacobian.T @ jacobian / sigma**2) @ to_camera
+    return total
+
+
+def _agreement(
+    gap: Float64[np.ndarray, "6"],
+    to_camera: Float64[np.ndarray, "6 6"],
+    covariance: Float64[np.ndarray, "6 6"],
+    information: Float64[np.ndarray, "6 6"],
+) -> float:
+    """Return the weight, 1 to 0, of what a photo's pixels ask for, by how far that is from what the matches say."""
+    if np.linalg.matrix_rank(information) < len(information):
+        return 1.0
+    spread = covariance + to_camera @ np.linalg.inv(information) @ to_camera.T
+    # Cauchy's weight of the Mahalanobis distance in six dimensions.
+    return 1.0 / (1.0 + float(gap @ np.linalg.solve(spread, gap)) / 6)
 
 
 def _adjoint(motion: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:

@@ -199,6 +199,24 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
+class RigCamera:
+    """One camera of a rig."""
+
+    rig_from_camera: Pose
+    """In the rig's frame, which may be any."""
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True, slots=True)
+class Rig:
+    """Cameras whose poses relative to one another are known, in the order of their photos."""
+
+    cameras: tuple[RigCamera, ...]
+    metric: bool = False
+    """Whether lengths are metres; else scene units."""
+
+
+@dataclass(frozen=True, slots=True)
 class NamedCamera:
     """A camera that the scene was trained with."""
 

@@ -37,7 +37,7 @@ def test_cameras_that_fail_alone_find_the_pose_together():
     right, alone = 0, 0
     for seed in range(6):
         cameras = rig(seed, 6, 84)
-        found = estimate_rig_pose(cameras, 2000)
+        found = estimate_rig_pose(cameras, 6000)
         if found is not None:
             turned, way = pose_distance(found.world_from_rig, TRUTH)
             right += turned < 0.3 and way < 0.02
@@ -46,4 +46,4 @@ def test_cameras_that_fail_alone_find_the_pose_together():
             truth = Pose(TRUTH.world_from_camera @ camera.rig_from_camera.world_from_camera)
             alone += single is not None and pose_distance(single.pose, truth)[0] < 0.3
     assert right == 6
-    assert alone < 6  # of 24
+    assert alone < 12  # of 24; seen: 4

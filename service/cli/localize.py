@@ -54,6 +54,10 @@ def localize(
     sequence: Annotated[
         bool, typer.Option("--sequence", help="One camera's photos in their order: follow it. A video always is.")
     ] = False,
+    rig: Annotated[
+        str,
+        typer.Option("--rig", help="Photos of cameras with known relative poses are one query: JSON or a file of it."),
+    ] = "",
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="What is known of the pose, as the API takes it: JSON or a file.")] = "",
     accuracy: Annotated[
@@ -90,17 +94,19 @@ def localize(
 
     fields = _fields(
         {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every},
-        {"intrinsics": intrinsics, "prior": prior, "accuracy": accuracy, "times_s": times},
+        {"intrinsics": intrinsics, "prior": prior, "accuracy": accuracy, "times_s": times, "rig": rig},
     )
     files = [(str(photo), read_file(photo)) for photo in photos]
     # A video is a sequence by itself; photos are one only on request.
     track_camera = sequence or any(is_sequence(data) for _, data in files)
+    if rig and track_camera:
+        raise InvalidRequest("photos are a rig, or a sequence.", where="--rig")
     if not track_camera:
         _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times, "--smooth": smooth})
     elif learn_lenses:
         raise InvalidRequest("the photos of a sequence share a lens anyway.", where="--learn-lenses")
     paths = [path for given_path in scene for path in find_scenes(given_path)]
-    if track_camera:
+    if track_camera or rig:
         _require_one_scene(paths)
     # Last: faults of photos and fields are reported without waiting for it.
     loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
@@ -108,6 +114,9 @@ def localize(
     output = _Output(as_json, csv_file, tum_file, smooth)
     if track_camera:
         statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], registrations, anchors[0], output)
+    elif rig:
+        known = [(loaded[0], registrations[0], anchors[0])]
+        statuses = _localize_each([body_of(files, {})], fields, known, output, learn_lenses=False)
     else:
         bodies = [Body(data, name, {}) for name, data in files]
         known = list(zip(loaded, registrations, anchors, strict=True))

@@ -11,8 +11,17 @@ from pathlib import Path
 
 from service.errors import SceneNotReady, SplatfixError
 from service.estimators import ESTIMATORS
-from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord, SequenceSource
-from service.jobs.model import JobRecord, JobResult
+from service.jobs.engine import (
+    EngineAnswer,
+    HeldScenes,
+    LocalizeTask,
+    NextFrame,
+    OnAnswer,
+    OnRecord,
+    RigSource,
+    SequenceSource,
+)
+from service.jobs.model import JobRecord, JobResult, SequenceFrame
 from service.jobs.trajectory import Trajectory
 from service.live.live_tracker import LiveTracker
 from service.live.live_values import LiveTask
@@ -22,6 +31,7 @@ from service.multi_scene import SceneEstimate, localize_in_scenes
 from service.photos.sequence import read_sequence
 from service.registration.registration import Registration
 from service.results import PoseEstimate
+from service.rig import localize_rig
 from service.scene_manager import scene_images
 from service.scene_manager.entry import Entry
 from service.scene_manager.manager import Acquired, Scenes
@@ -224,7 +234,8 @@ def run_task(
 ) -> tuple[JobResult, LoadedScene]:
     """Localize on this thread, in one scene or in the one of several that the photo shows; return that scene, too.
 
-    A sequence is localized in the first scene. `registrations` are the scenes', which the result's pose is placed by.
+    A sequence, or a rig, is localized in the first scene. `registrations` are the scenes', which the result's pose is
+    placed by.
     """
     options = ESTIMATORS.load(task.estimator).Options(**task.options)
     request = Request(
@@ -233,6 +244,9 @@ def run_task(
     if isinstance(task.source, SequenceSource):
         sequence = _run_sequence(task.source, request, scenes[0], on_record)
         return _registered(sequence, scenes, scenes[0], registrations), scenes[0]
+    if isinstance(task.source, RigSource):
+        rig = _run_rig(task, task.source, request, scenes[0], on_record)
+        return _registered(rig, scenes, scenes[0], registrations), scenes[0]
     step = (lambda record: on_record(JobRecord(record), None)) if on_record else None
     if len(scenes) > 1:
         found = localize_in_scenes(task.source, scenes, request, step)
@@ -268,6 +282,32 @@ def _run_sequence(
                 on_record(record, shown)
     result = trajectory.result(loaded.scene.info.geo_anchor)
     return replace(result, estimate=with_last_record_only(result.estimate))
+
+
+def _run_rig(
+    task: LocalizeTask, source: RigSource, request: Request, loaded: LoadedScene, on_record: OnRecord | None
+) -> JobResult:
+    step = (lambda record: on_record(JobRecord(record), None)) if on_record else None
+    found = localize_rig(source.photos, loaded, request, step, metric=source.metric)
+    verdict = found.estimate.verdict
+    frames = tuple(
+        SequenceFrame(
+            index=index,
+            name=photo.name,
+            time_s=0.0,
+            status=verdict.status,
+            reason=verdict.reason,
+            score=verdict.score,
+            tracked=False,
+            pose=pose,
+            covariance=own.covariance,
+            right_place=verdict.right_place,
+            precise=verdict.precise,
+        )
+        for index, (photo, (pose, own)) in enumerate(zip(source.photos, found.photos, strict=True))
+    )
+    estimate = with_last_record_only(found.estimate)
+    return JobResult(estimate, task.decode, loaded.scene.info.geo_anchor, versions(), frames)
 
 
 def with_last_record_only(estimate: PoseEstimate) -> PoseEstimate:

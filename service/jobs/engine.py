@@ -18,6 +18,7 @@ from service.jobs.model import JobRecord, JobResult
 from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.photos.sequence import SequenceOptions
 from service.results import StageTiming
+from service.rig import RigPhoto
 from service.scene_manager.status import (
     CoverageStatus,
     PictureSpec,
@@ -55,8 +56,16 @@ class SequenceSource:
 
 
 @dataclass(frozen=True, slots=True)
+class RigSource:
+    """The photos of a rig, which are one query."""
+
+    photos: tuple[RigPhoto, ...]
+    metric: bool
+
+
+@dataclass(frozen=True, slots=True)
 class LocalizeTask:
-    """One attempt to localize a photo or a sequence."""
+    """One attempt to localize a photo, a sequence or a rig."""
 
     id: str
     """Names the attempt to `cancel`."""
@@ -67,7 +76,7 @@ class LocalizeTask:
     """For the estimator's `Options`."""
     seed: int
     budget_s: float | None
-    source: Query | SequenceSource
+    source: Query | SequenceSource | RigSource
     decode: StageTiming
     """What reading the photo took: a part of the result."""
     accuracy: Accuracy = DEFAULT_ACCURACY

@@ -15,7 +15,7 @@ from service.lenses.lens_memory import RecalledLens
 from service.registration.registration import Registration
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status
 from service.scene_manager.status import AUTO
-from service.types import GeoAnchor, Intrinsics, Pose, PriorRegion
+from service.types import GeoAnchor, Intrinsics, Pose, PriorRegion, Rig
 
 JobState = Literal["queued", "running", "succeeded", "failed", "cancelled", "interrupted"]
 ENDED: tuple[JobState, ...] = ("succeeded", "failed", "cancelled", "interrupted")
@@ -56,6 +56,8 @@ class JobSpec:
     """Of a sequence: use each Nth photo."""
     times_s: tuple[float, ...] | None = None
     """When each photo of a sequence was taken, ascending."""
+    rig: Rig | None = None
+    """Of several photos that are one query; None: they are a sequence."""
     seed: int = 0
     budget_s: float | None = None
     """Wall time after which the best pose so far is the answer."""
@@ -86,7 +88,7 @@ class PhotoInfo:
 
 @dataclass(frozen=True, slots=True)
 class SequenceFrame:
-    """Where one photo of a sequence was taken."""
+    """Where one photo of a sequence, or of a rig, was taken."""
 
     index: int
     """Among those that were looked at, from 0."""
@@ -127,7 +129,8 @@ class JobResult:
     versions: Mapping[str, str]
     """Of the packages that the result depends on."""
     frames: tuple[SequenceFrame, ...] | None = None
-    """Of a sequence: each photo's answer; the estimate is the last that was localized."""
+    """Of a sequence: each photo's answer; the estimate is the last that was localized. Of a rig likewise; the estimate
+    is of the first photo."""
     registration: Registration | None = None
     """Of the scene, without residuals: the revision in force when the attempt began."""
 

@@ -9,13 +9,23 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from service.errors import InvalidPrior, InvalidRequest
-from service.jobs.engine import LocalizeTask, SequenceSource
+from service.jobs.engine import LocalizeTask, RigSource, SequenceSource
 from service.jobs.model import JobSpec
 from service.lenses.lens_memory import RecalledLens
 from service.photos.camera_identity import CameraIdentity
 from service.photos.images import open_photo
-from service.photos.sequence import SequenceOptions, check_sequence, is_sequence, read_sequence
+from service.photos.sequence import (
+    SequenceOptions,
+    at_photo,
+    check_sequence,
+    is_packed,
+    is_sequence,
+    read_sequence,
+    unpacked,
+)
+from service.photos.video import is_video
 from service.results import StageTiming
+from service.rig import RigPhoto
 from service.types import Query
 
 MAX_FRAMES = 1000
@@ -29,8 +39,8 @@ class DecodedPhoto:
     """The photo; of a sequence the first."""
     decode: StageTiming
     """What decoding took."""
-    source: Query | SequenceSource
-    """What is localized: the query, or the whole sequence as it was sent."""
+    source: Query | SequenceSource | RigSource
+    """What is localized: the query, the whole sequence as it was sent, or the photos of a rig."""
     camera: CameraIdentity
     """By the header of the photo, of a sequence the first one's."""
     recalled: RecalledLens | None
@@ -69,7 +79,7 @@ def read_photo(
     """
     wall, cpu = time.perf_counter(), time.thread_time()
     known = spec.lens and spec.lens.recalled
-    read = _read_sequence if is_sequence(data) else _read_single
+    read = _read_rig if spec.rig else _read_sequence if is_sequence(data) else _read_single
     found = read(data, spec, background_rgb, max_frames, recall or (lambda _: known))
     return replace(found, decode=StageTiming("decode", time.perf_counter() - wall, time.thread_time() - cpu))
 
@@ -95,6 +105,30 @@ def _read_single(
     )
     query = replace(query, region=spec.region)
     return DecodedPhoto(query, _UNTIMED, query, opened.camera, recalled)
+
+
+def _read_rig(
+    data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], _: int, recall: Recall
+) -> DecodedPhoto:
+    assert spec.rig is not None
+    files = unpacked(data) if is_packed(data) else [("", data)]
+    if len(files) != len(spec.rig.cameras) or is_video(data):
+        raise InvalidRequest(
+            f"has {len(spec.rig.cameras)} cameras; {len(files)} photos were sent.",
+            where="rig.cameras",
+            hint="Send a photo for each camera, in their order.",
+        )
+    if spec.names_several_scenes:
+        raise InvalidRequest("a rig is looked for in one scene.", where="scene", hint="Name one scene.")
+    photos, first = [], None
+    for index, ((name, photo), camera) in enumerate(zip(files, spec.rig.cameras, strict=True)):
+        with at_photo(index):
+            opened = open_photo(photo)
+            first = first or opened.camera
+            query = opened.query(intrinsics=camera.intrinsics, background_rgb=background_rgb)
+        photos.append(RigPhoto(query, camera.rig_from_camera, name))
+    assert first is not None
+    return DecodedPhoto(photos[0].query, _UNTIMED, RigSource(tuple(photos), spec.rig.metric), first, None)
 
 
 def _read_sequence(

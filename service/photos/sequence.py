@@ -72,6 +72,12 @@ def packed(files: Sequence[tuple[str, bytes]]) -> bytes:
     return file.getvalue()
 
 
+def unpacked(data: bytes) -> list[tuple[str, bytes]]:
+    """Return the (name, photo) pairs that `packed` put together."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        return [(entry.filename.partition("/")[2], archive.read(entry)) for entry in archive.infolist()]
+
+
 def check_sequence(data: bytes, options: SequenceOptions) -> None:
     """Check count, times and sizes by the files' headers alone. Raises InvalidImage, InvalidRequest."""
     if is_video(data):
@@ -87,7 +93,7 @@ def check_sequence(data: bytes, options: SequenceOptions) -> None:
         sizes: list[tuple[int, int]] = []
         # Photos that are skipped may be broken: they are never decoded.
         for index in range(0, len(entries), options.every):
-            with _at_photo(index):
+            with at_photo(index):
                 sizes.append(photo_size(archive.read(entries[index])))
                 _check_size(sizes[-1], sizes[0])
 
@@ -101,7 +107,7 @@ def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePh
     first: tuple[int, int] | None = None
     for count, (index, name, time_s, source) in enumerate(_sources(data, options), 1):
         _check_count(count, options)
-        with _at_photo(index):
+        with at_photo(index):
             # The prior is of the first pose; later ones start from the pose before.
             prior = options.prior if first is None else None
             if isinstance(source, bytes):
@@ -152,7 +158,7 @@ def _check_size(size: tuple[int, int], first: tuple[int, int]) -> None:
 
 
 @contextmanager
-def _at_photo(index: int) -> Iterator[None]:
+def at_photo(index: int) -> Iterator[None]:
     """Name the photo in an InvalidImage that is raised inside."""
     try:
         yield

@@ -29,8 +29,8 @@ def _form_schema() -> dict[str, Any]:
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
     # The definitions are among the document's components already.
     schema.pop("$defs", None)
-    schema["description"] = "`options`, `intrinsics`, `prior`, `accuracy`, `truth` and `times_s` are JSON text."
-    for name in ("options", "intrinsics", "prior", "accuracy", "truth", "times_s"):
+    schema["description"] = "`options`, `intrinsics`, `prior`, `accuracy`, `truth`, `times_s` and `rig` are JSON text."
+    for name in ("options", "intrinsics", "prior", "accuracy", "truth", "times_s", "rig"):
         described = LocalizeFields.model_fields[name].description or "See the JSON body."
         schema["properties"][name] = {
             "type": "string",
@@ -41,8 +41,8 @@ def _form_schema() -> dict[str, Any]:
         "type": "array",
         "items": {"type": "string", "format": "binary"},
         "minItems": 1,
-        "description": "A photo (JPEG, PNG, WebP, HEIC); several of one camera, in the order in which they were taken; "
-        "or a video (MP4, MOV, WebM, Matroska, AVI).",
+        "description": "A photo (JPEG, PNG, WebP, HEIC); several of one camera, in the order in which they were taken, "
+        "or of the cameras of a `rig`; or a video (MP4, MOV, WebM, Matroska, AVI).",
     }
     return schema
 
@@ -107,7 +107,7 @@ async def localize_photo(
     """Localize a photo: check the request, queue a job, and return it.
 
     Several photos of one camera, or a video, are one job: the camera is tracked from each frame to the next, an event
-    `record` has each frame's answer, and `frames` of the result has all of them.
+    `record` has each frame's answer, and `frames` of the result has all of them. With `rig` the photos are one query.
     """
     body = await read_body(request, app_state.settings.max_frames)
     job = await create_job(request, app_state, visible, body, read_fields(body.fields), idempotency_key)
@@ -143,7 +143,7 @@ async def create_job(
         sha256 = hashlib.sha256(body.photo).hexdigest()
         # Of the validated fields: the same request as form and as JSON is the same job. Requests of before there were
         # these fields keep their digest.
-        absent = {name for name in ("camera_id", "accuracy") if getattr(fields, name) is None}
+        absent = {name for name in ("camera_id", "accuracy", "rig") if getattr(fields, name) is None}
         digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
         spec = replace(spec, scene=visible.asked(spec.scene, app_state.engine.scenes()))

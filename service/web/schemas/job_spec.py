@@ -23,10 +23,10 @@ from service.jobs.model import JobSpec
 from service.loaded_scene import DEFAULT_ESTIMATOR
 from service.photos.intrinsics import intrinsics_from
 from service.pose.absolute_pose.prior_region import inside_prior
-from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion
+from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion, Rig, RigCamera
 from service.web.problems import field_and_message
 from service.web.schemas.conversion import OPENCV_FROM_OPENGL
-from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields, PoseIn, PriorIn
+from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields, PoseIn, PriorIn, RigIn
 
 
 def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
@@ -49,6 +49,7 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
     prior, region = (None, None) if fields.prior is None else prior_from(fields.prior)
     if prior is None and needs_prior(estimator):
         raise InvalidPrior(f"'{estimator}' needs an approximate pose of the photo, and there is none.", where="prior")
+    rig = None if fields.rig is None else _rig(fields.rig, fields)
     return JobSpec(
         estimator=estimator,
         scene=tuple(fields.scene) if isinstance(fields.scene, list) else fields.scene,
@@ -60,12 +61,37 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
         truth=None if fields.truth is None else pose_from(fields.truth, "truth"),
         every=fields.every,
         times_s=None if fields.times_s is None else tuple(fields.times_s),
+        rig=rig,
         seed=fields.seed,
         budget_s=fields.budget_s,
         deadline_s=fields.deadline_s,
         keep_photo=fields.keep_photo,
         accuracy=DEFAULT_ACCURACY if fields.accuracy is None else Accuracy(**fields.accuracy.model_dump()),
     )
+
+
+def _rig(rig: RigIn, fields: LocalizeFields) -> Rig:
+    """Validate a rig, and that nothing of one camera is given beside it. Raises InvalidRequest, InvalidIntrinsics."""
+    for name in ("intrinsics", "camera_id", "prior", "times_s"):
+        if getattr(fields, name) is not None:
+            raise InvalidRequest("not together with `rig`, whose cameras have their own.", where=name)
+    if fields.every != 1:
+        raise InvalidRequest("is of a sequence, not of a rig.", where="every")
+    axes = OPENCV_FROM_OPENGL if rig.convention == "opengl" else np.eye(4)
+    cameras = []
+    for index, camera in enumerate(rig.cameras):
+        where = f"rig.cameras.{index}"
+        try:
+            pose = Pose(np.array(camera.rig_from_camera, np.float64) @ axes)
+        except InvalidPrior as error:
+            raise InvalidRequest(error.message, where=f"{where}.rig_from_camera") from None
+        try:
+            intrinsics = intrinsics_from(camera.intrinsics)
+        except InvalidIntrinsics as error:
+            error.where = f"{where}.intrinsics.{error.where}"
+            raise
+        cameras.append(RigCamera(pose, dataclasses.replace(intrinsics, trust="exact")))
+    return Rig(tuple(cameras), rig.metric)
 
 
 def accuracy_from(value: Any) -> Accuracy:

@@ -82,6 +82,26 @@ class RenderIn(Model):
     """Quality of a JPEG."""
 
 
+class RigCameraIn(Model):
+    """One camera of a rig."""
+
+    rig_from_camera: Matrix4
+    """4x4, row-major: the camera's pose in the rig's frame, which may be any."""
+    intrinsics: dict[str, Any]
+    """As those of a request; always taken for exact."""
+
+
+class RigIn(Model):
+    """Cameras whose poses relative to one another are known: their photos are one query."""
+
+    cameras: Annotated[list[RigCameraIn], Len(2, 8)]
+    """In the order of the photos."""
+    convention: Literal["opencv", "opengl"] = "opencv"
+    """Camera axes of `rig_from_camera`."""
+    metric: bool = False
+    """Lengths are metres, for scenes whose manifest has `metres_per_unit`; default: scene units."""
+
+
 class LocalizeFields(Model):
     """The fields of a request beside the photo."""
 
@@ -110,6 +130,9 @@ class LocalizeFields(Model):
     """Of a video, or several photos: use every Nth frame, beginning with the first."""
     times_s: list[float] | None = Field(default=None, min_length=2)
     """Time of each of several photos in seconds, ascending. A video has its own times."""
+    rig: RigIn | None = None
+    """Several photos are one query instead of a sequence: of cameras whose poses relative to one another are known. The
+    result is of the first photo; `frames` has all."""
     seed: int = Field(default=0, ge=0, lt=2**63)
     """Seed of the estimator's random numbers."""
     budget_s: float | None = Field(default=None, gt=0, le=3600, allow_inf_nan=False)
@@ -127,6 +150,7 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
     "accuracy": InvalidAccuracy,
     "truth": InvalidPrior,
     "times_s": InvalidRequest,
+    "rig": InvalidRequest,
 }
 """Fields that are JSON text in a form, and the error that an invalid one raises; other fields raise InvalidRequest."""
 
@@ -134,8 +158,8 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
 class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same fields.
 
-    In a form, `options`, `intrinsics`, `prior`, `accuracy`, `truth` and `times_s` are JSON text, and `photo` is a file,
-    or several of one camera, in the order in which they were taken.
+    In a form, `options`, `intrinsics`, `prior`, `accuracy`, `truth`, `times_s` and `rig` are JSON text, and `photo` is
+    a file, or several of one camera, in the order in which they were taken, or of a rig.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
