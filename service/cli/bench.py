@@ -15,6 +15,7 @@ from service.cli.bench_live import bench_live
 from service.cli.bench_localize import bench_localize
 from service.cli.bench_paper import bench_paper
 from service.cli.bench_render import bench_render
+from service.cli.bench_rigs import bench_rigs
 from service.cli.bench_scale import bench_scale
 from service.cli.bench_track import bench_track
 
@@ -22,6 +23,7 @@ bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed."
 bench_app.command("localize")(bench_localize)
 bench_app.command("track")(bench_track)
 bench_app.command("live")(bench_live)
+bench_app.command("rigs")(bench_rigs)
 bench_app.command("paper")(bench_paper)
 bench_app.command("gate")(bench_gate)
 bench_app.command("render")(bench_render)

@@ -1,0 +1,51 @@
+"""`splatfix bench rigs`: photos that fail alone, as rigs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from service.cli.terminal import (
+    JsonFileOption,
+    counter,
+    print_machine,
+    progress_bar,
+    say,
+    settings_of,
+    short,
+    write_json,
+)
+
+
+def bench_rigs(
+    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    occluders: Annotated[Path, typer.Option(help="Another one, whose photos hide parts.")],
+    rigs: Annotated[int, typer.Option(min=1, help="Queries.")] = 30,
+    photos: Annotated[int, typer.Option(min=2, max=8, help="Of a query.")] = 4,
+    variants: Annotated[int, typer.Option(min=1, help="How often each photo is modified in each way.")] = 2,
+    modify: Annotated[list[str] | None, typer.Option(help="NAME=VALUE; may be repeated.")] = None,
+    seed: int = 0,
+    json_file: JsonFileOption = None,
+) -> None:
+    """Localize photos that fail alone together, with their true relative poses, and with wrong ones."""
+    from service.bench.rigs import MODIFICATIONS, run
+
+    print_machine()
+    with progress_bar() as progress:
+        outcome = run(
+            folder,
+            occluders,
+            rigs=rigs,
+            photos=photos,
+            variants=variants,
+            modify=tuple(modify or MODIFICATIONS),
+            seed=seed,
+            cache_dir=settings_of({}).cache_dir,
+            progress=counter(progress, "rigs"),
+        )
+    write_json(json_file, outcome)
+    for name, value in outcome.items():
+        if name != "per_query":
+            say(f"{name:36} {short(value)}")
