@@ -24,7 +24,7 @@ from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
+from service.pose.absolute_pose.rig_pose import RigMatches, RigPose, estimate_rig_pose
 from service.pose.features.image_sizes import PHOTO_PX, RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer

@@ -29,7 +29,7 @@ FLOORS = {
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
         {"localize", "loaded_scene"},
-        {"tracking", "smoothing", "multi_scene", "coverage"},
+        {"tracking", "smoothing", "multi_scene", "coverage", "rig"},
         {"scene_manager", "live"},
         {"jobs"},
         {"web", "bench"},
