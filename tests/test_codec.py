@@ -82,6 +82,18 @@ STORED_SPEC = {
         **{"truth": None, "every": 2, "times_s": [0.5, 1.0], "seed": 7, "budget_s": 0.1, "deadline_s": None},
         "keep_photo": True,
         "accuracy": {"deg": 2.0, "units": 0.5, "metres": None, "share": None},
+        "rig": {
+            "cameras": [
+                {
+                    "rig_from_camera": {"world_from_camera": IDENTITY},
+                    "intrinsics": {
+                        **{"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 2.0, "cy": 1.5, "model": "PINHOLE"},
+                        **{"distortion": [], "trust": "exact"},
+                    },
+                }
+            ],
+            "metric": True,
+        },
     },
 }
 
@@ -109,6 +121,8 @@ def test_a_stored_spec_is_read():
     assert spec.lens
     assert spec.lens.recalled
     assert spec.lens.recalled.prior == LensPrior(0.01, 0.004, 0.006)
+    assert spec.rig
+    assert spec.rig.cameras[0].intrinsics.fx == 5.0
     assert json.loads(encode(spec)) == STORED_SPEC
 
 

@@ -111,6 +111,11 @@ def _read_rig(
     data: bytes, spec: JobSpec, background_rgb: tuple[float, float, float], _: int, recall: Recall
 ) -> DecodedPhoto:
     assert spec.rig is not None
+    defaults = {field.name: field.default for field in fields(JobSpec)}
+    for name in ("intrinsics", "camera_id", "prior", "region", *_OF_SEQUENCES):
+        if getattr(spec, name) != defaults[name]:
+            field = "prior" if name == "region" else name
+            raise InvalidRequest("not together with `rig`, whose photos are one query.", where=field)
     files = unpacked(data) if is_packed(data) else [("", data)]
     if len(files) != len(spec.rig.cameras) or is_video(data):
         raise InvalidRequest(

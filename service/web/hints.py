@@ -20,6 +20,15 @@ EXAMPLES: Mapping[str, Any] = {
     "truth": {"position": [0, 0, 1.5], "quaternion_wxyz": [1, 0, 0, 0]},
     "every": 3,
     "times_s": [0, 0.2, 0.4],
+    "rig": {
+        "cameras": [
+            {
+                "rig_from_camera": [[1, 0, 0, x], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
+                "intrinsics": {"width": 640, "height": 480, "fx": 500, "fy": 500, "cx": 320, "cy": 240},
+            }
+            for x in (0, 0.1)
+        ]
+    },
     "seed": 7,
     "budget_s": 10,
     "deadline_s": 60,
@@ -40,6 +49,8 @@ _ALLOWED: Mapping[str, str] = {
     "truth": f"A JSON object: {_POSE}.",
     "every": "A whole number from 1 on; for a sequence only.",
     "times_s": "A JSON list of seconds, ascending, one for each photo of a sequence.",
+    "rig": "A JSON object: cameras, one for each photo in its order, each with rig_from_camera (4x4) and intrinsics; "
+    "optionally convention (opencv or opengl) and metric.",
     "seed": "A whole number from 0 to 9223372036854775807.",
     "budget_s": "Seconds, greater than 0 and at most 3600.",
     "deadline_s": "Seconds, greater than 0 and at most 86400.",

@@ -49,7 +49,7 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
     prior, region = (None, None) if fields.prior is None else prior_from(fields.prior)
     if prior is None and needs_prior(estimator):
         raise InvalidPrior(f"'{estimator}' needs an approximate pose of the photo, and there is none.", where="prior")
-    rig = None if fields.rig is None else _rig(fields.rig, fields)
+    rig = None if fields.rig is None else _rig(fields.rig)
     return JobSpec(
         estimator=estimator,
         scene=tuple(fields.scene) if isinstance(fields.scene, list) else fields.scene,
@@ -70,13 +70,8 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
     )
 
 
-def _rig(rig: RigIn, fields: LocalizeFields) -> Rig:
-    """Validate a rig, and that nothing of one camera is given beside it. Raises InvalidRequest, InvalidIntrinsics."""
-    for name in ("intrinsics", "camera_id", "prior", "times_s"):
-        if getattr(fields, name) is not None:
-            raise InvalidRequest("not together with `rig`, whose cameras have their own.", where=name)
-    if fields.every != 1:
-        raise InvalidRequest("is of a sequence, not of a rig.", where="every")
+def _rig(rig: RigIn) -> Rig:
+    """Validate a rig. Raises InvalidRequest, InvalidIntrinsics."""
     axes = OPENCV_FROM_OPENGL if rig.convention == "opengl" else np.eye(4)
     cameras = []
     for index, camera in enumerate(rig.cameras):
