@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 import io
 import json
-import multiprocessing
 import os
 import re
 import socket
+import tempfile
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -24,7 +24,7 @@ import pytest
 import uvicorn
 from fastapi import FastAPI
 from PIL import Image
-from stand_ins import make_scene, packed, set_up_engine
+from stand_ins import FileEvent, make_scene, packed, set_up_engine
 from subprocess_engine import SubprocessEngine
 
 import service.estimators
@@ -47,7 +47,7 @@ NOT_IN_A_SUBPROCESS = {
     "test_errors.py": "brings parts of the service into states by changing them in the test's process",
 }
 """Tests of the API, or files of them, that reach around HTTP into the engine, and how."""
-GO_ON = multiprocessing.get_context("spawn").Event()
+GO_ON = FileEvent(Path(tempfile.mkdtemp(prefix="splatfix-go-on-")) / "set")
 """Held jobs wait for it, in whatever process they run."""
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import time
 from collections.abc import Mapping
-from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,27 @@ PHOTO = Intrinsics(96, 64, 80.0, 80.0, 48.0, 32.0)
 HALF = 0.5**0.5
 TURNED = np.array([[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 2.0], [0.0, 0.0, 1.0, 3.0], [0.0, 0.0, 0.0, 1.0]])
 """A camera at (1, 2, 3), turned by 90 degrees about z."""
+
+
+class FileEvent:
+    """An event that is set as long as a file is there: for processes that share nothing else."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def set(self) -> None:
+        self._path.touch()
+
+    def clear(self) -> None:
+        self._path.unlink(missing_ok=True)
+
+    def wait(self, seconds: float) -> bool:
+        deadline = time.monotonic() + seconds
+        while not self._path.exists():
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.002)
+        return True
 
 
 class FlatRasterizer(Rasterizer):
@@ -74,7 +95,7 @@ def packed(loaded: LoadedScene) -> Packed:
     return loaded.scene, loaded.rasterizer if isinstance(loaded.rasterizer, FlatRasterizer) else None, loaded.matcher
 
 
-def set_up_engine(scenes: Mapping[str, Packed], go_on: Event, engine: EmbeddedEngine) -> None:
+def set_up_engine(scenes: Mapping[str, Packed], go_on: FileEvent, engine: EmbeddedEngine) -> None:
     """Give an engine the tests' scenes, and the process the estimators of tests/fake_estimators."""
     folder = str(Path(__file__).with_name("fake_estimators"))
     if folder not in service.estimators.__path__:

@@ -11,8 +11,10 @@ What can't, because it doesn't speak HTTP only, is listed in `api_server.NOT_IN_
 
 from __future__ import annotations
 
+import os
 import pickle
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -76,6 +78,16 @@ KINDS: dict[str, Callable[[EngineConfig], Engine]] = {
 }
 
 
+def ray_engine(config: EngineConfig, set_up, replicas: int = 2) -> Engine:
+    """The engine on a Ray cluster of two processes on this machine; skips where Ray isn't installed."""
+    pytest.importorskip("ray", reason="Ray isn't installed: pip install 'splatfix[ray]'")
+    from service.jobs.ray_engine import RayConfig, RayEngine
+
+    # Its processes import the stand-ins of these tests.
+    os.environ["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
+    return RayEngine(config, RayConfig(replicas=replicas), set_up)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Files of scenes, one of them torn."""
@@ -86,12 +98,15 @@ def folder(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=[*KINDS, pytest.param("ray", marks=pytest.mark.ci)])
 def engine(request, plugins, folder) -> Iterator[Engine]:
     """With `room` in memory, `attic` required, and files that are loaded when they are asked for."""
     config = EngineConfig("stepping", matcher="sift", rasterizer="cpu")
-    if request.param == "subprocess":
-        made: Engine = SubprocessEngine(config, partial(set_up_engine, {"room": packed(make_scene())}, GO_ON))
+    set_up = partial(set_up_engine, {"room": packed(make_scene())}, GO_ON)
+    if request.param == "ray":
+        made: Engine = ray_engine(config, set_up)
+    elif request.param == "subprocess":
+        made = SubprocessEngine(config, set_up)
     else:
         made = KINDS[request.param](config)
         assert isinstance(made, EmbeddedEngine)

@@ -184,11 +184,7 @@ class EmbeddedEngine:
         finally:
             # Also after an error: a later attempt has another id, so the entry would stay for ever.
             del self._cancels[task.id]
-        if left_out := held.acquired.left_out:
-            told = f"not searched, for they are not in memory: {', '.join(left_out)}"
-            estimate = result.estimate
-            result = replace(result, estimate=replace(estimate, warnings=(*estimate.warnings, told)))
-        return EngineAnswer(result, self._manager.id_of(loaded))
+        return EngineAnswer(with_left_out(result, held.acquired.left_out), self._manager.id_of(loaded))
 
     def _status(self, entry: Entry) -> SceneStatus:
         status = entry.status()
@@ -308,6 +304,15 @@ def _run_rig(
     )
     estimate = with_last_record_only(found.estimate)
     return JobResult(estimate, task.decode, loaded.scene.info.geo_anchor, versions(), frames)
+
+
+def with_left_out(result: JobResult, left_out: Sequence[str]) -> JobResult:
+    """Return the result with a warning that names the scenes that were not searched, if there are any."""
+    if not left_out:
+        return result
+    told = f"not searched, for they are not in memory: {', '.join(left_out)}"
+    estimate = result.estimate
+    return replace(result, estimate=replace(estimate, warnings=(*estimate.warnings, told)))
 
 
 def with_last_record_only(estimate: PoseEstimate) -> PoseEstimate:

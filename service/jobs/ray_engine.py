@@ -1,0 +1,303 @@
+"""The engine whose scenes are in other processes, on this or other machines, by Ray. The only file with ray.
+
+Actors, not Ray Serve: an attempt, its cancel, a live session's frames and the scenes that are held for it must reach
+one certain replica, which Serve's handles choose themselves; where scenes go is decided by `placement`. One actor of
+all fronts, the coordinator, has the table and starts the replicas; records come from the replicas directly.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import secrets
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import ray  # pyright: ignore[reportMissingImports]
+from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
+
+from service import __version__
+from service.errors import SceneNotReady, SplatfixError
+from service.jobs.embedded_engine import EngineConfig, with_left_out
+from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
+from service.jobs.placement import PlacementConfig
+from service.jobs.replica import Replica, SetUp
+from service.jobs.scene_coordinator import HeldAt, SceneCoordinator
+from service.live.live_values import LiveTask
+from service.scene_formats.size_estimate import estimated_bytes
+from service.scene_manager.status import (
+    CoverageStatus,
+    PictureSpec,
+    SceneContents,
+    SceneReadiness,
+    SceneStatus,
+    StoredScene,
+)
+from service.types import SceneInfo
+
+_log = logging.getLogger(__name__)
+
+_HEARTBEAT_S = 5.0
+_AT_ONCE = 1000
+"""Calls that a coordinator or a replica may have under way: most of them wait."""
+
+
+@dataclass(frozen=True, slots=True)
+class RayConfig:
+    address: str | None = None
+    """Of a Ray cluster, e.g. `auto`; None: one of this process, that ends with it."""
+    replicas: int = 2
+    """Processes that have scenes and run jobs."""
+    cpus: float = 1.0
+    """Of each replica."""
+    gpus: float = 0.0
+    """Of each replica: a share of a GPU, or several."""
+
+
+class RayEngine:
+    """Implements `Engine`. `config.memory_bytes` is the budget of each replica."""
+
+    def __init__(self, config: EngineConfig, ray_config: RayConfig, set_up: SetUp | None = None) -> None:
+        self._config, self._ray, self._set_up = config, ray_config, set_up
+        self._front = secrets.token_hex(8)
+        self._scenes: dict[str, tuple[StoredScene, bool]] = {}
+        self._held: dict[str, HeldAt] = {}
+        self._running: dict[str, Any] = {}
+        """The replica of each attempt."""
+        self._coordinator: Any = None
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+
+    # ------------------------------------------------------------------ the cluster
+
+    def start(self) -> None:
+        if not ray.is_initialized():
+            if not self._ray.address and "RAY_AUTH_TOKEN_PATH" not in os.environ:
+                # Ray's own would be a file in the home folder.
+                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+            local = {
+                "address": "local",
+                "num_cpus": max(1, round(self._ray.replicas * self._ray.cpus)),
+                # Whoever reaches Ray's ports can run code: only this machine does.
+                "_node_ip_address": "127.0.0.1",
+                "include_dashboard": False,
+                "object_store_memory": 500_000_000,
+            }
+            where = {"address": self._ray.address} if self._ray.address else local
+            ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
+        self._connect()
+        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
+
+    def _connect(self) -> None:
+        """Find the coordinator or start it, with its replicas, and tell it of all scenes."""
+        replica = ray.remote(Replica).options(
+            num_cpus=self._ray.cpus, num_gpus=self._ray.gpus, max_concurrency=_AT_ONCE
+        )
+        spawn = partial(replica.remote, replace(self._config, memory_bytes=None), self._set_up)
+        placed = PlacementConfig(budget_bytes=self._config.memory_bytes)
+        # By version: fronts of two releases may run beside each other, each with its own code in the replicas.
+        named = ray.remote(SceneCoordinator).options(
+            name=f"scenes-{__version__}",
+            get_if_exists=True,
+            lifetime="detached" if self._ray.address else None,
+            num_cpus=0,
+            max_concurrency=_AT_ONCE,
+        )
+        self._coordinator = named.remote(spawn, (RayActorError,), placed, _expected_bytes)
+        for scene, required in self._scenes.values():
+            self._call("add", scene, required)
+        self._call("start", self._ray.replicas)
+
+    def close(self) -> None:
+        self._closed.set()
+        for token in tuple(self._held):
+            with suppress(Exception):
+                self.release(token)
+        if not self._ray.address:
+            ray.shutdown()
+
+    def _beat(self) -> None:
+        while not self._closed.wait(_HEARTBEAT_S):
+            try:
+                self._ask("heard", self._front)
+            except Exception as error:
+                _log.warning("Ray: %s", error)
+
+    # ------------------------------------------------------------------ scenes
+
+    def add(self, scene: StoredScene, *, required: bool = False) -> None:
+        self._scenes[scene.id] = scene, required
+        if self._coordinator is not None:
+            self._ask("add", scene, required)
+
+    def remove(self, scene_id: str) -> None:
+        self._ask("remove", scene_id)
+        self._scenes.pop(scene_id, None)
+
+    def scenes(self) -> list[SceneStatus]:
+        return self._ask("scenes")
+
+    def scene(self, scene_id: str | None) -> SceneStatus:
+        return self._ask("scene", scene_id)
+
+    def contents(self, scene_id: str) -> SceneContents | None:
+        return self._ask_replica(scene_id, "contents", scene_id) if self._is_there(scene_id) else None
+
+    def require(self, scene_id: str) -> SceneInfo:
+        return self._ask_replica(scene_id, "require", scene_id)
+
+    def readiness(self) -> SceneReadiness:
+        return self._ask("readiness")
+
+    def load(self, scene_id: str) -> SceneStatus:
+        return self._ask("load", scene_id)
+
+    def unload(self, scene_id: str) -> SceneStatus:
+        return self._ask("unload", scene_id)
+
+    def hold(self, asked: str | Sequence[str] | None) -> HeldScenes:
+        return self._keep(self._ask("hold", self._front, asked))
+
+    def hold_later(
+        self, asked: str | Sequence[str] | None, take: Callable[[HeldScenes | SplatfixError], object]
+    ) -> None:
+        def wait() -> None:
+            while not self._closed.is_set():
+                try:
+                    take(self._keep(self._ask("hold_later", self._front, asked)))
+                except _CoordinatorGone:
+                    continue
+                except SplatfixError as error:
+                    take(error)
+                except Exception as error:
+                    _log.exception("scenes can't be held")
+                    take(SceneNotReady(f"the scene can't be loaded: {error}", where="scene"))
+                return
+
+        threading.Thread(target=wait, name="hold", daemon=True).start()
+
+    def _keep(self, found: HeldAt) -> HeldScenes:
+        self._held[found.held.token] = found
+        return found.held
+
+    def release(self, token: str) -> None:
+        if self._held.pop(token, None):
+            self._ask("release", token)
+
+    def _is_there(self, scene_id: str) -> bool:
+        return self.scene(scene_id).memory_bytes is not None
+
+    # ------------------------------------------------------------------ work
+
+    def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
+        held = self._held.get(task.held)
+        if held is None:
+            raise SceneNotReady("the job's scenes were unloaded.", where="scene")
+        self._running[task.id] = held.replica
+        try:
+            for kind, value in self._stream(held.replica.localize, task):
+                if kind == "answer":
+                    return replace(value, result=with_left_out(value.result, held.held.left_out))
+                on_record(*value)
+            raise EngineLost
+        except BaseException:
+            self.cancel(task.id)  # it may be `on_record` that failed
+            raise
+        finally:
+            del self._running[task.id]
+
+    def cancel(self, task_id: str) -> None:
+        if replica := self._running.get(task_id):
+            with suppress(RayActorError):
+                # Waited for: the next record must not overtake it.
+                ray.get(replica.cancel.remote(task_id))
+
+    def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
+        held = self._held.get(task.held)
+        if held is None:
+            raise SceneNotReady("the session's scene was unloaded.", where="scene")
+        session = secrets.token_hex(8)
+        try:
+            for kind, value in self._stream(held.replica.live, session, task):
+                if kind == "frame?":
+                    held.replica.frame.remote(session, next_frame())
+                elif kind == "record":
+                    on_answer(value)
+        except BaseException:
+            held.replica.frame.remote(session, None)  # it may be a callback that failed: the session ends
+            raise
+
+    def render(self, scene_id: str, picture: PictureSpec) -> bytes:
+        return self._ask_replica(scene_id, "render", scene_id, picture)
+
+    def thumbnail(self, scene_id: str) -> bytes:
+        return self._ask_replica(scene_id, "thumbnail", scene_id)
+
+    def splats(self, scene_id: str, limit: int) -> bytes:
+        return self._ask_replica(scene_id, "splats", scene_id, limit)
+
+    def coverage(self, scene_id: str) -> CoverageStatus:
+        if not self._is_there(scene_id):
+            return CoverageStatus("none")
+        return self._ask_replica(scene_id, "coverage", scene_id)
+
+    def measure_coverage(self, scene_id: str) -> CoverageStatus:
+        return self._ask_replica(scene_id, "measure_coverage", scene_id)
+
+    # ------------------------------------------------------------------ calls
+
+    def _ask(self, name: str, *arguments: Any) -> Any:
+        """Call the coordinator. Raises what it raises; _CoordinatorGone after another one was started."""
+        coordinator = self._coordinator
+        try:
+            return self._call(name, *arguments)
+        except RayActorError as error:
+            with self._lock:
+                if self._coordinator is coordinator and not self._closed.is_set():
+                    _log.error("the coordinator of scenes ended: %s", error)
+                    self._connect()
+            raise _CoordinatorGone("the engine was started again.", where="scene", hint="Try again later.") from None
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        with _own_errors():
+            return ray.get(getattr(self._coordinator, name).remote(*arguments))
+
+    def _ask_replica(self, scene_id: str, name: str, *arguments: Any) -> Any:
+        """Call the engine of a replica that has a scene."""
+        replica = self._ask("where", scene_id)
+        try:
+            with _own_errors():
+                return ray.get(replica.ask.remote(name, *arguments))
+        except RayActorError:
+            raise SceneNotReady("the scene's process ended.", where="scene", hint="Try again later.") from None
+
+    def _stream(self, method: Any, *arguments: Any) -> Iterator[Any]:
+        """Yield what a method of a replica yields. Raises what it raises, and EngineLost."""
+        try:
+            for message in method.options(num_returns="streaming").remote(*arguments):
+                with _own_errors():
+                    found = ray.get(message)
+                yield found
+        except RayActorError as error:
+            raise EngineLost from error
+
+
+class _CoordinatorGone(SceneNotReady): ...
+
+
+class _own_errors:
+    """Raises errors of our own as they were raised in the actor."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, RayTaskError) and isinstance(error.cause, Exception):
+            raise error.cause from None
+
+
+def _expected_bytes(scene: StoredScene) -> int:
+    return estimated_bytes(scene.path) or 0

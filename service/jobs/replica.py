@@ -1,0 +1,176 @@
+"""One process of the Ray engine: an embedded engine that is told by `SceneCoordinator` which scenes to have.
+
+Methods are coroutines, so that cancels and frames arrive while a job runs; the work is on threads. Knows no Ray.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+import threading
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import Any
+
+from service.errors import SceneNotFound
+from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
+from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask
+from service.live.live_values import LiveFrame, LiveTask
+from service.scene_manager.status import SceneReadiness, SceneStatus, StoredScene
+
+SetUp = Callable[[EmbeddedEngine], None]
+"""Called in the replica before its engine starts; for scenes that are in no file."""
+
+
+class Replica:
+    """What its methods return and raise can be pickled."""
+
+    def __init__(self, config: EngineConfig, set_up: SetUp | None = None) -> None:
+        # The budget is the coordinator's, who says what to drop.
+        self._engine = EmbeddedEngine(config)
+        self._held: dict[str, set[str]] = {}
+        """Attempts under way, by the token of their scenes."""
+        self._frames: dict[str, SimpleQueue[LiveFrame | None]] = {}
+        if set_up:
+            set_up(self._engine)
+        self._engine.start()
+
+    async def ping(self) -> int:
+        """Return the process' number."""
+        return os.getpid()
+
+    async def built_in(self) -> list[SceneStatus]:
+        """Return the scenes that were set up here, as soon as they are prepared."""
+        while self._engine.readiness().pending:
+            await asyncio.sleep(0.02)
+        return self._engine.scenes()
+
+    async def prepared(self, scene_id: str) -> None:
+        """Return when a scene is loaded and prepared, or won't be."""
+        while self._engine.scene(scene_id).state in ("loading", "preparing"):
+            await asyncio.sleep(0.02)
+
+    async def drop(self, ids: Sequence[str]) -> None:
+        """Take scenes that nothing uses out of memory, and forget them."""
+        self._drop(ids)
+
+    def _drop(self, ids: Sequence[str]) -> None:
+        for scene_id in ids:
+            with suppress(SceneNotFound):
+                self._engine.unload(scene_id)
+                self._engine.remove(scene_id)
+
+    async def readiness(self) -> SceneReadiness:
+        """Return what scenes here are rendered with."""
+        return self._engine.readiness()
+
+    async def ask(self, name: str, *arguments: Any) -> Any:
+        """Call a method of the engine that answers once."""
+        return await self._in_thread(getattr(self._engine, name), *arguments)
+
+    # ------------------------------------------------------------------ jobs
+
+    async def hold(
+        self, drop: Sequence[str], stored: Sequence[StoredScene], ids: Sequence[str]
+    ) -> tuple[HeldScenes | Exception, list[SceneStatus]]:
+        """Drop scenes, load others, and hold those that are asked for as soon as all are in memory.
+
+        Return them, or why they can't be, and what each is then.
+        """
+        self._drop(drop)
+        known = {scene.id for scene in self._engine.scenes()}
+        for scene in stored:
+            if scene.id not in known:
+                self._engine.add(scene)
+            self._engine.load(scene.id)
+        loop, answer = asyncio.get_running_loop(), asyncio.Future()
+        asked = ids[0] if len(ids) == 1 else tuple(ids)
+        self._engine.hold_later(asked, lambda found: loop.call_soon_threadsafe(answer.set_result, found))
+        found = await answer
+        statuses = [status for status in self._engine.scenes() if status.id in ids]
+        return (_portable(found) if isinstance(found, Exception) else found), statuses
+
+    async def release(self, token: str) -> None:
+        """Let go of scenes, and end what still runs with them."""
+        for task_id in self._held.pop(token, ()):
+            self._engine.cancel(task_id)
+        self._engine.release(token)
+
+    async def cancel(self, task_id: str) -> None:
+        """End an attempt at its next record."""
+        self._engine.cancel(task_id)
+
+    async def localize(self, task: LocalizeTask) -> AsyncIterator[tuple[str, Any]]:
+        """Yield `("record", (record, shown))` for each record, then `("answer", EngineAnswer)`."""
+        self._held.setdefault(task.held, set()).add(task.id)
+
+        def work(put: Callable[[tuple[str, Any]], None]) -> EngineAnswer:
+            return self._engine.localize(task, lambda *record: put(("record", record)))
+
+        try:
+            async for message in _streamed(work):
+                yield message
+        finally:
+            self._held.get(task.held, set()).discard(task.id)
+
+    async def live(self, session: str, task: LiveTask) -> AsyncIterator[tuple[str, Any]]:
+        """Yield `("frame?", None)` where a frame is wanted, `("record", LiveAnswer)`, at last `("answer", None)`."""
+        frames = self._frames[session] = SimpleQueue()
+
+        def work(put: Callable[[tuple[str, Any]], None]) -> None:
+            def next_frame() -> LiveFrame | None:
+                put(("frame?", None))
+                return frames.get()
+
+            self._engine.live(task, next_frame, lambda answer: put(("record", answer)))
+
+        try:
+            async for message in _streamed(work):
+                yield message
+        finally:
+            frames.put(None)
+            self._frames.pop(session, None)
+
+    async def frame(self, session: str, frame: LiveFrame | None) -> None:
+        """Give a live session the frame that it wants; None ends it."""
+        if frames := self._frames.get(session):
+            frames.put(frame)
+
+    async def _in_thread(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return await asyncio.to_thread(function, *arguments)
+        except Exception as error:
+            raise _portable(error) from None
+
+
+async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) -> AsyncIterator[tuple[str, Any]]:
+    """Yield what work on a thread of its own puts, then `("answer", what it returns)`; raise what it raises."""
+    loop, messages = asyncio.get_running_loop(), asyncio.Queue()
+
+    def put(message: tuple[str, Any]) -> None:
+        loop.call_soon_threadsafe(messages.put_nowait, message)
+
+    def run() -> None:
+        try:
+            put(("answer", work(put)))
+        except Exception as error:
+            put(("error", error))
+
+    threading.Thread(target=run, name="job", daemon=True).start()
+    while True:
+        kind, value = await messages.get()
+        if kind == "error":
+            raise _portable(value)
+        yield kind, value
+        if kind == "answer":
+            return
+
+
+def _portable(error: Exception) -> Exception:
+    """Return what survives pickling: the error, or one of the same text."""
+    try:
+        return pickle.loads(pickle.dumps(error))
+    except Exception:
+        return RuntimeError(f"{type(error).__name__}: {error}")

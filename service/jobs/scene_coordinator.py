@@ -1,0 +1,459 @@
+"""Who has which scenes among replicas, and who uses them: one for all fronts of a fleet. Knows no Ray.
+
+Everything happens on one event loop, so that no lock is needed: whatever is looked at holds until the next `await`.
+Each load is one task that all who need the scene wait for; it goes on if they leave, and nothing of it is left if it
+fails.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+from service.errors import (
+    BadInput,
+    Failure,
+    SceneInUse,
+    SceneNotFound,
+    SceneNotReady,
+    SceneTooLarge,
+    SceneUnloaded,
+    SplatfixError,
+)
+from service.jobs.engine import HeldScenes
+from service.jobs.placement import Choice, Placement, PlacementConfig
+from service.scene_manager.status import AUTO, SceneReadiness, SceneStatus, StoredScene
+
+_log = logging.getLogger(__name__)
+
+_WATCH_S = 1.0
+_FRONT_S = 30.0
+"""A front that says nothing for so long is taken for dead, and what it held is let go."""
+RETRY_S = 5.0
+"""A scene that failed to load is tried again by a request after this time, doubled with each failure."""
+MAX_RETRY_S = 300.0
+
+
+@dataclass(slots=True)
+class _Scene:
+    stored: StoredScene | None
+    """None: it was set up in each replica."""
+    required: bool = False
+    awaited: bool = False
+    """Required, and neither loaded nor failed yet."""
+    wanted: bool = True
+    """May be loaded; False after it was unloaded by request."""
+    error: Exception | None = None
+    retry_at: float = 0.0
+    failures: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class HeldAt:
+    """Scenes that are held, and the replica where they are."""
+
+    held: HeldScenes
+    replica: Any
+    """Its handle."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Hold:
+    front: str
+    replica: str
+    ids: tuple[str, ...]
+
+
+class ReplicaLost(Exception):
+    """A replica ended while it was asked."""
+
+
+class SceneCoordinator:
+    """`spawn` starts a replica and returns its handle; `expected_bytes` estimates what a stored scene will take."""
+
+    def __init__(
+        self,
+        spawn: Callable[[], Any],
+        lost: tuple[type[Exception], ...],
+        config: PlacementConfig,
+        expected_bytes: Callable[[StoredScene], int],
+    ) -> None:
+        """`lost` are the errors that tell that a replica is gone."""
+        self._spawn, self._lost, self._expected_bytes = spawn, lost, expected_bytes
+        self._placement = Placement(config)
+        self._budget = config.budget_bytes
+        self._replicas: dict[str, Any] = {}
+        self._scenes: dict[str, _Scene] = {}
+        self._holds: dict[str, _Hold] = {}
+        self._fronts: dict[str, float] = {}
+        self._changed = asyncio.Event()
+        self._started = 0
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    # ------------------------------------------------------------------ replicas
+
+    async def start(self, count: int) -> None:
+        """Start replicas, up to so many, and load the scenes that are required; return when the replicas answer."""
+        if not self._tasks:
+            self._in_background(self._watch())
+        await asyncio.gather(*(self._start_replica() for _ in range(count - len(self._replicas))))
+        for scene_id, scene in self._scenes.items():
+            if scene.required and scene.awaited:
+                self._in_background(self._preload(scene_id))
+
+    async def _start_replica(self) -> None:
+        self._started += 1
+        name, handle = f"r{self._started}", self._spawn()
+        built_in = await handle.built_in.remote()
+        self._replicas[name] = handle
+        self._placement.add_replica(name)
+        for status in built_in:
+            self._scenes.setdefault(status.id, _Scene(None))
+            self._placement.loaded(name, status.id, status.memory_bytes or 0, pinned=True)
+        self._notify()
+
+    async def _watch(self) -> None:
+        """Find out which replicas and fronts are gone."""
+        while True:
+            await asyncio.sleep(_WATCH_S)
+            for name, handle in list(self._replicas.items()):
+                with suppress(ReplicaLost):
+                    await self._asked(name, handle.ping.remote())
+            late = time.monotonic() - _FRONT_S
+            for front in [front for front, heard in self._fronts.items() if heard < late]:
+                _log.warning("front %s is gone: what it held is let go", front)
+                del self._fronts[front]
+                for token in [token for token, hold in self._holds.items() if hold.front == front]:
+                    await self.release(token)
+
+    async def _asked(self, name: str, answer: Awaitable[Any]) -> Any:
+        """Wait for a replica's answer. Raises ReplicaLost, after another was started in its place."""
+        try:
+            return await answer
+        except self._lost as error:
+            self._replica_lost(name)
+            raise ReplicaLost from error
+
+    def _replica_lost(self, name: str) -> None:
+        if self._replicas.pop(name, None) is None:
+            return
+        _log.error("replica %s ended", name)
+        self._placement.remove_replica(name)
+        for token in [token for token, hold in self._holds.items() if hold.replica == name]:
+            del self._holds[token]
+        self._in_background(self._start_again())
+        self._notify()
+
+    async def _start_again(self) -> None:
+        while True:
+            try:
+                await self._start_replica()
+                return
+            except self._lost as error:
+                _log.error("a replica can't be started: %s", error)
+                await asyncio.sleep(_WATCH_S)
+
+    async def heard(self, front: str) -> dict[str, int]:
+        """Note that a front is alive; return each replica's jobs."""
+        self._fronts[front] = time.monotonic()
+        return {name: self._placement.jobs(name) for name in self._placement.replicas()}
+
+    # ------------------------------------------------------------------ the list of scenes
+
+    async def add(self, stored: StoredScene, required: bool) -> None:
+        """Make a scene known; one that is known already, from the same place, stays as it is."""
+        known = self._scenes.get(stored.id)
+        if known and known.stored == stored:
+            return
+        if known:
+            await self._drop_copies(stored.id)
+        self._placement.forget(stored.id)
+        self._placement.expect(stored.id, self._expected_bytes(stored))
+        self._scenes[stored.id] = _Scene(stored, required, awaited=required)
+
+    async def remove(self, scene_id: str) -> None:
+        """Forget a scene. Raises SceneNotFound, SceneInUse."""
+        self._known(scene_id)
+        if jobs := self._jobs(scene_id):
+            raise SceneInUse(f"{jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
+        del self._scenes[scene_id]
+        await self._drop_copies(scene_id)
+        self._notify()
+
+    async def unload(self, scene_id: str) -> SceneStatus:
+        """Drop a scene as soon as no job uses it. Raises SceneNotFound, BadInput."""
+        scene = self._known(scene_id)
+        if scene.stored is None:
+            raise BadInput("the scene has no file to reload it from.", where="scene")
+        scene.wanted = scene.awaited = False
+        await self._drop_copies(scene_id)
+        self._notify()
+        return await self.scene(scene_id)
+
+    async def load(self, scene_id: str) -> SceneStatus:
+        """Begin to load a scene. Raises SceneNotFound."""
+        scene = self._known(scene_id)
+        scene.wanted, scene.error = True, None
+        self._in_background(self._preload(scene_id))
+        await asyncio.sleep(0)
+        return await self.scene(scene_id)
+
+    async def scenes(self) -> list[SceneStatus]:
+        """Return all scenes with their states."""
+        return list(await asyncio.gather(*(self.scene(scene_id) for scene_id in list(self._scenes))))
+
+    async def scene(self, scene_id: str | None) -> SceneStatus:
+        """Return a scene; None: the only one. Raises SceneNotFound."""
+        scene = self._known(scene_id)
+        scene_id = next(name for name, other in self._scenes.items() if other is scene)
+        copies, jobs = self._placement.copies(scene_id), self._jobs(scene_id)
+        uploaded = scene.stored is not None and scene.stored.uploaded
+        ready = [name for name, copy in copies.items() if copy.ready]
+        if ready:
+            with suppress(ReplicaLost, SplatfixError):
+                status = await self._asked(ready[0], self._replicas[ready[0]].ask.remote("scene", scene_id))
+                total = sum(copy.bytes for copy in copies.values())
+                state = status.state if scene.wanted else "unloading"
+                return replace(status, state=state, jobs=jobs, uploaded=uploaded, memory_bytes=total)
+        failure = Failure.of(scene.error) if scene.error else None
+        state = "loading" if copies or scene.awaited else "failed" if scene.error else "unloaded"
+        return SceneStatus(scene_id, state, jobs, uploaded, failure)
+
+    async def readiness(self) -> SceneReadiness:
+        """Return whether the scenes that are required are in memory, and what failed."""
+        found = []
+        for name, handle in list(self._replicas.items()):
+            with suppress(ReplicaLost):
+                found.append(await self._asked(name, handle.readiness.remote()))
+        pending = tuple(f"scene {i}: loading" for i, s in self._scenes.items() if s.required and s.awaited)
+        told = [f"scene {i}: {s.error}" for i, s in self._scenes.items() if s.error]
+        usable = any(scene.wanted and scene.error is None for scene in self._scenes.values())
+        return SceneReadiness(
+            ready=usable and not pending and bool(self._placement.replicas()),
+            pending=pending,
+            failed=tuple(dict.fromkeys([*told, *(text for each in found for text in each.failed)])),
+            rasterizers=tuple(sorted({name for each in found for name in each.rasterizers})),
+            skipped_rasterizers=tuple(sorted({name for each in found for name in each.skipped_rasterizers})),
+        )
+
+    def _known(self, scene_id: str | None) -> _Scene:
+        known = ", ".join(self._scenes) or "none"
+        if scene_id is None and len(self._scenes) == 1:
+            return next(iter(self._scenes.values()))
+        if scene_id is None:
+            raise SceneNotFound(f"name a scene; known: {known}.", where="scene")
+        if scene_id not in self._scenes:
+            raise SceneNotFound(f"unknown scene '{scene_id}'; known: {known}.", where="scene")
+        return self._scenes[scene_id]
+
+    def _jobs(self, scene_id: str) -> int:
+        return sum(scene_id in hold.ids for hold in self._holds.values())
+
+    # ------------------------------------------------------------------ use
+
+    async def where(self, scene_id: str) -> Any:
+        """Return the handle of a replica with the scene. Raises SceneError, and has it loaded if it may be."""
+        self._require_usable(scene_id)
+        copies = self._placement.copies(scene_id)
+        ready = [name for name, copy in copies.items() if copy.ready]
+        if ready:
+            return self._replicas[min(ready, key=self._placement.jobs)]
+        if not copies:
+            self._in_background(self._preload(scene_id))
+        raise SceneNotReady(f"scene '{scene_id}' is loading.", where="scene", hint="Try again later.")
+
+    async def hold(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
+        """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded."""
+        ids, left_out = self._chosen(asked)
+        for scene_id in ids:
+            self._require_usable(scene_id)
+        choice = self._placement.choose(ids)
+        if choice is not None and self._all_ready(choice, ids):
+            with suppress(ReplicaLost):
+                return await self._hold_at(front, choice, ids, left_out)
+        for scene_id in ids:
+            if not self._placement.copies(scene_id):
+                self._in_background(self._preload(scene_id))
+        raise SceneNotReady(f"scene '{ids[0]}' is loading.", where="scene", hint="Try again later.")
+
+    async def hold_later(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
+        """Hold scenes as soon as all are in memory together. Raises SceneError if they won't be."""
+        while True:
+            ids, left_out = self._chosen(asked)
+            if asked != AUTO:
+                for scene_id in ids:
+                    self._require_usable(scene_id)
+            choice = self._placement.choose(ids)
+            if choice is None:  # all is in use, or a replica has to start first
+                await self._change()
+                continue
+            try:
+                return await self._hold_at(front, choice, ids, left_out)
+            except ReplicaLost:
+                continue
+            except SplatfixError:
+                if asked != AUTO:
+                    raise  # `auto` goes on without the scene that failed
+
+    async def release(self, token: str) -> None:
+        """Let go of scenes; without effect on a token that isn't known."""
+        hold = self._holds.pop(token, None)
+        if hold is None:
+            return
+        self._placement.release(hold.replica, hold.ids)
+        handle = self._replicas.get(hold.replica)
+        if handle:
+            with suppress(ReplicaLost):
+                await self._asked(hold.replica, handle.release.remote(token))
+        for scene_id in hold.ids:
+            scene = self._scenes.get(scene_id)
+            if scene is None or not scene.wanted:
+                await self._drop_copies(scene_id)
+        self._notify()
+
+    async def _hold_at(self, front: str, choice: Choice, ids: tuple[str, ...], left_out: tuple[str, ...]) -> HeldAt:
+        """Carry out a choice: drop, load, hold."""
+        # Nothing is awaited up to the call: replicas get calls in the order of the decisions.
+        self._placement.take(choice, ids)
+        stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
+        call = self._replicas[choice.replica].hold.remote(choice.drop, stored, ids)
+        task = self._in_background(self._finish_hold(front, choice.replica, ids, call))
+        try:
+            # Shielded: who leaves must not cancel a load that others wait for.
+            held = await asyncio.shield(task)
+        except asyncio.CancelledError:
+            task.add_done_callback(self._release_unwanted)
+            raise
+        return HeldAt(replace(held, left_out=left_out), self._replicas[choice.replica])
+
+    async def _finish_hold(self, front: str, name: str, ids: tuple[str, ...], call: Awaitable[Any]) -> HeldScenes:
+        """Put on record what became of a call to hold scenes. Raises why they can't be held, and ReplicaLost."""
+        found: HeldScenes | Exception
+        try:
+            found, statuses = await self._asked(name, call)
+        except ReplicaLost:
+            self._notify()
+            raise
+        for status in statuses:
+            self._note_loaded(name, status, found)
+        if isinstance(found, Exception):
+            self._placement.release(name, ids)
+            self._notify()
+            raise found
+        if front:
+            self._fronts.setdefault(front, time.monotonic())
+        self._holds[found.token] = _Hold(front, name, ids)
+        self._notify()
+        return found
+
+    def _note_loaded(self, name: str, status: SceneStatus, found: HeldScenes | Exception) -> None:
+        scene = self._scenes.get(status.id)
+        if status.memory_bytes is not None and status.state in ("preparing", "ready"):
+            over = self._placement.loaded(name, status.id, status.memory_bytes, pinned=not (scene and scene.stored))
+            if over:
+                self._replicas[name].drop.remote(over)
+            if scene:
+                scene.error, scene.failures = None, 0
+        elif isinstance(found, Exception):
+            self._placement.dropped(name, status.id)
+            if scene:
+                scene.error, scene.retry_at = found, time.monotonic() + min(RETRY_S * 2**scene.failures, MAX_RETRY_S)
+                scene.failures += 1
+
+    def _release_unwanted(self, task: asyncio.Task[HeldScenes]) -> None:
+        if not task.cancelled() and task.exception() is None:
+            self._in_background(self.release(task.result().token))
+
+    def _chosen(self, asked: str | Sequence[str] | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the scenes that a request names, and those that `auto` leaves out. Raises SceneError."""
+        if asked == AUTO:
+            return self._chosen_of_all()
+        names = [asked] if asked is None or isinstance(asked, str) else asked
+        found = [self._known(name) for name in names]
+        ids = tuple(name for name, scene in self._scenes.items() if any(scene is one for one in found))
+        ids = tuple(sorted(ids, key=lambda name: names.index(name) if name in names else 0))
+        if not self._placement.could_hold(ids):
+            size = sum(map(self._placement.size, ids))
+            raise SceneTooLarge(
+                f"scene '{ids[0]}' takes {size / 1e6:.1f} MB, and all scenes together may take "
+                f"{(self._budget or 0) / 1e6:.1f} MB.",
+                where="scene",
+                hint="Raise SPLATFIX_SCENE_MEMORY_BYTES, or serve a smaller scene.",
+            )
+        return ids, ()
+
+    def _chosen_of_all(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        candidates = [name for name, scene in self._scenes.items() if scene.wanted and self._error(scene) is None]
+        # Those in memory first.
+        candidates.sort(key=lambda name: not self._placement.copies(name))
+        ids: tuple[str, ...] = ()
+        for name in candidates:
+            if self._placement.could_hold((*ids, name)):
+                ids = (*ids, name)
+        if not ids:
+            message = "no scene can be searched: none is there, or all failed or were unloaded."
+            raise SceneNotFound(message, where="scene")
+        return ids, tuple(name for name, scene in self._scenes.items() if scene.wanted and name not in ids)
+
+    def _require_usable(self, scene_id: str) -> None:
+        """Raise why a scene can't be used: it failed to load a short while ago, or was unloaded by request."""
+        scene = self._known(scene_id)
+        if error := self._error(scene):
+            raise error
+        if not scene.wanted:
+            hint = f"Load it: POST /scenes/{scene_id}/load."
+            raise SceneUnloaded(f"scene '{scene_id}' was unloaded.", where="scene", hint=hint)
+
+    def _error(self, scene: _Scene) -> Exception | None:
+        return scene.error if time.monotonic() < scene.retry_at else None
+
+    # ------------------------------------------------------------------ loads
+
+    def _all_ready(self, choice: Choice, ids: Sequence[str]) -> bool:
+        copies = self._placement.scenes(choice.replica)
+        return all(scene_id in copies and copies[scene_id].ready for scene_id in ids)
+
+    async def _preload(self, scene_id: str) -> None:
+        """Load and prepare a scene that no job waits for; without effect if that isn't possible."""
+        try:
+            held = await self.hold_later("", scene_id)
+            with suppress(SplatfixError):
+                await held.replica.prepared.remote(scene_id)
+            await self.release(held.held.token)
+        finally:
+            if scene := self._scenes.get(scene_id):
+                scene.awaited = False
+
+    async def _drop_copies(self, scene_id: str) -> None:
+        """Drop a scene wherever no job uses it; the other copies go when they are released."""
+        for name, copy in self._placement.copies(scene_id).items():
+            if copy.ready and not copy.uses:
+                self._placement.dropped(name, scene_id)
+                with suppress(ReplicaLost):
+                    await self._asked(name, self._replicas[name].drop.remote((scene_id,)))
+
+    # ------------------------------------------------------------------ tasks
+
+    def _in_background(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)  # the loop itself keeps no reference
+
+        def ended(task: asyncio.Task[Any]) -> None:
+            self._tasks.discard(task)
+            if not task.cancelled():
+                task.exception()  # whoever waits has it
+
+        task.add_done_callback(ended)
+        return task
+
+    async def _change(self) -> None:
+        await self._changed.wait()
+
+    def _notify(self) -> None:
+        self._changed.set()
+        self._changed = asyncio.Event()
