@@ -36,8 +36,8 @@ test: check
 
 # What several machines share, with the packages that only they need. PostgreSQL's server is the system's.
 test-fleet: setup
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres]"
-	$(BIN)/pytest -rs tests/test_fronts.py tests/test_store_contracts.py tests/test_lenses.py
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray]"
+	$(BIN)/pytest -rs tests/test_fronts.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py
 
 # All tests, and which lines they run in their own process.
 coverage: check

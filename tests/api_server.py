@@ -61,9 +61,9 @@ def create_app(
     """Make the service's app, with scenes that are in memory already."""
     if subprocess:
         set_up = partial(set_up_engine, {name: packed(scene) for name, scene in (scenes or {}).items()}, GO_ON)
-        engine: Engine = SubprocessEngine(settings.engine, set_up)
+        engine: Engine = SubprocessEngine(settings.engine_config, set_up)
     else:
-        engine = EmbeddedEngine(settings.engine)
+        engine = EmbeddedEngine(settings.engine_config)
         for scene_id, loaded in (scenes or {}).items():
             engine.add_loaded(scene_id, loaded)
     return service.web.app.create_app(settings, engine, keys)

@@ -305,7 +305,7 @@ def main() -> None:
     from service.web.settings import Settings
 
     served = Settings(port=int(sys.argv[1]), scenes=[Path(path) for path in sys.argv[2:]])
-    uvicorn.run(create_app(served, SubprocessEngine(served.engine)), port=served.port, ws="websockets-sansio")
+    uvicorn.run(create_app(served, SubprocessEngine(served.engine_config)), port=served.port, ws="websockets-sansio")
 
 
 if __name__ == "__main__":

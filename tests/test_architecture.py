@@ -115,6 +115,7 @@ WRAPPED = {
     "cryptography": {"service/cli/local_certificate.py"},
     "segno": {"service/cli/qr_code.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
+    "ray": {"service/jobs/ray_engine.py"},
     "psycopg": {"service/jobs/postgres_database.py"},
     "psycopg_pool": {"service/jobs/postgres_database.py"},
     "filelock": {"service/operating_system.py"},

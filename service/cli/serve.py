@@ -19,6 +19,8 @@ def serve(
     viewer: Annotated[bool | None, typer.Option("--viewer/--no-viewer", help="The viewer under /viewer.")] = None,
     https: Annotated[bool, typer.Option("--https", help="HTTPS, with a local certificate unless one is set.")] = False,
     open_to_all: Annotated[bool, typer.Option("--open", help="Listen beyond this machine without keys.")] = False,
+    engine: Annotated[str | None, typer.Option(help="Where jobs run: embedded, or ray: other processes.")] = None,
+    ray_address: Annotated[str | None, typer.Option(help="A Ray cluster's address, e.g. auto.")] = None,
     browser: BrowserOption = False,
 ) -> None:
     """Serve scenes over HTTP. What isn't given here comes from SPLATFIX_* in the environment, or a file.
@@ -28,6 +30,6 @@ def serve(
     from service.cli.server import run
 
     given = {"scenes": scenes or None, "host": host, "port": port, "viewer": viewer, "open": open_to_all or None}
-    given |= {"https": https or None}
+    given |= {"https": https or None, "engine": engine, "ray_address": ray_address}
     # None stands for an option that was not given: the environment's or the file's value holds.
     run(settings_of({name: value for name, value in given.items() if value is not None}), out, err, browser)

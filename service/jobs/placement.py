@@ -1,9 +1,10 @@
 """Which scenes are in which replica's memory, and where a job goes: decisions only, no clock, no processes.
 
 The Ray engine and the simulation in `bench` run this same code. A job goes to the replica at which it is expected to
-begin first: jobs before it take `service_s` each, a scene that isn't there takes its load, and one that has to go
-for it will be loaded again some time. So a job goes where its scene is; a scene gets another copy when the queue at its
-replicas is worth more than a load, and loses copies as the least recently used. Scenes in use are never dropped.
+begin first, with the work that it causes there: jobs before it take `service_s` each, a scene that isn't there takes
+its load, and one that has to go for it will be loaded again some time. So a job goes where its scene is; a scene gets
+another copy when the queue at its replicas is worth more than two loads, and loses copies as the least recently used.
+Scenes in use are never dropped.
 """
 
 from __future__ import annotations
@@ -165,13 +166,14 @@ class Placement:
     # ------------------------------------------------------------------ what they rest on
 
     def _cost(self, replica: _Replica, scenes: Sequence[str], load: Sequence[str], drop: Sequence[str]) -> float:
-        """Return the seconds until a job could begin there, with the loads that it causes."""
-        loads = [self.size(scene) for scene in load]
-        if load or any(not replica.copies[scene].ready for scene in scenes):
-            # Loads of a replica are made one after the other: who needs one waits for those before it.
-            loads += [copy.bytes for copy in replica.copies.values() if not copy.ready]
+        """Return the seconds until a job could begin there, and those of the loads that it causes."""
+        fresh = [self.size(scene) for scene in load]
+        waits = bool(load) or any(not replica.copies[scene].ready for scene in scenes)
+        # Loads of a replica are made one after the other: who needs one waits for those before it.
+        before = [copy.bytes for copy in replica.copies.values() if waits and not copy.ready]
         again = [replica.copies[scene].bytes for scene in drop]
-        return replica.jobs * self._config.service_s + sum(map(self._load_s, [*loads, *again]))
+        # A load counts twice, as time that the job waits and as work: to wait for one under way is better.
+        return replica.jobs * self._config.service_s + sum(map(self._load_s, [*before, *fresh, *fresh, *again]))
 
     def _load_s(self, size: int) -> float:
         return self._config.load_s + size / self._config.load_bytes_per_s

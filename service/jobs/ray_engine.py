@@ -13,7 +13,7 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from service.errors import SceneNotReady, SplatfixError
 from service.jobs.embedded_engine import EngineConfig, with_left_out
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.jobs.placement import PlacementConfig
+from service.jobs.ray_config import RayConfig
 from service.jobs.replica import Replica, SetUp
 from service.jobs.scene_coordinator import HeldAt, SceneCoordinator
 from service.live.live_values import LiveTask
@@ -46,18 +47,6 @@ _AT_ONCE = 1000
 """Calls that a coordinator or a replica may have under way: most of them wait."""
 
 
-@dataclass(frozen=True, slots=True)
-class RayConfig:
-    address: str | None = None
-    """Of a Ray cluster, e.g. `auto`; None: one of this process, that ends with it."""
-    replicas: int = 2
-    """Processes that have scenes and run jobs."""
-    cpus: float = 1.0
-    """Of each replica."""
-    gpus: float = 0.0
-    """Of each replica: a share of a GPU, or several."""
-
-
 class RayEngine:
     """Implements `Engine`. `config.memory_bytes` is the budget of each replica."""
 
@@ -77,13 +66,11 @@ class RayEngine:
     def start(self) -> None:
         if not ray.is_initialized():
             if not self._ray.address and "RAY_AUTH_TOKEN_PATH" not in os.environ:
-                # Ray's own would be a file in the home folder.
+                # Ray listens on all addresses, and runs whatever it is sent: with a token of this process only.
                 os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
             local = {
                 "address": "local",
                 "num_cpus": max(1, round(self._ray.replicas * self._ray.cpus)),
-                # Whoever reaches Ray's ports can run code: only this machine does.
-                "_node_ip_address": "127.0.0.1",
                 "include_dashboard": False,
                 "object_store_memory": 500_000_000,
             }

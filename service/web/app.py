@@ -69,7 +69,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
     """
     settings = settings or Settings()
     _check_plugins(settings)
-    engine = engine or EmbeddedEngine(settings.engine)
+    engine = engine or _engine(settings)
     named = _named_scenes(settings)
     for scene in named:
         engine.add(scene, required=settings.preload is None or scene.id in settings.preload)
@@ -155,12 +155,24 @@ async def _start(
     # Registered after the engine's, hence called before: running jobs need it until they end.
     stack.push_async_callback(to_thread.run_sync, jobs.close)
     await to_thread.run_sync(jobs.start)
-    limits = anyio.CapacityLimiter(settings.workers), anyio.CapacityLimiter(2)
+    limits = anyio.CapacityLimiter(settings.jobs_at_once), anyio.CapacityLimiter(2)
     add_gauges(metrics, settings, engine, jobs, folder)
     anchors = FileAnchorStore(scene_store.find, settings.data_dir)
     state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
     metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
     return state
+
+
+def _engine(settings: Settings) -> Engine:
+    """Make the engine that the settings name. Raises BackendMissing."""
+    if settings.engine == "embedded":
+        return EmbeddedEngine(settings.engine_config)
+    # Not above: Ray is there only where the extra is installed.
+    try:
+        from service.jobs.ray_engine import RayEngine
+    except ImportError as error:
+        raise BackendMissing(f"Ray: {error}.", where="engine", hint="pip install 'splatfix[ray]'") from error
+    return RayEngine(settings.engine_config, settings.ray)
 
 
 def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, LensStore]:

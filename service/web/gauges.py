@@ -17,7 +17,7 @@ def add_gauges(metrics: Metrics, settings: Settings, engine: Engine, jobs: Jobs,
     """Add the gauges to the metrics of an app."""
     metrics.gauge("jobs_queued", "Queued jobs", (), lambda: {(): jobs.waiting()})
     metrics.gauge("jobs_running", "Running jobs", (), lambda: {(): jobs.running()})
-    metrics.gauge("workers", "Worker threads", (), lambda: {(): settings.workers})
+    metrics.gauge("workers", "Worker threads", (), lambda: {(): settings.jobs_at_once})
     metrics.gauge("workers_stuck", "Stuck workers", (), lambda: {(): jobs.stuck_workers()})
     metrics.gauge("scene_bytes", "Memory of a loaded scene", ("scene",), lambda: _scene_bytes(engine))
     metrics.gauge("ready", "1: photos can be localized now, as /readyz says", (), lambda: {(): _ready(engine, jobs)})

@@ -7,13 +7,14 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, SecretStr
 from pydantic_settings import BaseSettings, SettingsConfigDict, TomlConfigSettingsSource
 
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EngineConfig
+from service.jobs.ray_config import RayConfig
 from service.jobs.read_photo import MAX_FRAMES
 from service.loaded_scene import DEFAULT_ESTIMATOR, DEFAULT_MATCHER
 from service.operating_system import available_cores
@@ -96,8 +97,16 @@ class Settings(BaseSettings):
     """Matcher of local features, for all scenes; some need weights in the folder SPLATFIX_WEIGHTS_DIR."""
     rasterizer: str | None = None
     """Renderer; None: a GPU renderer if this machine has a suitable GPU, else the CPU renderer."""
+    engine: Literal["embedded", "ray"] = "embedded"
+    """Where scenes are and jobs run: threads of this process, or processes of a Ray cluster."""
+    ray_address: str | None = None
+    """Address of a Ray cluster, e.g. `auto`; None: a cluster on this machine, that ends with the service."""
+    ray_replicas: int = Field(default_factory=available_cores, ge=1)
+    """Processes of the Ray engine that have scenes and run jobs; `scene_memory_bytes` is the limit of each."""
+    ray_gpus: float = Field(default=0.0, ge=0)
+    """GPUs of each process of the Ray engine, e.g. 0.5 for two on one."""
     workers: int = Field(default_factory=available_cores, ge=1)
-    """Number of jobs that run at once, each on one thread."""
+    """Number of jobs that run at once, each on one thread; with the Ray engine, unless set, one for each process."""
     queue_size: int = Field(default=32, ge=1)
     """Number of jobs that may be queued; further ones are refused with 503."""
     queue_bytes: int = Field(default=500_000_000, ge=1)
@@ -178,10 +187,20 @@ class Settings(BaseSettings):
         return 1_000_000_000 if is_loopback(self.host) else 50_000_000
 
     @property
+    def jobs_at_once(self) -> int:
+        """`workers`, or its default for the engine."""
+        return self.ray_replicas if self.engine == "ray" and "workers" not in self.model_fields_set else self.workers
+
+    @property
+    def ray(self) -> RayConfig:
+        """The part of the settings for the Ray engine."""
+        return RayConfig(self.ray_address, self.ray_replicas, gpus=self.ray_gpus)
+
+    @property
     def jobs(self) -> JobsConfig:
         """The part of the settings for `service.jobs`."""
         return JobsConfig(
-            workers=self.workers,
+            workers=self.jobs_at_once,
             queue_size=self.queue_size,
             queue_bytes=self.queue_bytes,
             max_job_s=self.max_job_s,
@@ -196,8 +215,8 @@ class Settings(BaseSettings):
         )
 
     @property
-    def engine(self) -> EngineConfig:
-        """The part of the settings for the embedded engine."""
+    def engine_config(self) -> EngineConfig:
+        """The part of the settings for the engine of a process."""
         return EngineConfig(
             self.estimator,
             self.matcher,
