@@ -76,6 +76,8 @@ class RayEngine:
             }
             where = {"address": self._ray.address} if self._ray.address else local
             ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
+        if self._coordinator is not None:
+            return
         self._connect()
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
 
