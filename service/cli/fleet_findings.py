@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
+from importlib import metadata
 
 from service.cli.diagnostics import Finding
 from service.errors import SplatfixError
@@ -10,15 +12,30 @@ from service.web.settings import Settings
 
 
 def fleet_findings(settings: Settings) -> Iterator[Finding]:
-    """Examine the shared database, where one is set."""
-    if settings.database is None:
+    """Examine the Ray engine and the shared database, where they are set."""
+    if settings.engine == "ray":
+        yield from _ray_findings(settings.ray_address)
+    if settings.database is not None:
+        yield from _database_findings(settings.database.get_secret_value())
+
+
+def _ray_findings(address: str | None) -> Iterator[Finding]:
+    try:
+        version = metadata.version("ray")
+    except metadata.PackageNotFoundError:
+        yield Finding("Ray", False, "it is missing: pip install 'splatfix[ray]'")
         return
+    yield Finding("Ray", True, f"{version}, {f'the cluster at {address}' if address else 'a cluster of this process'}")
+    if os.environ.get("RAY_AUTH_MODE") == "disabled":
+        yield Finding("Ray's access", False, "who reaches its ports can run code: RAY_AUTH_MODE=disabled", needed=False)
+
+
+def _database_findings(address: str) -> Iterator[Finding]:
     try:
         from service.jobs.postgres_database import PostgresDatabase, unprotected
     except ImportError:
         yield Finding("database", False, "psycopg is missing: pip install 'splatfix[postgres]'")
         return
-    address = settings.database.get_secret_value()
     try:
         database = PostgresDatabase(address)
         database.now()

@@ -9,8 +9,12 @@ Scenes in use are never dropped.
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+
+_OTHERS = 8
+"""Replicas without a scene that are looked at for it: one decision must not take long among a thousand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,11 @@ class SceneCopy:
 class _Replica:
     copies: dict[str, SceneCopy] = field(default_factory=dict)
     jobs: int = 0
+
+    @property
+    def bytes(self) -> int:
+        """Of all its scenes."""
+        return sum(copy.bytes for copy in self.copies.values())
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,8 +122,20 @@ class Placement:
 
     def choose(self, scenes: Sequence[str]) -> Choice | None:
         """Return where a job that needs all of these scenes should go; None if no replica has room for them now."""
+        best = self._best(self._candidates(scenes), scenes)
+        # In a fleet where all candidates are full of scenes in use, another may have room.
+        return best or self._best(self._replicas, scenes)
+
+    def _candidates(self, scenes: Sequence[str]) -> list[str]:
+        """Return the replicas that have any of the scenes, and some of the others that have the least to do."""
+        there = {name for name, replica in self._replicas.items() if any(s in replica.copies for s in scenes)}
+        others = ((r.jobs, r.bytes, name) for name, r in self._replicas.items() if name not in there)
+        return [*sorted(there), *(name for *_, name in heapq.nsmallest(_OTHERS, others))]
+
+    def _best(self, names: Iterable[str], scenes: Sequence[str]) -> Choice | None:
         best: tuple[float, Choice] | None = None
-        for name, replica in self._replicas.items():
+        for name in names:
+            replica = self._replicas[name]
             load = tuple(scene for scene in scenes if scene not in replica.copies)
             drop = self._to_drop(replica, load, scenes)
             if drop is None:
@@ -183,7 +204,9 @@ class Placement:
         budget = self._config.budget_bytes
         if budget is None:
             return ()
-        over = sum(copy.bytes for copy in replica.copies.values()) + sum(map(self.size, load)) - budget
+        over = replica.bytes + sum(map(self.size, load)) - budget
+        if over <= 0:
+            return ()
         idle = [
             name for name, c in replica.copies.items() if c.ready and not c.uses and not c.pinned and name not in kept
         ]
