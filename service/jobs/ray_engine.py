@@ -175,7 +175,8 @@ class RayEngine:
 
     def release(self, token: str) -> None:
         if self._held.pop(token, None):
-            self._ask("release", token)
+            # Not waited for: who lets go needs no answer.
+            self._coordinator.release.remote(token)
 
     def _is_there(self, scene_id: str) -> bool:
         return self.scene(scene_id).memory_bytes is not None
@@ -256,7 +257,11 @@ class RayEngine:
             return ray.get(getattr(self._coordinator, name).remote(*arguments))
 
     def _ask_replica(self, scene_id: str, name: str, *arguments: Any) -> Any:
-        """Call the engine of a replica that has a scene."""
+        """Call the engine of a replica that has a scene: one that is held needs no way over the coordinator."""
+        held = [found.replica for found in tuple(self._held.values()) if scene_id in found.held.ids]
+        for replica in held[-1:]:
+            with _own_errors(), suppress(RayActorError):
+                return ray.get(replica.ask.remote(name, *arguments))
         replica = self._ask("where", scene_id)
         try:
             with _own_errors():
