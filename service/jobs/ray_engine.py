@@ -289,8 +289,9 @@ class _own_errors:
     def __enter__(self) -> None: ...
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, RayTaskError) and isinstance(error.cause, Exception):
-            raise error.cause from None
+        cause = getattr(error, "cause", None) if isinstance(error, RayTaskError) else None
+        if isinstance(cause, Exception):
+            raise cause from None
 
 
 def _expected_bytes(scene: StoredScene) -> int:
