@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_room import write_room
+from test_bench import estimate
 from test_estimators import LENS_UPRIGHT, photo_at, unseen_pose
 
+from service.bench import ablation
 from service.bench.ablation import CONDITIONS, Removal, removals, run, table, unscaled_dilation
+from service.bench.pose_metrics import Units
 from service.errors import UnknownName
 from service.geometry import look_at, moved, pose_distance, project, transformed
 from service.loaded_scene import LoadedScene
@@ -114,3 +119,69 @@ def test_the_table_has_a_line_a_part_and_counts_what_is_false() -> None:
 def test_an_unknown_part_is_named() -> None:
     with pytest.raises(UnknownName, match="in-plane rotation"):
         run([], parts=["wheels"])
+
+
+# ------------------------------------------------------------------ a whole run, with planted answers
+
+
+@pytest.fixture
+def planted(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Every photo is localized 0.02 units off, a second one by a run without `render and rematch` 1 unit off."""
+    seen = SimpleNamespace(prepared=[], occluders=[], asked=[], scaled=[], progress=[])
+    truth = Camera(LENS, unseen_pose())
+
+    def load_bench_scene(folder: Path, cameras: str = "given", cache_dir: Path | None = None):
+        loaded = SimpleNamespace(prepare=lambda estimator: seen.prepared.append((str(folder), cameras)))
+        return SimpleNamespace(loaded=loaded, photos="pq", units=Units(np.zeros(3), 0.5, False), cameras=cameras)
+
+    def make_trials(one, start, count, seed, modify, occluders):
+        seen.occluders.append((str(occluders), modify, one.cameras))
+        return iter([SimpleNamespace(photo=name, truth=truth) for name in "pq"[:count]])
+
+    def localize_trial(one, trial, request, trust):
+        seen.asked.append((one.cameras, trust, request.options.effort))
+        info = SceneInfo("s", "s", "0" * 64, "ply")
+        seen.scaled.append(cpu.dilation_for(Camera(LENS.resized(80, 60), truth.pose), info))
+        wrong = request.config.rematch_below_inliers == 0 and trial.photo == "q"
+        return estimate(moved(truth.pose, np.array([0, 0, 0, 2.0 if wrong else 0.04, 0, 0])))
+
+    monkeypatch.setattr(ablation, "load_bench_scene", load_bench_scene)
+    monkeypatch.setattr(ablation, "make_trials", make_trials)
+    monkeypatch.setattr(ablation, "localize_trial", localize_trial)
+    return seen
+
+
+def test_every_part_answers_every_condition_of_every_scene(planted: SimpleNamespace) -> None:
+    parts = ["nothing", "render and rematch", "estimation of the focal length", "scaled dilation"]
+    folders = [Path("a"), Path("b")]
+    rows = run(folders, parts=parts, progress=lambda *now: planted.progress.append(now))
+    assert [(row["part"], row["condition"]) for row in rows] == [(part, each) for part in parts for each in CONDITIONS]
+    assert all(row["photos"] == 4 for row in rows)
+    for row in rows:
+        # Half a normalized unit a scene unit: 0.02 units are right, but not within 0.01.
+        right = 2 if row["part"] == "render and rematch" else 4
+        assert (row["success_5deg_0p05"], row["success_1deg_0p01"]) == (right, 0)
+        assert row["false_localized"] == 4 - right
+        assert 0 <= row["cpu_ms_p50"] < 1000
+    count = len(CONDITIONS)
+    assert planted.progress == [(done, 2 * count) for done in range(1, 2 * count + 1)]
+    # The next scene's photos hide those of each, and those of the first hide the last one's.
+    assert [occluders for occluders, _, _ in planted.occluders] == ["b"] * count + ["a"] * count
+    assert [modify for _, modify, _ in planted.occluders[:count]] == list(CONDITIONS.values())
+    assert [cameras for _, _, cameras in planted.occluders] == [*["given"] * (count - 1), "ignored"] * 2
+    # The focal length is approximate in its own condition, but for the part that takes it as exact.
+    approximate = [i for i, (_, trust, _) in enumerate(planted.asked) if trust == "approximate"]
+    first = list(CONDITIONS).index("focal 5 % off") * len(parts) * 2
+    assert approximate[:6] == [first, first + 1, first + 2, first + 3, first + 6, first + 7]
+    assert len(approximate) == 12
+    # Without scaled dilation a render of a fifth of the size has the training photos'.
+    assert len(set(planted.scaled[:6])) == 1
+    assert set(planted.scaled[6:8]) == {cpu.DEFAULTS.dilation_px2} != set(planted.scaled[:6])
+
+
+def test_all_parts_are_removed_if_none_is_named(planted: SimpleNamespace) -> None:
+    rows = run([Path("a")])
+    assert {row["part"] for row in rows} == set(removals())
+    assert [row["photos"] for row in rows] == [2] * len(rows)
+    assert planted.occluders[0][0] == "a"  # a single scene's photos hide its own
+    assert sum(effort == "fast" for _, _, effort in planted.asked) == 2 * len(CONDITIONS)
