@@ -476,6 +476,90 @@ def test_every_bench_is_handed_its_flags_and_writes_what_it_returns(
     assert "core" in complaints
 
 
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [
+        ("S", {"seconds": 40, "sessions": 1, "cores": 1, "seed": 0, "withheld": False, "odometry": True}),
+        ("S --seconds 10 --sessions 4 --cores 2 --seed 3", {"seconds": 10, "sessions": 4, "cores": 2, "seed": 3}),
+        ("S --intrinsics withheld --no-odometry", {"withheld": True, "odometry": False}),
+    ],
+)
+def test_the_live_bench_is_handed_its_flags_and_tells_of_each_session(splatfix, monkeypatch, tmp_path, flags, asked):
+    given: dict = {}
+
+    def run(folder, *, progress, cache_dir, **options):
+        given.update(options)
+        progress(1, 2)
+        return {"service_cpu_share": 0.25, "sessions": [{"right": 0.5}, {"right": 0.75}]}
+
+    monkeypatch.setattr("service.bench.live.run", run)
+    code, told, complaints = splatfix("bench", "live", *flags.split(), "--json", tmp_path / "o.json")
+    assert code == 0
+    assert given | asked == given
+    assert json.loads((tmp_path / "o.json").read_text())["sessions"] == [{"right": 0.5}, {"right": 0.75}]
+    assert re.search(r"service_cpu_share +0\.25", told)
+    assert re.search(r"session 0 right +0\.5", told)
+    assert re.search(r"session 1 right +0\.75", told)
+    assert "sessions" not in told
+    assert "core" in complaints
+    assert (
+        splatfix("bench", "live", "S", "--seconds", "9")[0] == splatfix("bench", "live", "S", "--sessions", "5")[0] == 2
+    )
+
+
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [
+        ("S", {"layout": "auto", "estimator": "view_index", "start": "none", "trials": 1, "seed": 0, "data": None,
+               "intrinsics": "given", "cameras": "given", "modify": (), "modify_scene": (), "background": "scene"}),
+        ("S --data D --modify blur=4 --modify gain=2 --modify-scene dark=0.5 --occluders O --trials 3 --seed 2",
+         {"data": Path("D"), "modify": ("blur=4", "gain=2"), "modify_scene": ("dark=0.5",), "occluders": Path("O"),
+          "trials": 3, "seed": 2}),
+        ("S --intrinsics withheld --cameras ignored --start hard --estimator mc_do --background white",
+         {"intrinsics": "withheld", "cameras": "ignored", "start": "hard", "estimator": "mc_do",
+          "background": "white"}),
+    ],
+)  # fmt: skip
+def test_the_bench_of_photos_is_handed_its_flags_and_says_all_but_the_photos(
+    splatfix, monkeypatch, tmp_path, flags, asked
+):
+    given: dict = {}
+
+    def run(folder, *, progress, **options):
+        given.update(options)
+        progress(1, 2)
+        return {"queries": 3, "success_asked": 0.667, "per_query": ["a", "b", "c"]}
+
+    monkeypatch.setattr("service.bench.localize.run", run)
+    limits = ("--budget-s", "1.5", "--budget-renders", "9")
+    code, told, complaints = splatfix("bench", "localize", *flags.split(), *limits, "--json", tmp_path / "o.json")
+    assert code == 0
+    assert given | asked == given
+    assert (given["budget"].seconds, given["budget"].renders) == (1.5, 9)
+    assert json.loads((tmp_path / "o.json").read_text())["per_query"] == ["a", "b", "c"]
+    assert re.search(r"queries +3", told)
+    assert "per_query" not in told
+    assert "core" in complaints
+
+
+def test_the_bench_of_coverage_prints_a_row_a_scene_and_one_for_all(splatfix, monkeypatch, tmp_path):
+    row = {"seconds": 12.0, "count": 8, "found": 6, "brier": 0.125}
+    found = {"scenes": [{"scene": "room", **row}], "all": {**row, "count": 9}}
+
+    def run(scenes, progress, cache_dir):
+        assert scenes == [Path("S"), Path("T")]
+        progress("room", 1, 2)
+        return found
+
+    monkeypatch.setattr("service.bench.coverage.run", run)
+    code, told, complaints = splatfix("bench", "coverage", "S", "T", "--json", tmp_path / "o.json")
+    assert code == 0
+    assert json.loads((tmp_path / "o.json").read_text()) == found
+    assert re.search(r"room .* 8 .* 6 .*0\.125", told)
+    assert re.search(r"all .* 9 .* 6 .*0\.125", told)
+    assert "core" in complaints
+
+
 def test_an_ablation_needs_two_scenes(splatfix):
     code, _, complaint = splatfix("bench", "ablation", "S")
     assert code == 2
