@@ -47,7 +47,7 @@ class ServiceError(Exception):
 
     def __init__(self, code: str, detail: str, *, status: int | None = None, problem: Json | None = None) -> None:
         self.code, self.detail, self.status = code, detail, status
-        """`code` is stable: one of the service's, or `unreachable`, `timeout`, `http_error`; `status` is HTTP's."""
+        """`code` is stable: of the service, or `unreachable`, `timeout`, `http_error`, `closed`; `status` is HTTP's."""
         self.where: str = (problem or {}).get("where", "")
         self.hint: str = (problem or {}).get("hint", "")
         self.retry_after_s: float | None = None
@@ -600,7 +600,12 @@ class Client:
                     response.read()
                 _checked(response)
                 yield from filter(None, map(parser.line, response.iter_lines()))
-        except httpx.HTTPError as error:
+        except (httpx.HTTPError, RuntimeError, OSError) as error:
+            # What httpx raises where another thread has closed the client.
+            if self._http.is_closed:
+                raise ServiceError("closed", "The client is closed.") from error
+            if not isinstance(error, httpx.HTTPError):
+                raise
             raise _unreachable(error, self._http.base_url) from error
 
     def job(self, job_id: str) -> Job:
@@ -725,7 +730,12 @@ class Client:
     def _send(self, method: str, path: str, **arguments: Any) -> httpx.Response:
         try:
             return _checked(self._http.request(method, path, **arguments))
-        except httpx.HTTPError as error:
+        except (httpx.HTTPError, RuntimeError, OSError) as error:
+            # What httpx raises where another thread has closed the client.
+            if self._http.is_closed:
+                raise ServiceError("closed", "The client is closed.") from error
+            if not isinstance(error, httpx.HTTPError):
+                raise
             raise _unreachable(error, self._http.base_url) from error
 
 

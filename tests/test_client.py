@@ -7,6 +7,7 @@ import asyncio
 import io
 import json
 import sys
+import threading
 import time
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
@@ -122,6 +123,33 @@ def test_without_a_key_every_error_has_its_code(keyed):
             assert str(raised.value)
     with pytest.raises(ValueError, match="printable ASCII"):
         Client(url, "schlüssel")
+
+
+def test_a_client_that_another_thread_closes_says_so(keyed):
+    """Be it before a request, or in the middle of a stream."""
+    url, key = keyed
+    service = Client(url, key, use_proxy=False)
+    job = service.submit(photo(), scene="room", options={"steps": 10**6, "pause_s": 0.05})
+    codes: list[str] = []
+
+    def follow() -> None:
+        try:
+            for _ in service.events(job.id):
+                begun.set()
+        except ServiceError as error:
+            codes.append(error.code)
+
+    begun = threading.Event()
+    follower = threading.Thread(target=follow)
+    follower.start()
+    assert begun.wait(20)
+    service.close()
+    with pytest.raises(ServiceError) as raised:
+        service.scenes()
+    follower.join(20)
+    assert (raised.value.code, codes) == ("closed", ["closed"])
+    with Client(url, key, use_proxy=False) as other:
+        other.cancel(job.id)
 
 
 def test_a_service_without_keys_needs_none(shared):

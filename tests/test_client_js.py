@@ -6,6 +6,7 @@ import base64
 import json
 import re
 
+import pytest
 from api_server import ROOT, create_app, fake_estimators, photo, serving, settings, until
 from fake_service import FakeService
 from node import node
@@ -61,6 +62,7 @@ console.log(JSON.stringify({ steps, codes, seed: stored.seed, name: stored.photo
     assert told["scenes"] == ["room"]
 
 
+@pytest.mark.ci
 def test_scenes_links_and_keys_are_managed_in_node(tmp_path):
     (tmp_path / "attic").mkdir()
     (tmp_path / "attic" / "scene.ply").write_bytes(ply())

@@ -83,6 +83,7 @@ def test_who_reads_an_entry_uses_it(tmp_path: Path) -> None:
         assert time.time() - entry.stat().st_mtime < 60, entry
 
 
+@pytest.mark.ci
 def test_a_service_keeps_its_cache_within_the_limit_and_tells_of_it(stepping, tmp_path: Path) -> None:
     (tmp_path / "hall").mkdir()
     (tmp_path / "hall" / "scene.ply").write_bytes(ply())

@@ -28,7 +28,8 @@ class SharedData:
         """Stop all background threads."""
         self.lists.close()
         self.streams.close()
-        # Not the client, which a thread may be using: its connections go with it.
+        # Threads that are still in a request end with an error of it.
+        self.client.close()
 
 
 Connect = Callable[[str], Client]
