@@ -4,13 +4,14 @@
         [--measured FOLDER] [--select "not browser and not ci"] [PATH ...]
 
 Each of `--count` mutants, drawn by the seed from every file of service/ and viewer/ (or from the paths), all kinds
-alike, is applied in a copy of the last commit, and the tests that run its line are started, those of the cheapest files
-first, until one fails. Which those are, and how long each takes, is measured first by one run of all tests (some ten
-minutes) and kept in the folder `--measured`, for other seeds and later commits: lines are found again where a file has
-changed since, and a test file that has changed runs as a whole. Compiled kernels and processes of their own can't be
-measured, and what an import runs is measured in the test that happened to import it: these have the test files that
-name the module or run any of its lines, then those of the modules that import it, then all. A failing test counts if
-it passes without the mutant; one that does not end within the limit has not noticed anything.
+alike, is applied in a copy of the last commit, and the tests that run its line are started until one fails: those of
+files that name the module first, of these the cheapest. Which those are, and how long each takes, is measured first by
+one run of all tests (some ten minutes) and kept in the folder `--measured`, for other seeds and later commits: lines
+are found again where a file has changed since, and a test file that has changed runs as a whole. Compiled kernels and
+processes of their own can't be measured, and what an import runs is measured in the test that happened to import it:
+these have the test files that name the module or run any of its lines, then those of the modules that import it, then
+all. A failing test counts if it passes without the mutant; one that does not end within the limit has not noticed
+anything.
 
 The output has a line of JSON for each mutant; a run that was stopped goes on where it was. A mutant that changes
 nothing that anybody could see is marked by hand: `"equivalent": "why"` in its line. Prints the sums.
@@ -158,7 +159,11 @@ def stages(mutant: Mutant, coverage: Coverage, copy: Path) -> Iterator[list[str]
     tests = set() if runs_at_import(mutant.line, (copy / mutant.file).read_bytes()) else set(coverage.tests(mutant))
     if tests:
         added = near & coverage.changed
-        yield coverage.cheapest_first({test for test in tests if test.split("::")[0] not in added} | added)
+        tests = {test for test in tests if test.split("::")[0] not in added} | added
+        # Those of files that name the module are likely to notice, and collecting few files is quick.
+        likely = {test for test in tests if test.split("::")[0] in near}
+        yield coverage.cheapest_first(likely)
+        yield coverage.cheapest_first(tests - likely)
         return
     near |= coverage.files(mutant.file)
     importing = {t for p in naming(mutant.file, copy) if p.parts[0] != "tests" for t in coverage.files(str(p))}
