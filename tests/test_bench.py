@@ -544,6 +544,20 @@ class TestRoom:
         assert (a.count, a.sh_degree) == (500, 3)
         assert np.allclose(np.linalg.norm(a.quats, axis=1), 1, atol=1e-6)
 
+    def test_furniture_stands_on_the_floor_of_the_room(self):
+        means, normals, area = render_bench._on_surfaces(20_000, np.random.default_rng(0))
+        # Of a room of 8 by 6 by 3, and six boxes: by hand.
+        assert area == pytest.approx(180 + 10.92 + 16.56 + 8.96 + 10.36 + 3.2 + 8.82)
+        assert (np.abs(means) <= np.array([4.0, 3.0, 1.5]) + 1e-9).all()
+        levels = np.unique(means[normals[:, 2] == 1, 2].round(6))
+        heights = (1.1, 1.9, 0.8, 1.4, 0.6, 2.0)
+        assert levels == pytest.approx(sorted([-1.5, 1.5, *(-1.5 + height for height in heights)]))
+        # As many everywhere: the share of the ceiling and the floor, beneath boxes, too.
+        flat = normals[:, 2] == 1
+        shares = [np.mean(flat & np.isclose(means[:, 2], level)) for level in (1.5, -1.5)]
+        beneath = 1.2 * 1.8 + 1.0 * 2.2 + 2.4 * 0.8 + 2.0 * 0.7 + 0.8 * 0.8 + 0.9 * 0.9
+        assert shares == pytest.approx([48 / area, (48 + beneath) / area], abs=0.01)
+
     def test_cameras_are_inside_and_see_7_to_10_percent(self):
         room = render_bench.synthetic_room(20_000)
         shares = []
