@@ -16,6 +16,7 @@ from test_scenes import TRANSFORMS, ply
 from service import disk_cache
 from service.disk_cache import cache_bytes, evict
 from service.pose.retrieval.view_files import read_views
+from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
 
 
@@ -81,6 +82,38 @@ def test_who_reads_an_entry_uses_it(tmp_path: Path) -> None:
     assert read_views(views) is not None
     for entry in entries:
         assert time.time() - entry.stat().st_mtime < 60, entry
+
+
+def test_a_scene_is_cached_whole_or_not_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog) -> None:
+    cache, scene = tmp_path / "cache", tmp_path / "scene"
+    scene.mkdir()
+    (scene / "scene.ply").write_bytes(ply())
+    mapped_scene(scene, cache)
+    (entry,) = (cache / "scenes").iterdir()
+    shutil.rmtree(entry)
+    # Of a process of the same number that was killed while it wrote.
+    draft = entry.with_name(f"{entry.name}.{os.getpid()}")
+    draft.mkdir()
+    (draft / "half.npy").write_bytes(b"half")
+    expected = load_scene(scene)
+    found = mapped_scene(scene, cache)
+    assert np.array_equal(found.means, expected.means)
+    assert list((cache / "scenes").iterdir()) == [entry]
+    assert not (entry / "half.npy").exists()
+    assert "not cached" not in caplog.text
+    # A full disk: the scene is in memory, and nothing is left behind.
+    shutil.rmtree(entry)
+    save = np.save
+
+    def full(path: Path, *arguments, **options) -> None:
+        if path.name == "scales.npy":
+            raise OSError(28, "No space left on device")
+        save(path, *arguments, **options)
+
+    monkeypatch.setattr(np, "save", full)
+    assert np.array_equal(mapped_scene(scene, cache).scales, expected.scales)
+    assert list((cache / "scenes").iterdir()) == []
+    assert "not cached: [Errno 28]" in caplog.text
 
 
 @pytest.mark.ci
