@@ -27,7 +27,7 @@ from service.errors import (
 )
 from service.jobs.engine import HeldScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
-from service.scene_manager.status import AUTO, SceneReadiness, SceneStatus, StoredScene
+from service.scene_manager.status import AUTO, SceneNote, SceneReadiness, SceneStatus, StoredScene
 
 _log = logging.getLogger(__name__)
 
@@ -230,25 +230,24 @@ class SceneCoordinator:
         for name, handle in list(self._replicas.items()):
             with suppress(ReplicaLost):
                 found.append(await self._asked(name, handle.readiness.remote()))
-        pending = tuple(f"scene {i}: loading" for i, s in self._scenes.items() if s.required and s.awaited)
-        told = [f"scene {i}: {s.error}" for i, s in self._scenes.items() if s.error]
+        pending = tuple(SceneNote(i, "loading") for i, s in self._scenes.items() if s.required and s.awaited)
+        told = [SceneNote(i, str(s.error)) for i, s in self._scenes.items() if s.error]
         usable = any(scene.wanted and scene.error is None for scene in self._scenes.values())
         return SceneReadiness(
             ready=usable and not pending and bool(self._placement.replicas()),
             pending=pending,
-            failed=tuple(dict.fromkeys([*told, *(text for each in found for text in each.failed)])),
+            failed=tuple(dict.fromkeys([*told, *(note for each in found for note in each.failed)])),
             rasterizers=tuple(sorted({name for each in found for name in each.rasterizers})),
             skipped_rasterizers=tuple(sorted({name for each in found for name in each.skipped_rasterizers})),
         )
 
     def _known(self, scene_id: str | None) -> _Scene:
-        known = ", ".join(self._scenes) or "none"
         if scene_id is None and len(self._scenes) == 1:
             return next(iter(self._scenes.values()))
         if scene_id is None:
-            raise SceneNotFound(f"name a scene; known: {known}.", where="scene")
+            raise SceneNotFound("name a scene.", where="scene")
         if scene_id not in self._scenes:
-            raise SceneNotFound(f"unknown scene '{scene_id}'; known: {known}.", where="scene")
+            raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
         return self._scenes[scene_id]
 
     def _jobs(self, scene_id: str) -> int:
