@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from service.errors import InvalidRequest
-from service.geometry import hat, moved, pose_distance, se3_log, transformed
+from service.geometry import hat, moved, reprojection_error_px, se3_log, transformed
 from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
@@ -64,18 +64,22 @@ class RigConfig:
     """Weight of what the other photos say of a view, relative to its own score."""
     rematch_error_px: float = 3.0
     """Reprojection error of an inlier with a render at the pose, at PHOTO_PX."""
-    rematches: int = 2
+    rematches: int = 5
+    settled_gain: float = 0.05
+    """Renders, one after the other, that are matched at most; it ends where so small a share more agrees."""
     hopeless_inliers: int = 12
     """With fewer a pose isn't rendered again: they are chance."""
     min_inliers: int = 60
     min_inlier_share: float = 0.15
     """Fresh matches that agree, of all photos, and their share, from which on nothing more is searched: right poses of
     photos that are hidden by two thirds have 300 and 0.3, wrong ones 22 and 0.07."""
-    same_deg: float = 3.0
-    same_share: float = 0.05
-    """Poses nearer than this (share of the distance to what is seen) are the same hypothesis."""
+    same_share: float = 0.5
+    same_errors: float = 3.0
+    """Share of a hypothesis' matches that the best one explains, within so many times the largest error of an inlier,
+    from which on the two are the same: it has not settled. What is similar elsewhere has other points."""
     match_sigma_px: float = 4.0
-    """Standard deviation of a match, at PHOTO_PX: neighbours err alike, so 1.5 px count as more."""
+    most_matches: int = 60
+    """Standard deviation of a match, at PHOTO_PX, and how many count in refinement: neighbours err alike."""
     refined_px: tuple[int, ...] = (256, RENDER_PX, RENDER_PX)
     """Long sides of the renders that are refined on, one after the other."""
 
@@ -113,6 +117,8 @@ class _Hypothesis:
     matches: int
     information: Float64[np.ndarray, "6 6"]
     """Of the rig's twist, by the matches that agree."""
+    agreeing: tuple[RigMatches, ...] = ()
+    """These, of each photo."""
 
 
 def localize_rig(
@@ -244,11 +250,14 @@ class _Search:
         config = self._config
         return found.inliers >= max(config.min_inliers, config.min_inlier_share * found.matches)
 
-    def _is_same(self, a: _Hypothesis, b: _Hypothesis) -> bool:
-        turned, way = pose_distance(a.world_from_rig, b.world_from_rig)
-        first = _pose_of(b.world_from_rig, self._photos[0])
-        depth = typical_depth(self._renderer.at(self._photos[0].query, first).frame)
-        return turned < self._config.same_deg and way < self._config.same_share * depth
+    def _is_same(self, one: _Hypothesis, best: _Hypothesis) -> bool:
+        """Return whether the best pose explains most matches of another one, which then has only not settled."""
+        explained = 0
+        for photo, matches in zip(self._photos, one.agreeing, strict=True):
+            pose = _pose_of(best.world_from_rig, photo)
+            error_px = reprojection_error_px(matches.photo_px, matches.points_in_world, matches.intrinsics, pose)
+            explained += int((error_px < self._config.same_errors * matches.max_error_px).sum())
+        return explained >= self._config.same_share * one.inliers
 
     def _likeliest(self) -> Pose:
         """Return the rig's pose with its first photo at the view most like it: an answer where nothing matches."""
@@ -280,10 +289,7 @@ class _Search:
             yield found.world_from_rig, found.num_inliers
             if not number:
                 yield from starts[: self._config.hypotheses]
-            matches = [
-                replace(one, photo_px=one.photo_px[~agree], points_in_world=one.points_in_world[~agree])
-                for one, agree in zip(matches, found.inliers, strict=True)
-            ]
+            matches = [_chosen(one, ~agree) for one, agree in zip(matches, found.inliers, strict=True)]
 
     def _starts(self, photo: RigPhoto, parts: Sequence[Correspondences], error_px: float) -> list[tuple[Pose, int]]:
         """Return poses of the rig that the matches of a photo with one view lead to, and how many of them agree."""
@@ -316,7 +322,7 @@ class _Search:
 
     def _rematched(self, pose: Pose) -> _Hypothesis:
         """Render each photo at the pose, match, and solve all again; no matches agree where that fails."""
-        inliers, count, information = 0, 0, np.zeros((6, 6))
+        inliers, count, information, agreeing = 0, 0, np.zeros((6, 6)), ()
         for _ in range(self._config.rematches):
             matches = []
             for photo, images in zip(self._photos, self._images, strict=True):
@@ -328,12 +334,14 @@ class _Search:
             again = estimate_rig_pose(matches, self._config.trials, [pose])
             if again is None:
                 return _Hypothesis(pose, 0, count, np.zeros((6, 6)))
+            settled = again.num_inliers < (1 + self._config.settled_gain) * inliers
             pose, inliers = again.world_from_rig, again.num_inliers
             self._add("rematch_rig", pose, inliers)
-            information = _information(matches, again, self._config.match_sigma_px)
-            if inliers < self._config.hopeless_inliers:
+            agreeing = tuple(_chosen(one, agree) for one, agree in zip(matches, again.inliers, strict=True))
+            information = _information(matches, again, self._config.match_sigma_px, self._config.most_matches)
+            if settled or inliers < self._config.hopeless_inliers:
                 break
-        return _Hypothesis(pose, inliers, count, information)
+        return _Hypothesis(pose, inliers, count, information, agreeing)
 
     # ------------------------------------------------------------------ refinement
 
@@ -422,8 +430,15 @@ def _matches(photo: RigPhoto, found: Correspondences, error_px: float) -> RigMat
     )
 
 
-def _information(cameras: Sequence[RigMatches], found: RigPose, sigma_px: float) -> Float64[np.ndarray, "6 6"]:
-    """Return the information of the rig's twist by the matches that agree; `sigma_px` is at PHOTO_PX."""
+def _chosen(matches: RigMatches, keep: Bool[np.ndarray, "m"]) -> RigMatches:
+    return replace(matches, photo_px=matches.photo_px[keep], points_in_world=matches.points_in_world[keep])
+
+
+def _information(
+    cameras: Sequence[RigMatches], found: RigPose, sigma_px: float, most: int
+) -> Float64[np.ndarray, "6 6"]:
+    """Return the information of the rig's twist by the matches that agree, as if there were at most so many of them;
+    `sigma_px` is at PHOTO_PX."""
     total = np.zeros((6, 6))
     for camera, agree in zip(cameras, found.inliers, strict=True):
         pose = found.world_from_rig.world_from_camera @ camera.rig_from_camera.world_from_camera
@@ -439,7 +454,7 @@ def _information(cameras: Sequence[RigMatches], found: RigPose, sigma_px: float)
         sigma = sigma_px * lens.long_side / PHOTO_PX
         to_camera = _adjoint(camera.rig_from_camera.camera_from_world)
         total += to_camera.T @ (jacobian.T @ jacobian / sigma**2) @ to_camera
-    return total
+    return total * min(1.0, most / max(found.num_inliers, 1))
 
 
 def _agreement(
