@@ -135,24 +135,35 @@ def localize_rig(
     `rig_from_camera` is in scene units, or, `metric`, in metres. Poses are in the world. Raises InvalidRequest for a
     rig in metres in a scene without a scale, Cancelled, InvalidAccuracy.
     """
-    request = request or Request()
     origin, per_metre = loaded.scene.info.origin_in_world, _units_per_metre(loaded) if metric else 1.0
     own = [
-        replace(photo, query=asked_of(query_in_scene(photo.query, origin), loaded, request),
-                rig_from_camera=_scaled(photo.rig_from_camera, per_metre))
+        replace(photo, query=query_in_scene(photo.query, origin), rig_from_camera=_scaled(photo, per_metre))
         for photo in photos
-    ]  # fmt: skip
+    ]
 
     def report(record: IterationRecord) -> None:
         if on_record:
             on_record(record_in_world(record, origin))
 
-    found = _Search(own, loaded, request, report, config).run()
+    found = localize_rig_in_scene(own, loaded, request, report, config)
     return RigEstimate(
         shifted(found.world_from_rig, origin),
         estimate_in_world(found.estimate, origin),
         tuple((shifted(pose, origin), verdict) for pose, verdict in found.photos),
     )
+
+
+def localize_rig_in_scene(
+    photos: Sequence[RigPhoto],
+    loaded: LoadedScene,
+    request: Request | None = None,
+    on_record: Callable[[IterationRecord], None] | None = None,
+    config: RigConfig = RIG,
+) -> RigEstimate:
+    """Localize as `localize_rig` does, in scene units, with all positions relative to the scene's origin."""
+    request = request or Request()
+    own = [replace(photo, query=asked_of(photo.query, loaded, request)) for photo in photos]
+    return _Search(own, loaded, request, on_record or (lambda _: None), config).run()
 
 
 def _units_per_metre(loaded: LoadedScene) -> float:
@@ -166,8 +177,8 @@ def _units_per_metre(loaded: LoadedScene) -> float:
     return 1 / info.metres_per_unit
 
 
-def _scaled(pose: Pose, factor: float) -> Pose:
-    matrix = pose.world_from_camera.copy()
+def _scaled(photo: RigPhoto, factor: float) -> Pose:
+    matrix = photo.rig_from_camera.world_from_camera.copy()
     matrix[:3, 3] *= factor
     return Pose(matrix)
 

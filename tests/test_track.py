@@ -312,6 +312,34 @@ def test_a_live_frame_without_a_pose_is_carried_by_odometry(room):
     assert np.linalg.norm(matrix[:3, 3] - camera[-1].position_in_world) < 0.01
 
 
+def test_live_frames_that_fail_alone_are_searched_for_together(room, monkeypatch):
+    """Searches of single frames find nothing; odometry relates four frames of a turn, in a scene that has a scale."""
+    metric = replace(room, scene=replace(room.scene, info=replace(room.scene.info, metres_per_unit=2.0)))
+    search = live_tracker.localize_in_scene
+
+    def nothing(query, loaded, request):
+        found = search(query, loaded, request)
+        return replace(found, verdict=doubted(found.verdict, Reason.FEW_INLIERS))
+
+    monkeypatch.setattr(live_tracker, "localize_in_scene", nothing)
+    camera = [place(1.0 + 0.3 * k, 0.1) for k in range(4)]
+    start = moved(Pose(np.eye(4)), np.array([0.3, -1.0, 0.5, 4.0, 5.0, 6.0]))
+    with closing(LiveTracker(LiveTask("room", "view_index", intrinsics=LENS), metric, SHORT)) as tracker:
+        for number in range(400):
+            k = min(number, 3)
+            between = camera[0].camera_from_world @ camera[k].world_from_camera
+            between[:3, 3] *= 2.0
+            odom = Pose(start.world_from_camera @ between)
+            frame = LiveFrame(number, k + number / 1000, encode_image(photo(room, camera[k], k)), odom_from_camera=odom)
+            answer = tracker.use(frame)
+            if answer.mode == "tracking":
+                break
+            time.sleep(0.05)
+    assert answer.mode == "tracking"
+    assert answer.verdict.status is Status.LOCALIZED
+    assert close(answer.pose, camera[3])
+
+
 def test_a_live_lens_is_estimated_once_and_kept_for_frames_of_any_size(room):
     wrong = replace(LENS, fx=1.1 * FOCAL, fy=1.1 * FOCAL, trust="approximate")
     half = LENS.resized(WIDTH // 2, HEIGHT // 2)

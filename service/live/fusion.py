@@ -129,8 +129,10 @@ class Fusion:
 
     @property
     def scale(self) -> tuple[float, float] | None:
-        """Scene units per unit of the odometry, and the standard deviation of its logarithm; None: no fix so far."""
-        return None if self._scale is None else (float(np.exp(self._scale.log_scale)), self._scale.sigma)
+        """Scene units per unit of the odometry, and the standard deviation of its logarithm; None: nothing is known."""
+        if self._scale is not None:
+            return float(np.exp(self._scale.log_scale)), self._scale.sigma
+        return None if self._metric is None else (1 / self._metric, self._config.metric_sigma)
 
     # ------------------------------------------------------------------ what comes in
 

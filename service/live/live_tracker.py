@@ -5,8 +5,9 @@
 
 Where the pixels alone don't suffice the frame is `uncertain`. Searches, and every second the whole gate, run in the
 background. A search that succeeded belongs to a frame of the past: the frames since are followed from there, thinned
-out, until the newest one is reached. With odometry a frame that has no pose of its own is carried from those that had
-one (`fusion`).
+out, until the newest one is reached. Where frames alone aren't found, those that odometry relates are searched for
+together now and then (`service/rig.py`). With odometry a frame that has no pose of its own is carried from those that
+had one (`fusion`).
 """
 
 from __future__ import annotations
@@ -15,12 +16,17 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from service.errors import InvalidImage
 from service.live.background import Background
 from service.live.fusion import Fusion
 from service.live.live_values import FusedOdometry, LiveAnswer, LiveFrame, LiveTask, Mode
+from service.live.odometry_fit import scaled
+from service.live.recent_views import RecentViews
 from service.loaded_scene import LoadedScene
 from service.localize import Cancelled, Request, asked_of, localize_in_scene, rasterizer_for
 from service.localize import render_and_verify as verify_whole
@@ -31,6 +37,7 @@ from service.pose.features.rendered_views import RenderedView
 from service.pose.verification.gate import downgraded
 from service.pose.verification.signals import typical_depth
 from service.results import PoseEstimate, Reason, Status, Verdict
+from service.rig import RIG, RigConfig, RigPhoto, localize_rig_in_scene
 from service.scene_origin import query_in_scene, shifted
 from service.tracking import (
     TRACKING,
@@ -45,6 +52,7 @@ from service.tracking import (
 from service.types import Intrinsics, Pose, Query, frozen
 
 _log = logging.getLogger(__name__)
+LIVE_RIG = replace(RIG, rounds=((5, 1.0), (16, 1.0)), hypotheses=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +81,10 @@ class LiveConfig:
     """Standard deviation of a frame's values, 0..255, below which nothing is searched for: a dark or covered lens."""
     kept_every_s: float = 0.06
     """Time between the frames that are kept while a search runs."""
+    rig: RigConfig = LIVE_RIG
+    """Of the search for frames together: shorter than for photos, for the next search sees something else."""
+    most_scale_sigma: float = 0.05
+    """Of the scale's logarithm, up to which frames that odometry relates are searched for together."""
     kept: int = 40
     """Frames, as they came, hence about 2 MB; when there are more, every second one is dropped."""
 
@@ -125,6 +137,7 @@ class LiveTracker:
         self._fusion = Fusion(task.odometry, loaded.scene.info)
         self._run = 0
         """How often a search found the camera."""
+        self._views = RecentViews()
         self._background: Background[_Found | None] = Background()
 
     def close(self) -> None:
@@ -140,6 +153,7 @@ class LiveTracker:
         size = self._checked_size(frame)
         if frame.odom_from_camera is not None:
             self._fusion.move(frame.time_s, frame.odom_from_camera, frame.up_in_camera)
+            self._views.add(frame, frame.odom_from_camera, self._fusion.resets)
         self._take_over()
         followed = None
         if self._past and self._is_due(frame):
@@ -272,7 +286,11 @@ class LiveTracker:
         if followed is None or unverified_s > self._config.search_after_s or self._doubt is not None:
             if self._is_dark(query):
                 return
-            self._background.start(lambda cancel: self._searched(query, time_s, cancel))
+            rig = self._rig(query) if self._searches % 3 == 2 else []
+            if rig:
+                self._background.start(lambda cancel: self._searched_together(rig, query, time_s, cancel))
+            else:
+                self._background.start(lambda cancel: self._searched(query, time_s, cancel))
         elif time_s - self._checked_s > self._config.check_every_s:
             self._background.start(lambda cancel: self._checked(followed, time_s))
 
@@ -291,6 +309,38 @@ class LiveTracker:
         except Cancelled:
             return None
         return _Found(query, time_s, estimate, None, loaded)
+
+    def _rig(self, query: Query) -> list[RigPhoto]:
+        """Return the newest frame and those before it that odometry relates to it, the newest first; none where a frame
+        has nothing to go with it, or lengths aren't known."""
+        scale, views = self._fusion.scale, self._views.before_newest()
+        if scale is None or scale[1] > self._config.most_scale_sigma or not views:
+            return []
+        newest = self._views.newest
+        photos = [RigPhoto(self._alone(query), Pose(np.eye(4)))]
+        for frame, odom in views:
+            step = newest.camera_from_world @ odom.world_from_camera
+            own = self._query(frame, self._checked_size(frame))
+            photos.append(RigPhoto(self._alone(own), Pose(scaled(step, scale[0]))))
+        return photos
+
+    def _alone(self, query: Query) -> Query:
+        """Return a frame with the session's lens for exact, and without what is known of its own pose."""
+        return replace(self._through_lens(query), lens_prior=None, prior=None)
+
+    def _searched_together(
+        self, photos: Sequence[RigPhoto], query: Query, time_s: float, cancel: threading.Event
+    ) -> _Found | None:
+        config = self._config
+        request = Request(
+            seed=self._task.seed, cancel=cancel, accuracy=self._task.accuracy, budget_s=config.search_s[0]
+        )
+        loaded = self._loaded.as_seen_by(query)
+        try:
+            found = localize_rig_in_scene(photos, loaded, request, config=config.rig)
+        except Cancelled:
+            return None
+        return _Found(self._through_lens(query), time_s, found.estimate, None, loaded)
 
     def _checked(self, followed: _Followed, time_s: float) -> _Found:
         images = QueryImages(followed.query, self._loaded.matcher)
@@ -316,7 +366,7 @@ class LiveTracker:
             return  # it was found meanwhile where it was last
         record = estimate.records[-1]
         # A fisheye's correction isn't one of the pinhole that the next frames are taken for.
-        if found.query.lens_prior and record.lens is None:
+        if found.query.lens_prior and record.lens is None and estimate.verdict.focal_sigma:
             prior = replace(found.query.lens_prior, log_focal_scale=estimate.verdict.focal_sigma)
             self._lens.set(record.pose, self._lens.correction.then(record.correction), prior)
         self._loaded, self._rendered, self._doubt, self._searches = found.loaded, None, None, 0
