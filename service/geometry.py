@@ -69,6 +69,14 @@ def se3_log(transform: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:
     return np.concatenate([phi, inverse_jacobian @ transform[:3, 3]])
 
 
+def adjoint(motion: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
+    """Return the matrix that takes a twist through a motion: motion @ exp(x) = exp(adjoint @ x) @ motion."""
+    rotation, result = motion[:3, :3], np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = rotation
+    result[3:, :3] = hat(motion[:3, 3]) @ rotation
+    return result
+
+
 def moved(pose: Pose, twist: Float64[np.ndarray, "6"]) -> Pose:
     """Return world_from_camera @ exp(twist), re-orthonormalized so that long chains of steps stay rigid."""
     matrix = pose.world_from_camera @ se3_exp(twist)

@@ -19,18 +19,17 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from service.errors import InvalidRequest
-from service.geometry import hat, moved, reprojection_error_px, se3_log, transformed
+from service.geometry import adjoint, moved, reprojection_error_px
 from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
-from service.pose.absolute_pose.rig_pose import RigMatches, RigPose, estimate_rig_pose
-from service.pose.features.image_sizes import PHOTO_PX, RENDER_PX, sized
+from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
+from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer
 from service.pose.matching.correspondences import Correspondences, correspondences
-from service.pose.refinement.photometric import refine_photometric
-from service.pose.refinement.uncertainty import pose_uncertainty
+from service.pose.refinement.rig_refinement import match_information, refine_rig
 from service.pose.retrieval.image_variant import Retrieval
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
@@ -41,7 +40,7 @@ from service.pose.verification.signals import typical_depth
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, StageTiming, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world, shifted
-from service.types import Camera, Pose, Query
+from service.types import Pose, Query
 
 MOST_PHOTOS = 8
 
@@ -77,11 +76,6 @@ class RigConfig:
     same_errors: float = 3.0
     """Share of a hypothesis' matches that the best one explains, within so many times the largest error of an inlier,
     from which on the two are the same: it has not settled. What is similar elsewhere has other points."""
-    match_sigma_px: float = 4.0
-    most_matches: int = 60
-    """Standard deviation of a match, at PHOTO_PX, and how many count in refinement: neighbours err alike."""
-    refined_px: tuple[int, ...] = (256, RENDER_PX, RENDER_PX)
-    """Long sides of the renders that are refined on, one after the other."""
 
 
 RIG = RigConfig()
@@ -118,7 +112,7 @@ class _Hypothesis:
     information: Float64[np.ndarray, "6 6"]
     """Of the rig's twist, by the matches that agree."""
     agreeing: tuple[RigMatches, ...] = ()
-    """These, of each photo."""
+    """These, of each photo; empty: none agree."""
 
 
 def localize_rig(
@@ -215,7 +209,10 @@ class _Search:
 
     def run(self) -> RigEstimate:
         best, rivals = self._searched()
-        pose, covariance = self._refined(best)
+        cameras = [(one, photo.rig_from_camera) for one, photo in zip(self._images, self._photos, strict=True)]
+        pose, covariance = refine_rig(cameras, best.world_from_rig, best.information, self._renderer)
+        self._check()
+        self._add("refine_rig", pose, None)
         found, depth = [], 1.0
         for photo, images in zip(self._photos, self._images, strict=True):
             own = _pose_of(pose, photo)
@@ -225,7 +222,7 @@ class _Search:
             found.append((own, verify(images, own, rendered)))
         first = self._photos[0]
         if covariance is not None:
-            to_cameras = [_adjoint(photo.rig_from_camera.camera_from_world) for photo in self._photos]
+            to_cameras = [adjoint(photo.rig_from_camera.camera_from_world) for photo in self._photos]
             covariances = [one @ covariance @ one.T for one in to_cameras]
             found = [(own, replace(one, covariance=c)) for (own, one), c in zip(found, covariances, strict=True)]
             covariance = covariances[0]
@@ -263,6 +260,8 @@ class _Search:
 
     def _is_same(self, one: _Hypothesis, best: _Hypothesis) -> bool:
         """Return whether the best pose explains most matches of another one, which then has only not settled."""
+        if not one.agreeing:
+            return False
         explained = 0
         for photo, matches in zip(self._photos, one.agreeing, strict=True):
             pose = _pose_of(best.world_from_rig, photo)
@@ -349,56 +348,10 @@ class _Search:
             pose, inliers = again.world_from_rig, again.num_inliers
             self._add("rematch_rig", pose, inliers)
             agreeing = tuple(_chosen(one, agree) for one, agree in zip(matches, again.inliers, strict=True))
-            information = _information(matches, again, self._config.match_sigma_px, self._config.most_matches)
+            information = match_information(matches, again)
             if settled or inliers < self._config.hopeless_inliers:
                 break
         return _Hypothesis(pose, inliers, count, information, agreeing)
-
-    # ------------------------------------------------------------------ refinement
-
-    def _refined(self, matched: _Hypothesis) -> tuple[Pose, Float64[np.ndarray, "6 6"] | None]:
-        """Return the pose after joint refinement, and the covariance of its twist; None where nothing determines it.
-
-        Each photo is refined on a render; its covariance weighs the twist that it asks for. The matches' normal
-        equations are added, so that the pixels of what hides the scene can't lead away from them.
-        """
-        covariance, world_from_rig = None, matched.world_from_rig
-        for number, size_px in enumerate(self._config.refined_px):
-            back = se3_log(world_from_rig.camera_from_world @ matched.world_from_rig.world_from_camera)
-            information, pull = matched.information.copy(), matched.information @ back
-            for photo, images in zip(self._photos, self._images, strict=True):
-                self._check()
-                asked = self._asked_by(photo, images, _pose_of(world_from_rig, photo), size_px, 1 if number else 2)
-                if asked is None:
-                    continue
-                to_camera = _adjoint(photo.rig_from_camera.camera_from_world)
-                weight = _agreement(to_camera @ back - asked[0], to_camera, asked[1], matched.information)
-                weighed = weight * to_camera.T @ np.linalg.inv(asked[1])
-                information += weighed @ to_camera
-                pull += weighed @ asked[0]
-            if np.linalg.matrix_rank(information) < len(information):
-                return world_from_rig, covariance
-            covariance = np.linalg.inv(information)
-            world_from_rig = moved(world_from_rig, covariance @ pull)
-            self._add("refine_rig", world_from_rig, None)
-        return world_from_rig, covariance
-
-    def _asked_by(
-        self, photo: RigPhoto, images: QueryImages, pose: Pose, size_px: int, levels: int
-    ) -> tuple[Float64[np.ndarray, "6"], Float64[np.ndarray, "6 6"]] | None:
-        """Return the twist by which a photo would be moved, and its covariance; None: it doesn't determine its pose."""
-        size = sized(photo.query.intrinsics, size_px)
-        rgb, valid = images.resized(size), images.valid_mask(size)
-        rendered = self._renderer.render(Camera(size, pose))
-        frame, camera = rendered.frame, rendered.camera
-        result = refine_photometric(rgb, frame, camera, camera, levels, valid_mask=valid)
-        if not np.isfinite(result.loss):
-            return None
-        found = pose_uncertainty(rgb, frame, camera, Camera(size, result.pose), None, valid, result)
-        if found is None:
-            return None
-        goal = moved(result.pose, found.last_step)
-        return se3_log(pose.camera_from_world @ goal.world_from_camera), found.covariance[:6, :6]
 
     # ------------------------------------------------------------------ records
 
@@ -443,48 +396,3 @@ def _matches(photo: RigPhoto, found: Correspondences, error_px: float) -> RigMat
 
 def _chosen(matches: RigMatches, keep: Bool[np.ndarray, "m"]) -> RigMatches:
     return replace(matches, photo_px=matches.photo_px[keep], points_in_world=matches.points_in_world[keep])
-
-
-def _information(
-    cameras: Sequence[RigMatches], found: RigPose, sigma_px: float, most: int
-) -> Float64[np.ndarray, "6 6"]:
-    """Return the information of the rig's twist by the matches that agree, as if there were at most so many of them;
-    `sigma_px` is at PHOTO_PX."""
-    total = np.zeros((6, 6))
-    for camera, agree in zip(cameras, found.inliers, strict=True):
-        pose = found.world_from_rig.world_from_camera @ camera.rig_from_camera.world_from_camera
-        points = transformed(np.linalg.inv(pose), camera.points_in_world[agree].astype(np.float64))
-        x, y, z = points.T
-        zero, lens = np.zeros_like(x), camera.intrinsics
-        of_point = np.stack(
-            [lens.fx / z, zero, -lens.fx * x / z**2, zero, lens.fy / z, -lens.fy * y / z**2], 1
-        ).reshape(-1, 2, 3)
-        # A camera that turns by w and moves by v sees a point X move by X x w - v.
-        turned = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
-        jacobian = np.concatenate([of_point @ turned, -of_point], 2).reshape(-1, 6)
-        sigma = sigma_px * lens.long_side / PHOTO_PX
-        to_camera = _adjoint(camera.rig_from_camera.camera_from_world)
-        total += to_camera.T @ (jacobian.T @ jacobian / sigma**2) @ to_camera
-    return total * min(1.0, most / max(found.num_inliers, 1))
-
-
-def _agreement(
-    gap: Float64[np.ndarray, "6"],
-    to_camera: Float64[np.ndarray, "6 6"],
-    covariance: Float64[np.ndarray, "6 6"],
-    information: Float64[np.ndarray, "6 6"],
-) -> float:
-    """Return the weight, 1 to 0, of what a photo's pixels ask for, by how far that is from what the matches say."""
-    if np.linalg.matrix_rank(information) < len(information):
-        return 1.0
-    spread = covariance + to_camera @ np.linalg.inv(information) @ to_camera.T
-    # Cauchy's weight of the Mahalanobis distance in six dimensions.
-    return 1.0 / (1.0 + float(gap @ np.linalg.solve(spread, gap)) / 6)
-
-
-def _adjoint(motion: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
-    """Return the matrix that takes a twist (rotation, translation) through a motion."""
-    rotation, result = motion[:3, :3], np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = rotation
-    result[3:, :3] = hat(motion[:3, 3]) @ rotation
-    return result

@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float64
 
-from service.geometry import hat, moved, se3_log
+from service.geometry import adjoint, moved, se3_log
 from service.types import Pose, frozen
 
 
@@ -210,18 +210,10 @@ def _predicted(state: MotionState, dt: float, noise: MotionNoise) -> tuple[Motio
     """Return the state after dt, and the matrix that carries its error there."""
     step = moved(Pose(np.eye(4)), state.velocity * dt)
     transition = np.eye(12)
-    transition[:6, :6] = _adjoint(step.camera_from_world)
+    transition[:6, :6] = adjoint(step.camera_from_world)
     transition[:6, 6:] = dt * np.eye(6)
     covariance = transition @ state.covariance @ transition.T + noise.over(dt)
     return MotionState(moved(state.pose, state.velocity * dt), state.velocity, covariance), transition
-
-
-def _adjoint(motion: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6 6"]:
-    """Return the matrix that takes a twist (rotation, translation) through a motion."""
-    rotation, result = motion[:3, :3], np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = rotation
-    result[3:, :3] = hat(motion[:3, 3]) @ rotation
-    return result
 
 
 def _corrected(

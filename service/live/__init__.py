@@ -6,6 +6,6 @@
 Where the device sends odometry, `fusion` places it in the scene and carries frames that have no pose of their own;
 `odometry_fit` is the estimate, `odometry_scale` what is remembered of the scale.
 
-`recent_views` keeps the frames that are searched for together, `live_values` has what goes in and out, `live_tracker` the
-method, `background` the thread beside it, `pace` what the client is advised to send.
+`recent_views` keeps the frames that are searched for together, `live_values` has what goes in and out, `live_tracker`
+the method, `background` the thread beside it, `pace` what the client is advised to send.
 """
