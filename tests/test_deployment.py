@@ -99,6 +99,16 @@ def test_the_entrypoint_runs_the_kernels_that_were_compiled(entrypoint):
     assert len({name for name, _ in compiled}) == len({features for _, features in compiled}) == len(compiled)
 
 
+def test_on_arm_the_entrypoint_runs_its_kernels(entrypoint, tmp_path):
+    script = tmp_path / "entrypoint"
+    script.write_text(script.read_text().replace("/lib64/ld-linux-x86-64.so.2", str(tmp_path / "absent")))
+    (tmp_path / "uname").write_text("#!/bin/sh\necho aarch64\n")
+    (tmp_path / "uname").chmod(0o755)
+    assert "are compiled now" in entrypoint("serve")
+    assert "doctor generic +fp-armv8,+neon" in entrypoint("compile")
+    assert entrypoint("serve").startswith("serve generic +fp-armv8,+neon")
+
+
 def test_the_entrypoint_serves_the_demo_where_there_are_no_scenes(entrypoint, tmp_path):
     assert f'["{tmp_path}/opt/splatfix/demo/studio"]' in entrypoint("serve")
     (tmp_path / "scenes" / "mine").mkdir()
