@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from service.errors import InvalidOptions
 from service.estimators import icomma, inerf, mc_do, pnerf
 from service.geometry import pose_distance
 from service.pose.descent.losses import interest_region, loss_against
@@ -279,3 +280,34 @@ def test_the_blur_has_a_sigma_of_5_pixels_of_800_and_counts_four_fifths() -> Non
     value, _ = loss_against("blur", photo)(render)
     # The squares of a Gaussian of 2.5 pixels add up to 1 / (4 pi sigma^2).
     assert value * 400**2 == pytest.approx(1 + 0.8 / (4 * np.pi * 2.5**2), rel=1e-3)
+
+
+# ------------------------------------------------------------------ options
+
+LIMITS = {
+    inerf: {"steps": (1, 100_000), "rays": (0, 10_000_000), "rate": (0, 10), "long_side_px": (32, 4096)},
+    icomma: {"steps": (1, 100_000), "rematch_every": (1, 100_000), "rate": (0, 10), "long_side_px": (32, 4096)},
+    pnerf: {
+        "hypotheses": (1, 1024), "steps": (1, 100_000), "resample_every": (1, 100_000), "turn_rate": (0, 1),
+        "shift_rate": (0, 1), "long_side_px": (32, 4096),
+    },
+    mc_do: {
+        "hypotheses": (0, 4096), "range_deg": (0, 180), "range_share": (0, 10), "rounds": (0, 10),
+        "hypothesis_px": (64, 1024), "render_px": (64, 2048), "iterations": (0, 1000), "refinement_steps": (0, 10_000),
+    },
+}  # fmt: skip
+"""So that one request can't keep a worker for hours, nor take the memory of a huge image."""
+
+
+@pytest.mark.parametrize(
+    ("estimator", "name", "ends"),
+    [(each, name, ends) for each, limits in LIMITS.items() for name, ends in limits.items()],
+)
+def test_an_option_is_taken_up_to_its_limits_and_refused_beyond(estimator: Any, name: str, ends: tuple) -> None:
+    low, high = ends
+    for value in ends:
+        assert getattr(estimator.Options(**{name: value}), name) == value
+    for value in (low - 1, high + 1):
+        with pytest.raises(InvalidOptions, match=f"must lie in {low}..{high}, is {value}") as refused:
+            estimator.Options(**{name: value})
+        assert refused.value.where == name
