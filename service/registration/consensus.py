@@ -60,8 +60,10 @@ def agreeing(
         everyone = list(range(count))
         return fit_similarity(evidence, everyone, core.similarity, noise), everyone
     order = np.argsort(_distances(evidence, core.similarity, noise), kind="stable").tolist()
+    # Half: as long as most observations are right, those that agree best are.
     core = fit_similarity(evidence, sorted(order[:half]), core.similarity, noise)
     core_variance = max(_variance(core), _floor(evidence))
+    # From all downwards: the largest set that hangs together wastes no right observation.
     for size in range(count, half, -1):
         used = sorted(order[:size])
         fit = fit_similarity(evidence, used, core.similarity, noise)
@@ -86,6 +88,7 @@ def _trimmed(evidence: Evidence, similarity: Similarity, noise: Noise, half: int
 def _concentrated(evidence: Evidence, start: Similarity, noise: Noise, half: int) -> Fit:
     """Fit to the best half, and again to the half that then is best, until that stays."""
     chosen = _best(evidence, start, noise, half)
+    # As in fast LTS: the trimmed sum never grows, and a few rounds settle it.
     for _ in range(4):
         start = fit_similarity(evidence, chosen, start, noise, estimate_noise=False).similarity
         before, chosen = chosen, _best(evidence, start, noise, half)
@@ -106,6 +109,7 @@ def _floor(evidence: Evidence) -> float:
 
 def _variance(fit: Fit) -> float:
     """Return the variance of the residuals relative to the noise that the fit began with."""
+    # Over the rank, not over the number of parameters: some may be undetermined.
     redundancy = max(len(fit.whitened) - np.linalg.matrix_rank(fit.jacobian), 1)
     total = 0.0
     for kind in KINDS:
@@ -133,6 +137,7 @@ def _outliers(fit: Fit, evidence: Evidence, used: Sequence[int], config: Consens
             block = mine & (owners == number)
             size = int(block.sum())
             freedom = redundancy - size
+            # Without it the others would have nothing left to judge it by.
             if not size or freedom < 0.9:
                 continue
             # What the sum of squares loses if this observation may be anywhere.
@@ -169,6 +174,7 @@ def _starts(evidence: Evidence, rng: np.random.Generator, config: ConsensusConfi
             yield umeyama(*_pairs(seen, triple), fixed)
     if evidence.directions:
         yield from (_facing(evidence, o, starting) for o in seen if o.heading is not None)
+    # Rotations alone leave scale and place open: any will do to start from.
     for i in turned[: config.samples] if len(placed) < 2 else ():
         yield Similarity(_rotation(seen[i]), fixed or 1.0, np.zeros(3), np.zeros(3))
 
@@ -199,6 +205,7 @@ def _of_all(evidence: Evidence, placed: Sequence[int], turned: Sequence[int]) ->
         return umeyama(*_pairs(seen, placed), metric)
     world, target = _pairs(seen, placed) if placed else (np.zeros((1, 3)), np.zeros((1, 3)))
     spread = np.sqrt(((world - world.mean(0)) ** 2).sum()), np.sqrt(((target - target.mean(0)) ** 2).sum())
+    # Rotations cancel in the ratio of spreads, so the scale needs no rotation.
     scale = metric or (spread[1] / spread[0] if spread[0] > 1e-9 and spread[1] > 1e-9 else 1.0)
     return Similarity(rotation, float(scale), target.mean(0), world.mean(0))
 
@@ -211,6 +218,7 @@ def _rotation(seen: Observation) -> Float64[np.ndarray, "3 3"]:
 
 def _mean_rotation(rotations: Sequence[np.ndarray]) -> Float64[np.ndarray, "3 3"]:
     u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
+    # The nearest orthogonal matrix may be a reflection, which the last sign undoes.
     return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
 
 

@@ -51,6 +51,7 @@ def determined(
     # Scaled by the prior, the matrix is well conditioned: nothing is lost by its inverse.
     covariance = np.linalg.inv(information * np.outer(prior, prior) + np.eye(PARAMETERS)) * np.outer(prior, prior)
     if evidence.metres_per_unit is not None:
+        # A scale that was given has no uncertainty, whatever the prior says.
         covariance[6], covariance[:, 6] = 0.0, 0.0
     parts: list[Part] = []
     if np.sqrt(covariance[6, 6]) < config.log_scale:
@@ -60,11 +61,13 @@ def determined(
     tilt = across @ covariance[:3, :3] @ across
     tilt_sigma = float(np.sqrt(np.linalg.eigvalsh(tilt).max()))
     heading_sigma = float(np.sqrt(up @ covariance[:3, :3] @ up))
+    # A heading is an angle about up: it means nothing where up is open.
     if tilt_sigma < config.rotation:
         parts.append("up")
         if heading_sigma < config.rotation:
             parts.append("heading")
     place_sigma = float(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6]).max()))
+    # Coordinates of a point follow from the place only with the scale and all of the rotation.
     if place_sigma < 0.01 * prior[3] and {"scale", "heading"} <= set(parts):
         parts.append("position")
     reason = "" if len(parts) == len(PARTS) else _reason(parts, axes, evidence, used, tilt_sigma, heading_sigma)

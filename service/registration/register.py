@@ -55,10 +55,12 @@ def register(evidence: Evidence, rng: np.random.Generator) -> Registration:
 def _as_turned(evidence: Evidence, rng: np.random.Generator) -> tuple[Evidence, int, tuple[Fit, list[int]]]:
     """Return evidence and fit with the photos turned as fits best: by no or several quarter turns clockwise."""
     best = evidence, 0, agreeing(evidence, rng)
+    # Each turn costs a whole fit, and most files need none.
     if not evidence.may_be_turned or _turn_error(best[2][0]) < _TURNED:
         return best
     for quarter_turns in (1, 2, 3):
         angle = quarter_turns * np.pi / 2
+        # About the optical axis: the photo was turned, not the camera moved.
         turn = so3_exp(np.array([0.0, 0.0, -angle]))
         seen = [
             o if o.target_from_camera is None else replace(o, target_from_camera=o.target_from_camera @ turn)
@@ -93,6 +95,7 @@ def _check(evidence: Evidence) -> None:
 def _require_right_handed(evidence: Evidence, fit: Fit, used: Sequence[int]) -> None:
     """Raise RegistrationFailed if a reflection fits the positions far better than any rotation."""
     seen = [o for o in evidence.observations if o.position is not None]
+    # With fewer a reflection may fit as well by chance: points near a plane are their own mirror images.
     if len(seen) < 5:
         return
     world, target = np.array([o.position_in_world for o in seen]), np.array([o.position for o in seen])
@@ -123,6 +126,7 @@ def _small_sample_factor(fit: Fit, evidence: Evidence, used: Sequence[int]) -> f
     ]
     if not unsure:
         return 1.0
+    # A normal distribution's region is too small where few residuals have told the noise.
     unknowns = free_parameters(evidence)
     # Each kind's variance is estimated by itself: the one that is known worst counts.
     freedom = max(min(fit.redundancy(kind) for kind in unsure), 1.0)

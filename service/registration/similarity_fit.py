@@ -61,6 +61,7 @@ class Similarity:
         return replace(
             self,
             rotation=so3_exp(step[:3]) @ self.rotation,
+            # By the logarithm, so that the scale stays positive; clipped, as a bad step would overflow.
             scale=float(self.scale * np.exp(np.clip(step[6], -1.0, 1.0))),
             shift=self.shift + step[3:6],
         )
@@ -139,8 +140,10 @@ def fit_similarity(
     With `steps` of 0 it is only evaluated there.
     """
     if used:
+        # About their middle rotation and shift are nearly independent, and the steps well conditioned.
         start = start.about(np.mean([evidence.observations[i].position_in_world for i in used], axis=0))
     fit = _minimize(evidence, used, start, noise, steps)
+    # The fit depends on the weights and these on its residuals: both are repeated until neither changes.
     for _ in range(5 if estimate_noise else 0):
         noise, change = _with_estimated_noise(fit, evidence, used)
         if change < 1e-3:
@@ -176,6 +179,7 @@ def _minimize(evidence: Evidence, used: Sequence[int], similarity: Similarity, n
         ridge = damping * np.diag(np.diag(normal) + 1e-9 * np.trace(normal) + 1e-300)
         step[free] = -np.linalg.lstsq(normal + ridge, gradient, rcond=1e-14)[0]
         proposed = _evaluated(evidence, used, fit.similarity.moved(step), noise)
+        # At the minimum a step changes the cost by rounding only.
         if proposed.cost <= fit.cost * (1 + 1e-12):
             gain, fit = fit.cost - proposed.cost, proposed
             damping = max(damping / 10, _DAMPING)
@@ -206,6 +210,7 @@ def _evaluated(evidence: Evidence, used: Sequence[int], similarity: Similarity, 
         end = at + len(row.residual)
         covariance[at:end, at:end] += row.covariance
         at = end
+    # Drift correlates the observations, so they are whitened together, not one by one.
     lower = np.linalg.cholesky(covariance) if size else covariance
     whitened, white_jacobian = np.linalg.solve(lower, residual), np.linalg.solve(lower, jacobian)
     return Fit(similarity, noise, tuple(rows), whitened, white_jacobian, lower, _NO_HAT)
@@ -227,6 +232,7 @@ def _rows(evidence: Evidence, used: Sequence[int], similarity: Similarity, noise
         yield Row("other", -1, sine * stretch, jacobian, direction.sigma**2 * np.eye(2))
     for length in evidence.lengths:
         relative = length.sigma / length.metres
+        # In the logarithm, in which the scale is a parameter, a length is linear.
         error = np.array([np.log(scale * length.units / length.metres)])
         yield Row("other", -1, error, np.eye(PARAMETERS)[6:], np.array([[relative**2]]))
     for height in evidence.heights:
@@ -245,6 +251,7 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         stated = seen.position_covariance
         target = noise.position_sigma**2 * np.eye(3) if stated is None else stated
         covariance = target * noise.factors["position"] ** 2
+        # Localization's own uncertainty is in scene units and axes.
         own = scale**2 * rotation @ seen.world_covariance @ rotation.T
         jacobian = np.concatenate([-hat(arm), np.eye(3), arm[:, None]], 1)
         error = arm + similarity.shift - seen.position
@@ -260,6 +267,7 @@ def observation_rows(seen: Observation, number: int, similarity: Similarity, noi
         yield Row("rotation", number, error, jacobian, covariance + own, _share(own, covariance))
     if seen.heading is not None:
         x, y, _ = turned[:, 2]
+        # A camera that looks straight up or down has no azimuth to divide by.
         level = max(float(np.hypot(x, y)), 1e-3)
         error = (np.arctan2(x, y) - seen.heading + np.pi) % (2 * np.pi) - np.pi
         gradient = np.array([y, -x, 0.0]) / level**2
@@ -297,6 +305,7 @@ def _drift_covariance(
         if not mine:
             continue
         variance = (deviation * noise.factors[kind]) ** 2  # type: ignore[index]
+        # Of a random walk two places share the drift up to the nearer one.
         shared = variance * np.minimum.outer([at for _, at in mine], [at for _, at in mine]) / length
         index = np.add.outer([start for start, _ in mine], np.arange(3))
         for axis in range(3):
@@ -313,6 +322,7 @@ def _with_estimated_noise(fit: Fit, evidence: Evidence, used: Sequence[int]) -> 
             continue
         mine = fit.of_kind(kind)
         estimate = factors[kind] * float(np.sqrt(fit.whitened[mine] @ fit.whitened[mine] / redundancy))
+        # Stated noise may prove too small, but a lucky fit makes nothing more exact than it is stated.
         estimate = max(estimate, 1.0 if is_stated(kind, observations) else 1e-9)
         change = max(change, abs(np.log(estimate / factors[kind])))
         factors[kind] = estimate
