@@ -19,6 +19,7 @@ class AnchorLayer(Layer):
 
     def show(self, anchors: Mapping[str, Float64[np.ndarray, "3"]]) -> None:
         """Draw a scene's anchors, by name."""
+        # Nodes go by their number: of fewer anchors than before the last ones would stay.
         self.clear()
         if self.extent is None:
             return

@@ -22,6 +22,7 @@ class AxesLayer(Layer):
             return
         scale, unit = metres_per_unit or 1.0, "m" if metres_per_unit else "units"
         shown = round_length(0.4 * self.extent.radius * scale)
+        # In a world of map coordinates the origin may be out of sight.
         far = np.linalg.norm(self.extent.centre) > _FARTHEST * self.extent.radius
         start = self.extent.centre if far else np.zeros(3)
         ends = start + shown / scale * np.vstack([np.eye(3), self.extent.up])
@@ -34,4 +35,5 @@ class AxesLayer(Layer):
 def round_length(limit: float) -> float:
     """Return the largest of 1, 2 and 5 times a power of ten up to a positive limit."""
     power = 10.0 ** np.floor(np.log10(limit))
+    # Rounding must not exclude the limit itself.
     return float(power * max(step for step in (1, 2, 5) if step * power <= limit * (1 + 1e-9)))

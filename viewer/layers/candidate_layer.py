@@ -27,6 +27,7 @@ class CandidateLayer(Layer):
         scores = candidates.scores if candidates else np.zeros(0)
         colours = score_colours(scores)
         depth = self.extent.frustum_depth
+        # Stable: of equal scores the same frusta are shown after each step.
         best = np.argsort(-scores, kind="stable")[:_MAX_FRUSTA]
         segments = frustum_edges(poses[best], [photo] * len(best), 0.7 * depth)
         self._draw_lines("candidates", segments, edge_colours(linear_colours(colours[best])), 1.5)

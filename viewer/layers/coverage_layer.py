@@ -26,6 +26,7 @@ class CoverageLayer(Layer):
         rays = np.tile(found.directions_in_world, (len(found.positions_in_world), 1)) * found.cell
         segments = np.stack([middles + _INNER * rays, middles + _OUTER * rays], 1).astype(np.float32)
         probabilities = found.probabilities.ravel()
+        # NaN: from there a photo would see nothing of the scene.
         colours = np.array(
             [BLIND_COLOUR if np.isnan(p) else coverage_colour(p) for p in probabilities], np.uint8
         ).reshape(-1, 3)

@@ -21,6 +21,7 @@ class FloorPlanLayer(Layer):
     def show(self, content: SceneContent) -> None:
         """Draw a scene's plan."""
         splats, extent = content.splats, content.extent
+        # The service sends splats by importance, so the first matter most.
         kept = np.flatnonzero(below_the_cut(content))[:_MAX_POINTS]
         size = 0.008 * extent.radius
         self._draw_points("points", splats.centres[kept], splats.rgba[kept, :3], size)

@@ -27,6 +27,7 @@ class MeasureLayer(Layer):
         drawn = np.array(self._points)
         colours = np.tile(np.array(_COLOUR, np.uint8), (len(drawn), 1))
         self._draw_points("points", drawn, colours, 0.1 * self.extent.frustum_depth)
+        # A first point alone removes the line of the last distance.
         self._draw_lines("line", drawn[None].astype(np.float32)[:, :2] if len(drawn) == 2 else drawn[:0], _COLOUR, 3.0)
         if len(drawn) == 2:
             units = float(np.linalg.norm(drawn[1] - drawn[0]))
