@@ -49,11 +49,13 @@ def composed(
         target = (fisheye_radius if is_fisheye else radial_radius)(inner, given) / focal_factor
         # Beyond the radius at which it stops growing the image isn't used.
         usable = np.isfinite(target) & (np.diff(target, prepend=0.0) > 0) & (np.diff(inner, prepend=0.0) > 0)
+    # Up to the first radius that is not: beyond it the model may grow again.
     usable = np.logical_and.accumulate(usable)
     r, target = r[usable], target[usable]
     if is_fisheye:
         theta = np.arctan(r)
         return "OPENCV_FISHEYE", tuple(_fitted(theta, target - theta, 4).tolist())
+    # Each coefficient belongs to a power of the radius, which the factor scales.
     scaled = given * focal_factor ** np.array([2, 4, 1, 1, 6, 2, 4, 6])
     held = scaled.copy()
     held[:2] = 0.0

@@ -32,6 +32,7 @@ def geographic(anchor: GeoAnchor, pose: Pose) -> tuple[Float64[np.ndarray, "3"],
     enu = scaled @ pose.position_in_world + anchor.enu_from_world[:3, 3]
     latitude, longitude, height = ecef_from_geodetic.transform(*(origin + ecef_from_enu @ enu), direction="INVERSE")
     ecef_from_camera = ecef_from_enu @ enu_from_world @ pose.world_from_camera[:3, :3] @ _OPENCV_FROM_OPENGL
+    # Of the camera's own place: east and north there differ from those at the anchor.
     rotation = quat_from_rotation(_ecef_from_enu(latitude, longitude).T @ ecef_from_camera)
     return np.array([latitude, longitude, height]), rotation
 

@@ -81,6 +81,7 @@ def smoothed(photos: Sequence[TimedPose], config: SmoothingConfig = SMOOTHING) -
     """
     answers: list[SmoothedPose | None] = [None] * len(photos)
     known = [p.covariance for p in photos if p.pose is not None and p.covariance is not None]
+    # Of all-unknown covariances only the ratio to the motion matters, which is estimated.
     usual = np.median(known, axis=0) if known else np.eye(6) * 1e-6
     filled = [replace(p, covariance=usual) if p.pose is not None and p.covariance is None else p for p in photos]
     for begin, end in _stretches(filled, config.max_gap_s):
@@ -103,6 +104,7 @@ def _stretches(photos: Sequence[TimedPose], max_gap_s: float) -> list[tuple[int,
 
 def _smoothed_stretch(photos: Sequence[TimedPose], config: SmoothingConfig) -> list[SmoothedPose]:
     known = [p for p in photos if p.pose is not None]
+    # Two poses have one velocity: nothing tells jitter from motion.
     if len(known) < 3:
         return _joined(photos, known)
     noise, scale = _most_probable_noise(photos, config)
@@ -135,6 +137,7 @@ def _most_probable_noise(photos: Sequence[TimedPose], config: SmoothingConfig) -
     times = np.array([time_s for time_s, _ in known])
     steps = [_step(a, b) for (_, a), (_, b) in pairwise(known)]
     gaps = np.maximum(np.diff(times), 1e-6)
+    # A first guess: the noise that makes the changes of velocity that were seen.
     changes = np.diff(np.array(steps) / gaps[:, None], axis=0)
     shown = np.mean(changes**2, axis=0) / np.mean(gaps) + 1e-18
     noise = MotionNoise(float(shown[:3].mean()), float(shown[3:].mean()))
