@@ -22,6 +22,7 @@ from service.pose.verification.gate import VERIFICATION, doubted, photometric_su
 from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.pose.verification.photo_quality import photo_faults
 from service.pose.verification.precision import AskedBounds, probability_within
+from service.pose.verification.rig_gate import rig_verdict
 from service.pose.verification.signals import geometry_signals, match_signals, typical_depth
 from service.results import Reason, Status, Verdict
 from service.types import NO_CORRECTION, Camera, Intrinsics, Pose, Query
@@ -516,3 +517,75 @@ def test_one_steps_back_from_what_fills_the_photo_and_is_near(distance: float, k
     partly = replace(seen(distance=24.0), solid=columns(95))
     assert "step back" not in " ".join(advice._about_position(partly, each, 100.0, ADVICE))
     assert advice._about_position(seen(distance=24.0), replace(each, covariance=None), 100.0, ADVICE) == []
+
+
+# ------------------------------------------------------------------ the photos of a rig
+
+
+def rig_photo(inliers: int = 100, share: float = 0.5, colour: float = 0.99) -> Verdict:
+    told = signals(inliers=float(inliers), inlier_share=share, local_colour_correlation=colour)
+    return replace(verdict(), inliers=inliers, signals=told)
+
+
+def of_rig(
+    *photos: Verdict, place: float = 0.3, rival: float = 0.0, spread: np.ndarray | None = None, **changed: Any
+) -> Verdict:
+    gate_config = replace(VERIFICATION, model=PlantedModel(place))
+    spread = covariance() if spread is None else spread
+    return rig_verdict(photos, changed.get("given", spread), ASKED, rival, gate=gate_config)
+
+
+@pytest.mark.parametrize(
+    ("second", "reason"),
+    [
+        (rig_photo(), "verified"),
+        # A photo agrees with 25 matches, a fifth of all, and colours of 0.97; else it can't tell...
+        (rig_photo(25), "verified"),
+        (rig_photo(24), "few_inliers"),
+        (rig_photo(share=0.2), "verified"),
+        (rig_photo(share=0.199), "few_inliers"),
+        (rig_photo(colour=0.97), "verified"),
+        # ...or contradicts, if its matches agree. Two must agree in any case.
+        (rig_photo(colour=0.969), "few_inliers"),
+    ],
+)
+def test_two_photos_of_a_rig_must_agree(second: Verdict, reason: str) -> None:
+    assert of_rig(rig_photo(), second).reason is Reason(reason)
+
+
+def test_a_rig_needs_eighty_matches_in_all_and_more_photos_that_agree_than_contradict() -> None:
+    assert of_rig(rig_photo(40), rig_photo(40)).reason is Reason.VERIFIED
+    few = of_rig(rig_photo(40), rig_photo(39))
+    assert (few.reason, few.status, few.right_place) == (Reason.FEW_INLIERS, Status.UNCERTAIN, 0.5)
+    assert of_rig(rig_photo(0), rig_photo(0)).reason is Reason.NO_MATCHING_VIEW
+    wrong = rig_photo(colour=0.5)
+    assert of_rig(rig_photo(), rig_photo(), wrong).reason is Reason.VERIFIED
+    even = of_rig(rig_photo(), rig_photo(), wrong, wrong)
+    assert (even.reason, even.status, even.right_place) == (Reason.RENDER_MISMATCH, Status.UNCERTAIN, 0.5)
+    # What is hidden doesn't contradict.
+    assert (
+        of_rig(rig_photo(), rig_photo(), rig_photo(3, colour=0.1), rig_photo(2, colour=0.1)).reason is Reason.VERIFIED
+    )
+    # Where none agrees nothing is found.
+    assert of_rig(wrong, wrong).status is Status.NOT_LOCALIZED
+
+
+def test_a_rig_is_in_the_right_place_as_if_each_photo_that_agrees_was_evidence_by_itself() -> None:
+    # By the model 0.3, at least 0.6: both wrong in 0.16 of all cases; a third that can't tell adds nothing.
+    assert of_rig(rig_photo(), rig_photo(), rig_photo(3)).right_place == pytest.approx(1 - 0.4**2)
+    found = of_rig(rig_photo(), rig_photo(), rig_photo(), place=0.9)
+    assert found.right_place == pytest.approx(1 - 0.1**3)
+    assert (found.inliers, found.status) == (300, Status.LOCALIZED)
+    assert found.score == pytest.approx(found.right_place * found.precise)
+    assert found.signals == {"agreeing": 3.0, "contradicting": 0.0, "rival_share": 0.0}
+
+
+def test_another_pose_with_half_of_the_matches_makes_a_rig_ambiguous_and_a_wide_covariance_uncertain() -> None:
+    assert of_rig(rig_photo(), rig_photo(), rival=0.5).reason is Reason.VERIFIED
+    rival = of_rig(rig_photo(), rig_photo(), rival=0.501)
+    assert (rival.reason, rival.status, rival.right_place) == (Reason.AMBIGUOUS, Status.UNCERTAIN, 0.5)
+    for probability, reason in ((0.911, Reason.VERIFIED), (0.909, Reason.POSITION_UNCERTAIN)):
+        spread = covariance(1e-6, sigma_of_probability(probability))
+        assert of_rig(rig_photo(), rig_photo(), spread=spread).reason is reason
+    unknown = of_rig(rig_photo(), rig_photo(), given=None)
+    assert (unknown.status, unknown.precise, unknown.score) == (Status.NOT_LOCALIZED, 0.0, 0.0)
