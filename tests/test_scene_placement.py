@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from service.bench.fleet_simulation import FleetModel, FleetSimulation
 from service.errors import CorruptScene, SceneInUse, SceneNotFound, SceneTooLarge, SceneUnloaded
 from service.jobs.engine import HeldScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
@@ -54,21 +55,33 @@ def test_a_long_queue_is_worth_another_copy_and_a_short_one_is_not():
     assert {choice.replica for choice in choices[21:]} == {"b"}
 
 
-def test_what_was_used_longest_ago_makes_room_and_what_is_elsewhere_first():
+def test_a_crowded_scene_gets_a_copy_beside_and_a_burst_does_not():
+    table = placement(250, x=100, y=100, z=100)
+    run_job(table, "x")
+    held = []
+    for _ in range(12):  # a burst
+        held.append(run_job(table, "x", keep=True).replica)
+        assert table.extra_copy("x") is None
+    extra = None
+    for _ in range(30):  # as many wait all the time
+        table.release(held.pop(0), ("x",))
+        held.append(run_job(table, "x", keep=True).replica)
+        if extra := table.extra_copy("x"):
+            break
+    assert extra == Choice("b", ("x",), ())
+    table.take(extra, ("x",))
+    assert table.extra_copy("x") is None  # one at a time
+    table.loaded("b", "x", 100)
+    table.release("b", ("x",))
+    assert [run_job(table, "x", keep=True).replica for _ in range(8)] == ["b"] * 8  # until both have as many
+
+
+def test_what_was_used_longest_ago_makes_room():
     table = placement(250, "a", w=100, x=100, y=100, z=100)
     run_job(table, "w")
     run_job(table, "x")
     run_job(table, "w")
     assert run_job(table, "y") == Choice("a", ("y",), ("x",))
-    both = placement(250, w=100, x=100, y=100)
-    run_job(both, "w")
-    both.take(Choice("a", ("x",), ()), ("x",))
-    both.loaded("a", "x", 100)
-    both.release("a", ("x",))
-    both.take(Choice("b", ("x",), ()), ("x",))
-    both.loaded("b", "x", 100)
-    both.loaded("b", "pinned", 150, pinned=True)
-    assert both.choose(("y",)) == Choice("a", ("y",), ("x",))  # w was used before, but is nowhere else
 
 
 def test_scenes_in_use_stay_and_the_job_waits():
@@ -371,3 +384,22 @@ def test_what_a_dead_front_held_is_let_go(monkeypatch):
     monkeypatch.setattr("service.jobs.scene_coordinator._WATCH_S", 0.05)
     monkeypatch.setattr("service.jobs.scene_coordinator._FRONT_S", 0.2)
     with_fleet(check)
+
+
+# ------------------------------------------------------------------ the simulation
+
+
+def test_one_replica_waits_as_queueing_theory_says():
+    """M/M/1 at a load of 0.6: a job takes 1/(1 - 0.6) = 2.5 service times on average, the median is ln 2 of that."""
+    found = FleetSimulation(FleetModel(1, 1, jobs=30_000, service_s=0.1)).run()
+    assert found.busy_share == pytest.approx(0.6, abs=0.02)
+    assert found.p50_s == pytest.approx(0.25 * np.log(2), rel=0.1)  # seen: 0.176 of 0.173
+    assert found.p95_s == pytest.approx(0.25 * np.log(20), rel=0.1)
+    assert (found.loads_per_job, found.found_share, found.ended) == (0, 1, 30_000)
+
+
+def test_every_simulated_job_ends_whatever_dies():
+    found = FleetSimulation(FleetModel(4, 40, jobs=3000, scenes_in_memory=12, failures_per_hour=200.0)).run()
+    assert found.ended == 3000
+    assert found.repeated > 0
+    assert found.loads_per_job > 0

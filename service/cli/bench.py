@@ -9,6 +9,7 @@ from service.cli.bench_coverage import bench_coverage
 from service.cli.bench_device import bench_device
 from service.cli.bench_evaluate import bench_evaluate
 from service.cli.bench_field import bench_field
+from service.cli.bench_fleet import bench_fleet
 from service.cli.bench_gate import bench_gate
 from service.cli.bench_gpu import bench_gpu
 from service.cli.bench_live import bench_live
@@ -34,3 +35,4 @@ bench_app.command("scale")(bench_scale)
 bench_app.command("ablation")(bench_ablation)
 bench_app.command("field")(bench_field)
 bench_app.command("evaluate")(bench_evaluate)
+bench_app.command("fleet")(bench_fleet)

@@ -2,8 +2,8 @@
 
 The Ray engine and the simulation in `bench` run this same code. A job goes to the replica at which it is expected to
 begin first, with the work that it causes there: jobs before it take `service_s` each, a scene that isn't there takes
-its load, and one that has to go for it will be loaded again some time. So a job goes where its scene is; a scene gets
-another copy when the queue at its replicas is worth more than two loads, and loses copies as the least recently used.
+its load, and one that has to go for it will be loaded again some time. So a job goes where its scene is. A scene whose
+jobs find others before them again and again gets another copy, loaded beside; copies go as the least recently used.
 Scenes in use are never dropped.
 """
 
@@ -28,6 +28,12 @@ class PlacementConfig:
     load_bytes_per_s: float = 100e6
     """Reading and preparing, by what the scene takes of memory then."""
 
+    crowded: float = 5.0
+    """Jobs that those of a scene find before them, smoothed over some ten: beyond that it gets another copy. A burst of
+    a dozen doesn't reach it."""
+    smoothing: float = 0.1
+    """Share of the latest job in that mean."""
+
 
 @dataclass(slots=True)
 class SceneCopy:
@@ -48,11 +54,8 @@ class SceneCopy:
 class _Replica:
     copies: dict[str, SceneCopy] = field(default_factory=dict)
     jobs: int = 0
-
-    @property
-    def bytes(self) -> int:
-        """Of all its scenes."""
-        return sum(copy.bytes for copy in self.copies.values())
+    bytes: int = 0
+    """Of all its scenes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +76,10 @@ class Placement:
         self._config = config
         self._replicas: dict[str, _Replica] = {}
         self._sizes: dict[str, int] = {}
+        self._holders: dict[str, set[str]] = {}
+        """The replicas of each scene: the table's other direction."""
+        self._queues: dict[str, float] = {}
+        """By scene: how many jobs a job of it found before it, smoothed."""
         self._decisions = 0
 
     # ------------------------------------------------------------------ what there is
@@ -83,7 +90,9 @@ class Placement:
 
     def remove_replica(self, replica: str) -> None:
         """Forget a replica with all that it had; without effect if it isn't known."""
-        self._replicas.pop(replica, None)
+        gone = self._replicas.pop(replica, None)
+        for scene in gone.copies if gone else ():
+            self._holders[scene].discard(replica)
 
     def replicas(self) -> list[str]:
         """Return the replicas' names."""
@@ -91,7 +100,7 @@ class Placement:
 
     def copies(self, scene: str) -> dict[str, SceneCopy]:
         """Return a scene's copies by replica."""
-        return {name: r.copies[scene] for name, r in self._replicas.items() if scene in r.copies}
+        return {name: self._replicas[name].copies[scene] for name in sorted(self._holders.get(scene, ()))}
 
     def scenes(self, replica: str) -> dict[str, SceneCopy]:
         """Return the scenes of a replica."""
@@ -126,9 +135,16 @@ class Placement:
         # In a fleet where all candidates are full of scenes in use, another may have room.
         return best or self._best(self._replicas, scenes)
 
+    def _is_missed(self, scene: str) -> bool:
+        """Return whether a scene would soon be loaded again if one copy of it went: it has no other, and is in use."""
+        copies = self.copies(scene)
+        # One load in so many jobs costs a tenth of what the jobs take.
+        often = 10 * self._load_s(self.size(scene)) / self._config.service_s
+        return len(copies) == 1 and self._decisions - max(copy.used for copy in copies.values()) < often
+
     def _candidates(self, scenes: Sequence[str]) -> list[str]:
         """Return the replicas that have any of the scenes, and some of the others that have the least to do."""
-        there = {name for name, replica in self._replicas.items() if any(s in replica.copies for s in scenes)}
+        there = set().union(*(self._holders.get(scene, ()) for scene in scenes))
         others = ((r.jobs, r.bytes, name) for name, r in self._replicas.items() if name not in there)
         return [*sorted(there), *(name for *_, name in heapq.nsmallest(_OTHERS, others))]
 
@@ -150,13 +166,31 @@ class Placement:
         replica = self._replicas[choice.replica]
         self._decisions += 1
         for scene in choice.drop:
-            del replica.copies[scene]
+            self.dropped(choice.replica, scene)
         for scene in choice.load:
-            replica.copies[scene] = SceneCopy(self.size(scene))
+            self._put(choice.replica, scene, self.size(scene))
         for scene in scenes:
             replica.copies[scene].uses += 1
             replica.copies[scene].used = self._decisions
+            before = self._queues.get(scene, 0.0)
+            self._queues[scene] = before + self._config.smoothing * (replica.jobs - before)
         replica.jobs += 1
+
+    def extra_copy(self, scene: str) -> Choice | None:
+        """Return where another copy of a scene should be loaded because its jobs wait for each other; None: nowhere."""
+        there = self.copies(scene)
+        crowded = self._queues.get(scene, 0.0) > self._config.crowded
+        if not crowded or not all(copy.ready for copy in there.values()):
+            return None
+        fewest = min((self._replicas[name].jobs for name in there), default=0)
+        names = [name for name in self._candidates((scene,)) if name not in there]
+        # No copy where jobs would wait as long.
+        choice = self._best([name for name in names if self._replicas[name].jobs < fewest / 2], (scene,))
+        if choice and any(self._is_missed(other) for other in choice.drop):
+            return None
+        if choice:
+            self._queues[scene] = 0.0  # whether it was enough is seen anew
+        return choice
 
     def release(self, name: str, scenes: Sequence[str]) -> None:
         """Count one job less that uses the scenes; without effect on a replica that is gone."""
@@ -171,18 +205,29 @@ class Placement:
     def loaded(self, name: str, scene: str, size: int, *, pinned: bool = False) -> tuple[str, ...]:
         """Note that a scene is in memory and what it takes; return what to drop where it takes more than expected."""
         replica = self._replicas[name]
-        copy = replica.copies.setdefault(scene, SceneCopy(size))
-        copy.bytes = self._sizes[scene] = size
+        copy = self._put(name, scene, size)
+        self._sizes[scene] = size
         copy.ready, copy.pinned = True, pinned
         over = self._to_drop(replica, (), (scene,)) or ()
         for other in over:
-            del replica.copies[other]
+            self.dropped(name, other)
         return over
+
+    def _put(self, name: str, scene: str, size: int) -> SceneCopy:
+        """Enter a copy, or its size if it is there."""
+        replica = self._replicas[name]
+        copy = replica.copies.setdefault(scene, SceneCopy(0))
+        replica.bytes += size - copy.bytes
+        copy.bytes = size
+        self._holders.setdefault(scene, set()).add(name)
+        return copy
 
     def dropped(self, name: str, scene: str) -> None:
         """Note that a scene isn't in a replica's memory: its load failed, or it was taken out."""
-        if replica := self._replicas.get(name):
-            replica.copies.pop(scene, None)
+        replica = self._replicas.get(name)
+        if replica and (copy := replica.copies.pop(scene, None)):
+            replica.bytes -= copy.bytes
+            self._holders[scene].discard(name)
 
     # ------------------------------------------------------------------ what they rest on
 
@@ -210,8 +255,7 @@ class Placement:
         idle = [
             name for name, c in replica.copies.items() if c.ready and not c.uses and not c.pinned and name not in kept
         ]
-        # Of scenes that are elsewhere, too, a copy is missed least.
-        idle.sort(key=lambda name: (not self._is_elsewhere(name, replica), replica.copies[name].used))
+        idle.sort(key=lambda name: replica.copies[name].used)
         drop: list[str] = []
         for name in idle:
             if over <= 0:
@@ -219,6 +263,3 @@ class Placement:
             over -= replica.copies[name].bytes
             drop.append(name)
         return tuple(drop) if over <= 0 or not load else None
-
-    def _is_elsewhere(self, scene: str, replica: _Replica) -> bool:
-        return any(scene in other.copies for other in self._replicas.values() if other is not replica)

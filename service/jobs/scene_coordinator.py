@@ -321,6 +321,9 @@ class SceneCoordinator:
         self._placement.take(choice, ids)
         stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
         call = self._replicas[choice.replica].hold.remote(choice.drop, stored, ids)
+        for scene_id in ids:
+            if extra := self._placement.extra_copy(scene_id):
+                self._in_background(self._copy(extra, scene_id))
         task = self._in_background(self._finish_hold(front, choice.replica, ids, call))
         try:
             # Shielded: who leaves must not cancel a load that others wait for.
@@ -329,6 +332,12 @@ class SceneCoordinator:
             task.add_done_callback(self._release_unwanted)
             raise
         return HeldAt(replace(held, left_out=left_out), self._replicas[choice.replica])
+
+    async def _copy(self, extra: Choice, scene_id: str) -> None:
+        """Load another copy of a scene, beside the jobs."""
+        with suppress(ReplicaLost, SplatfixError):
+            held = await self._hold_at("", extra, (scene_id,), ())
+            await self.release(held.held.token)
 
     async def _finish_hold(self, front: str, name: str, ids: tuple[str, ...], call: Awaitable[Any]) -> HeldScenes:
         """Put on record what became of a call to hold scenes. Raises why they can't be held, and ReplicaLost."""
