@@ -15,16 +15,14 @@ from service.cli.terminal import err, out
 def bench_fleet(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures to a file.")] = None,
 ) -> None:
-    """Simulate fleets of 2 to 1000 replicas: what scenes, memory and failures do to latency."""
+    """Simulate fleets of 2 to 100 replicas: what scenes, memory and failures do to latency."""
     from rich.table import Table
 
     from service.bench.fleet_simulation import run
 
     with err.status("simulating"):
         rows = run()
-    table = Table(
-        "replicas", "scenes", "in memory of each", "failures/h", "p50 s", "p95 s", "p99 s", "loads/job", "busy"
-    )
+    table = Table("replicas", "scenes", "in each", "failures/h", "p50 s", "p95 s", "p99 s", "loads/job", "busy")
     for model, found in rows:
         table.add_row(
             *(str(model.replicas), str(model.scenes), str(model.scenes_in_memory), f"{model.failures_per_hour:g}"),
