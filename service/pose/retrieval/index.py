@@ -30,7 +30,7 @@ from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera
 
-VERSION = 9
+VERSION = 10
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 

@@ -58,7 +58,8 @@ class PlacementConfig:
     one by less than this share."""
     score_quantile: float = 0.9
     min_score_share: float = 0.5
-    """A candidate is solid if its share of such pixels is at least `min_score_share` of this quantile of all shares."""
+    """A candidate is solid if its share of such pixels is at least `min_score_share` of this quantile of all shares;
+    in the choice at the end, of the shares of those as far from the scene's middle, by octave."""
     voxel_share: float = 0.25
     """Side of the voxels in which surfaces are recorded, as a share of the typical distance."""
     rounds: int = 24
@@ -71,11 +72,13 @@ class PlacementConfig:
     """Share of the opaque Gaussians that any good view sees: the search ends there, or when a round adds less."""
     least_seen_share: float = 0.25
     """The share of them, seen by the fewest good views, that a round aims at."""
-    interior_enclosure: float = 0.7
+    interior_enclosure: float = 0.85
     relative_enclosure: float = 0.6
     enclosure_quantile: float = 0.95
     """The scene is an interior if this quantile of the solid views' enclosures (shares of closed directions) is at
-    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile."""
+    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile. A closed room has 1.00, the
+    inside of a hollow object 0.75, other objects and open scenes 0.50 to 0.62. Of a room that is taken for an open
+    scene, views are wasted; of an object that is taken for a room, all views are in its inside."""
     min_views: int = 64
     max_views: int = 1000
     covered_share: float = 0.93
@@ -142,6 +145,11 @@ def find_views(
     # With a second up direction each place may have two views.
     limited = replace(config, max_views=config.max_views // (1 + len(others)))
     chosen = good[_choice([views.cells(i) for i in good], limited)]
+    # An object before a soft background is rarely solid from where photos of the whole are taken.
+    afar = np.setdiff1d(views.good(or_best_from_afar=True), good)
+    if len(afar) and len(chosen) < limited.max_views:
+        limited = replace(limited, min_views=0, max_views=limited.max_views - len(chosen))
+        chosen = np.concatenate([chosen, afar[_choice([views.cells(i) for i in afar], limited)]])
     lens = search_camera(config.render_px, config.fov_deg)
     cameras = tuple(Camera(lens, pose) for i in chosen for pose in _uprights(views.poses[i], others, config))
     coverage = _covered(views.seen(chosen))
@@ -231,10 +239,20 @@ class _Views:
             voxels = np.floor(self._surfaces[-1] / self._voxel).astype(np.int64)
             self._surface_ids.append(np.unique(cell_ids(voxels)))
 
-    def good(self) -> Int64[np.ndarray, "k"]:
-        """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior."""
+    def good(self, or_best_from_afar: bool = False) -> Int64[np.ndarray, "k"]:
+        """Return which candidates are solid and, in an interior, inside; note whether the scene is an interior.
+
+        `or_best_from_afar`: also those that are solid among the candidates as far from the scene's middle.
+        """
         scores, enclosures = np.array(self.scores), np.array(self._enclosures)
-        least = self._config.min_score_share * np.quantile(scores, self._config.score_quantile)
+        least = self._least_score(scores)
+        if or_best_from_afar:
+            away = np.linalg.norm([pose.position_in_world for pose in self.poses] - self._space.middle, axis=1)
+            octaves = np.rint(np.log2(np.maximum(away / max(self._space.radius, 1e-12), 1)))
+            # From farther away more of the image is background, which is rarely solid.
+            limits = {octave: self._least_score(scores[octaves == octave]) for octave in np.unique(octaves)}
+            by_octave = [limits[octave] for octave in octaves]
+            least = np.minimum(least, by_octave)
         solid = np.flatnonzero((scores >= least) & (scores > 0))
         # Not the maximum: a single view may stand in a closet.
         limit = float(np.quantile(enclosures[solid], self._config.enclosure_quantile)) if len(solid) else 0.0
@@ -242,6 +260,9 @@ class _Views:
             self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
         )
         return solid[enclosures[solid] >= self._least_enclosed]
+
+    def _least_score(self, scores: Float64[np.ndarray, "n"]) -> float:
+        return self._config.min_score_share * float(np.quantile(scores, self._config.score_quantile))
 
     def seen(self, chosen: Int64[np.ndarray, "k"]) -> Int64[np.ndarray, "n"]:
         """Return for each point of the space how many of the views see its voxel."""

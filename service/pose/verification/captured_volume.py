@@ -1,7 +1,6 @@
 """Whether a pose shows what was captured: surfaces that views of the scene's index see about as it does.
 
-A scene tells nothing of the back of its surfaces, nor of how they look from much nearer or farther than photos were
-taken; what it renders there is a guess of its trainer. Views of the index stand where photos were taken, or, in a scene
+A scene tells nothing of the back of its surfaces, nor of how they look much finer or coarser than in the photos; what it renders there is a guess of its trainer. Views of the index stand where photos were taken, or, in a scene
 without cameras, where its surfaces look like some.
 """
 
@@ -29,9 +28,10 @@ class CaptureConfig:
     """Of those points."""
     max_turn_deg: float = 60.0
     """Between the rays of pose and view to a point. A surface that is seen from its back turns by more than 90."""
-    max_nearer: float = 8.0
-    """Distance of the view from it, relative to the pose's: nearer, the scene looks softer, but like itself..."""
-    max_farther: float = 3.0
+    max_finer: float = 8.0
+    """Size that a pixel of the view's has on it, relative to one of the pose's (images of the same width): finer, the
+    scene looks softer, but like itself..."""
+    max_coarser: float = 3.0
     """...and of the pose's, relative to the view's; features match within 2."""
     min_share: float = 0.5
     """Share of the points that are captured, below which the pose is outside."""
@@ -79,7 +79,7 @@ def _is_beside_a_view(pose: Pose, views: Sequence[View], config: CaptureConfig) 
 def captured_share(
     frame: Frame, camera: Camera, views: Sequence[Camera], config: CaptureConfig = CAPTURE
 ) -> float | None:
-    """Return the share of a render's surface points that a view sees from a like direction and distance.
+    """Return the share of a render's surface points that a view sees from a like direction, at a like scale.
 
     None if it shows no surface. That a nearer surface may hide a point from a view is not examined.
     """
@@ -97,11 +97,17 @@ def captured_share(
     captured = np.zeros(len(points), bool)
     for view in views:
         rays, distances = _rays(points, view.pose)
-        ratio = distances / own_distances
+        # A telephoto lens sees from far away what a view shows from near.
+        ratio = distances / own_distances * (_relative_focal(camera.intrinsics) / _relative_focal(view.intrinsics))
         alike = (own_rays * rays).sum(1) > _cosine(config.max_turn_deg)
-        alike &= (ratio < config.max_nearer) & (ratio > 1 / config.max_farther)
+        alike &= (ratio < config.max_finer) & (ratio > 1 / config.max_coarser)
         captured |= alike & _in_image(points, view)
     return float(captured.mean())
+
+
+def _relative_focal(size: Intrinsics) -> float:
+    """Return the focal length in units of the image's long side."""
+    return float(np.sqrt(size.fx * size.fy) / max(size.width, size.height))
 
 
 def _in_image(points: Float64[np.ndarray, "n 3"], view: Camera) -> Bool[np.ndarray, "n"]:
