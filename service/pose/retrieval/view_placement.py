@@ -76,8 +76,8 @@ class PlacementConfig:
     relative_enclosure: float = 0.6
     enclosure_quantile: float = 0.95
     """The scene is an interior if this quantile of the solid views' enclosures (shares of closed directions) is at
-    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile. A closed room has 1.00, the
-    inside of a hollow object 0.75, other objects and open scenes 0.50 to 0.62. Of a room that is taken for an open
+    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile. A closed room has 1.00,
+    the inside of a hollow object 0.75, other objects and open scenes 0.50 to 0.62. Of a room that is taken for an open
     scene, views are wasted; of an object that is taken for a room, all views are in its inside."""
     min_views: int = 64
     max_views: int = 1000
@@ -144,16 +144,24 @@ def find_views(
     others = () if scene.info.up_in_world else OTHER_UPS
     # With a second up direction each place may have two views.
     limited = replace(config, max_views=config.max_views // (1 + len(others)))
-    chosen = good[_choice([views.cells(i) for i in good], limited)]
-    # An object before a soft background is rarely solid from where photos of the whole are taken.
-    afar = np.setdiff1d(views.good(or_best_from_afar=True), good)
-    if len(afar) and len(chosen) < limited.max_views:
-        limited = replace(limited, min_views=0, max_views=limited.max_views - len(chosen))
-        chosen = np.concatenate([chosen, afar[_choice([views.cells(i) for i in afar], limited)]])
+    chosen = _chosen(views, good, limited)
     lens = search_camera(config.render_px, config.fov_deg)
     cameras = tuple(Camera(lens, pose) for i in chosen for pose in _uprights(views.poses[i], others, config))
     coverage = _covered(views.seen(chosen))
     return Placement(cameras, len(views.poses), len(good), coverage, space.distance, views.interior)
+
+
+def _chosen(views: _Views, good: Int64[np.ndarray, "k"], config: PlacementConfig) -> Int64[np.ndarray, "c"]:
+    """Return the choice of the good views and, where there is room, one of the best from afar."""
+    chosen = good[_choice([views.cells(i) for i in good], config)]
+    # An object before a soft background is rarely solid from where photos of the whole are taken.
+    afar = np.setdiff1d(views.good(or_best_from_afar=True), good)
+    room = config.max_views - len(chosen)
+    if not len(afar) or room < 1:
+        return chosen
+    return np.concatenate(
+        [chosen, afar[_choice([views.cells(i) for i in afar], replace(config, min_views=0, max_views=room))]]
+    )
 
 
 def _uprights(pose: Pose, ups: Sequence[tuple[float, float, float]], config: PlacementConfig) -> list[Pose]:
