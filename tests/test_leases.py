@@ -6,6 +6,8 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from api_server import GO_ON, photo, until
@@ -18,6 +20,7 @@ from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.job_order import JobOrder
 from service.jobs.model import JobSpec, StoredJob
 from service.jobs.service import Jobs
+from service.jobs.worker import Worker
 
 
 class CountingObserver:
@@ -120,3 +123,29 @@ def test_a_job_whose_attempts_are_all_lost_is_interrupted(stepping):
         assert (job.state, job.attempt, job.lost) == ("interrupted", 1, 1)
         assert job.failure
         assert job.failure.code == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("state", "cancelled", "ended_here", "refused", "cleaned"),
+    [
+        ("queued", True, True, True, True),
+        ("queued", True, False, True, False),  # somebody else was faster to end it
+        ("cancelled", True, False, True, False),
+        ("running", True, False, False, False),  # another process makes an attempt, and will end it
+        ("queued", False, True, False, False),
+        ("succeeded", False, False, False, False),
+    ],
+)
+def test_a_job_that_was_cancelled_before_it_began_is_ended_by_who_can_not_claim_it(
+    state: str, cancelled: bool, ended_here: bool, refused: bool, cleaned: bool
+) -> None:
+    ended, cleaned_up = [], []
+    job = SimpleNamespace(cancelled=cancelled, state=state, ended=state in ("cancelled", "succeeded"))
+    store = SimpleNamespace(
+        get=lambda job_id: job, end_queued=lambda job, ending, until: ended.append(ending.state) or ended_here
+    )
+    worker: Any = SimpleNamespace(_store=store, photo_until=lambda: None, clean_up=cleaned_up.append)
+    live: Any = SimpleNamespace(id="j")
+    assert Worker._refused(worker, live) is refused
+    assert ended == (["cancelled"] if cancelled else [])
+    assert cleaned_up == ([live] if cleaned else [])
