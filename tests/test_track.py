@@ -312,6 +312,7 @@ def test_a_live_frame_without_a_pose_is_carried_by_odometry(room):
     assert np.linalg.norm(matrix[:3, 3] - camera[-1].position_in_world) < 0.01
 
 
+@pytest.mark.ci
 def test_live_frames_that_fail_alone_are_searched_for_together(room, monkeypatch):
     """Searches of single frames find nothing; odometry relates four frames of a turn, in a scene that has a scale."""
     metric = replace(room, scene=replace(room.scene, info=replace(room.scene.info, metres_per_unit=2.0)))
