@@ -345,13 +345,13 @@ def test_inliers_are_counted_at_the_renders_size_and_by_cells_that_show_somethin
 # ------------------------------------------------------------------ captured or not
 
 
-def captured_from(view: Pose, pose: Pose = HERE) -> float | None:
-    """Return the captured share of one point at depth 4 before `pose`, in the middle of the image."""
-    lens = Intrinsics(5, 5, 1000.0, 1000.0, 2.5, 2.5)
+def captured_from(view: Pose, zoom: float = 1.0) -> float | None:
+    """Return the captured share of a point at depth 4, through a lens `zoom` times as long as the view's."""
+    lens = Intrinsics(5, 5, 2.5 * zoom, 2.5 * zoom, 2.5, 2.5)
     image = np.full((5, 5), np.float32(1.0))
     depth = np.full((5, 5), np.float32(4.0))
-    wide = Camera(Intrinsics(400, 400, 10.0, 10.0, 200.0, 200.0), view)
-    return captured_share(Frame(np.zeros((5, 5, 3), np.float32), image, depth, depth), Camera(lens, pose), [wide])
+    wide = Camera(Intrinsics(400, 400, 200.0, 200.0, 200.0, 200.0), view)
+    return captured_share(Frame(np.zeros((5, 5, 3), np.float32), image, depth, depth), Camera(lens, HERE), [wide])
 
 
 def towards(degrees: float, distance: float) -> Pose:
@@ -366,7 +366,7 @@ def towards(degrees: float, distance: float) -> Pose:
     [
         (towards(59, 4), 1.0),
         (towards(61, 4), 0.0),
-        # The pose may be eight times nearer than a view, and three times farther.
+        # Through like lenses the pose may be eight times nearer than a view, and three times farther.
         (towards(0, 31.9), 1.0),
         (towards(0, 32.1), 0.0),
         (towards(0, 1.34), 1.0),
@@ -376,6 +376,15 @@ def towards(degrees: float, distance: float) -> Pose:
 )
 def test_a_point_is_captured_by_a_view_that_is_alike(view: Pose, share: float) -> None:
     assert captured_from(view) == share
+
+
+@pytest.mark.parametrize(
+    ("zoom", "distance", "share"), [(3.9, 8.0, 1.0), (4.1, 8.0, 0.0), (1 / 2.9, 4.0, 1.0), (1 / 3.1, 4.0, 0.0)]
+)
+def test_what_a_pixel_covers_counts_not_how_far_away_it_is_seen_from(
+    zoom: float, distance: float, share: float
+) -> None:
+    assert captured_from(towards(0, distance), zoom) == share
 
 
 def test_a_pose_is_outside_if_less_than_half_of_what_it_sees_was_captured() -> None:
