@@ -150,6 +150,27 @@ class ImageMatcher(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class SurfacePoints:
+    """Points on the scene's surface that training photos show, each with a patch of one of these photos.
+
+    `service/pose/training_photos` finds them.
+    """
+
+    points_in_world: Float64[np.ndarray, "n 3"]
+    """Relative to the scene's origin, like its Gaussians."""
+    covariances: Float32[np.ndarray, "n 3 3"]
+    """Of the points, in the world."""
+    tangents: Float32[np.ndarray, "n 3 2"]
+    """By how much the point moves on its surface for one pixel of the patch to the right, and down."""
+    patches: UInt8[np.ndarray, "n side side"]
+    """Luma; the point is in the middle, at the corner of four pixels."""
+    photo: Int32[np.ndarray, "n"]
+    """Number of the photo that the patch is of."""
+    photo_positions: Float64[np.ndarray, "p 3"]
+    """Where the photos were taken; like the points."""
+
+
 @dataclass(slots=True)
 class RenderTally:
     """Counts a job's renders, and a gradient as one more."""
@@ -176,6 +197,8 @@ class Tools(Generic[Prepared]):
     """In the place of `matcher` for methods that match renders with the photo; those that need features refuse."""
     tally: RenderTally = field(default_factory=RenderTally)
     """Of `rasterizer`; an estimator that renders with another one wraps it with `counted`, too."""
+    surface_points: SurfacePoints | None = None
+    """Of the training photos; None: the scene has no digest of them."""
 
 
 @dataclass(frozen=True, slots=True)

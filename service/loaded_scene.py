@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from service.errors import BackendMissing
+from service.errors import BackendMissing, InvalidImage, SceneNotFound
 from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, Tools
 from service.matchers import MATCHERS
 from service.pose.features.untold_background import WHITE, has_white_border, shows_background
 from service.pose.retrieval.floaters import without_floaters
+from service.pose.training_photos.digest import DIGEST, PhotoDigest, TrainingPhoto, digest_of, scene_key
+from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
+from service.scene_formats.training_files import training_photo_path
 from service.types import GaussianScene, Query
 
+log = logging.getLogger(__name__)
 RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
 """Where no rasterizer is named, the first one that can run here is used."""
 DEFAULT_ESTIMATOR = "view_index"
@@ -49,6 +55,8 @@ class LoadedScene:
     """For every result."""
     without_floaters: GaussianScene | None = None
     """The scene that photos are localized in; None: it is all of `scene`."""
+    photo_digest: PhotoDigest | None = None
+    """Of its training photos; None: there is none."""
     _prepared: dict[str, Any] = field(default_factory=dict)
     _whole: Rasterizer | None = None
     _over_white: LoadedScene | None = None
@@ -65,10 +73,13 @@ class LoadedScene:
     ) -> LoadedScene:
         """Read a scene folder (or a bare scene file) and bind tools to it.
 
-        Raises SceneError, UnknownName, and BackendMissing if the rasterizer that was named can't run.
+        The digest of training photos is read where there is one. Raises SceneError, UnknownName, and BackendMissing if
+        the rasterizer that was named can't run.
         """
         scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
         loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        if (folder / DIGEST_FILE).is_file():
+            loaded.photo_digest = read_digest(folder / DIGEST_FILE, scene_key(scene))
         release(scene)  # the rasterizer has its own copy
         return loaded
 
@@ -127,6 +138,35 @@ class LoadedScene:
                 # It was read through for the index; from now on the renderer's copy is used.
                 release(self.scene)
             return self._prepared[estimator]
+
+    def digest_photos(self, folder: Path, progress: Callable[[int, int], None] | None = None) -> PhotoDigest:
+        """Return the digest of the training photos that lie in the scene's folder. Raises SceneNotFound."""
+        cameras = self.scene.cameras[:: max(1, -(-len(self.scene.cameras) // DIGEST.max_photos))]
+        photos = []
+        for camera in cameras:
+            path = training_photo_path(folder, camera.name)
+            try:
+                data = None if path is None else path.read_bytes()
+                read = data and TrainingPhoto.read(camera, data, self.scene.info.background_rgb, self.matcher)
+            except (InvalidImage, OSError) as error:
+                log.warning("the training photo %s can't be read and is left out (%s)", camera.name, error)
+                continue
+            if read:
+                photos.append(read)
+        if not photos:
+            raise SceneNotFound(
+                "no photo of a training camera lies there.",
+                where=str(folder),
+                hint="Put them where the camera file says, or in a folder 'images' beside it.",
+            )
+        found = digest_of(photos, self.scene, self.rasterizer, progress)
+        if found is None:
+            raise SceneNotFound(
+                f"nothing is shown alike by three of the {len(photos)} training photos.",
+                where=str(folder),
+                hint="Check that the photos are those of the camera file, without distortion.",
+            )
+        return found
 
     def as_seen_by(self, query: Query) -> LoadedScene:
         """Return this scene, over white where its background is untold, shows, and is white in the photo.

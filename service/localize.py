@@ -109,6 +109,7 @@ def localize_in_scene(
         loaded.prepare(request.estimator),
         image_matcher=loaded.image_matcher,
         tally=tally,
+        surface_points=loaded.photo_digest and loaded.photo_digest.points,
     )
     tuning = {} if request.config is None else {"config": request.config}
     clock = Clock()

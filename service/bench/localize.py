@@ -96,6 +96,7 @@ def run(
     progress: Callable[[int, int], None] | None = None,
     cache_dir: Path | None = None,
     on_miss: Callable[[BenchScene, Trial, PoseEstimate], dict[str, Any]] | None = None,
+    photos: bool = False,
 ) -> dict[str, Any]:
     """Return the object that `--json` writes. Raises SceneError, UnknownName, InvalidOptions.
 
@@ -103,7 +104,8 @@ def run(
     another scene; `modify_scene` changes the scene's Gaussians. `options` are the estimator's `Options`; None: its
     defaults. With `cameras="ignored"` the scene is used without its training cameras, which still define the units.
     `on_miss` is called for each photo that isn't a success at 1 deg and 0.01 units; what it returns is added to the
-    photo's line. `accuracy` is asked for with each photo; its bound of the position is one at the true pose.
+    photo's line. `accuracy` is asked for with each photo; its bound of the position is one at the true pose. With
+    `photos` a digest of the training photos is made, anew: that beside the scene may hold the test photos.
     """
     require_kind(start)
     require_modifications(modify)
@@ -113,6 +115,7 @@ def run(
         Path(folder), data, layout=layout, background=background, cameras=cameras, matcher=matcher, cache_dir=cache_dir
     )
     bench_scene = with_modified_scene(bench_scene, modify_scene, seed, matcher, cache_dir)
+    digest = digested(bench_scene, data or folder) if photos else {}
     # Preparing is a matter of the scene, and its time isn't a photo's.
     began = time.perf_counter()
     bench_scene.loaded.prepare(estimator)
@@ -140,8 +143,32 @@ def run(
     settings |= {"modify_scene": list(modify_scene)}
     settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
     settings |= {"accuracy": dataclasses.asdict(accuracy)}
-    facts = {"scene": bench_scene.loaded.scene.info.name, **settings, **_facts(bench_scene), "prepare_s": prepare_s}
+    facts = {
+        "scene": bench_scene.loaded.scene.info.name,
+        **settings,
+        **_facts(bench_scene),
+        **digest,
+        "prepare_s": prepare_s,
+    }
     return {**facts, **summary(outcomes), "per_query": per_query}
+
+
+def digested(bench_scene: BenchScene, data: Path) -> dict[str, float]:
+    """Give the scene a digest of its training photos, which lie in the data set's folder; return what it takes.
+
+    The scene has no cameras of test photos, so these are not among them. Raises SceneNotFound.
+    """
+    loaded = bench_scene.loaded
+    loaded.digest_photos(data)  # not counted: its time includes compilation
+    began = time.process_time()
+    digest = loaded.photo_digest = loaded.digest_photos(data)
+    cpu_ms, photos = 1e3 * (time.process_time() - began), len(digest.names)
+    return {
+        "digest_photos": photos,
+        "digest_points": len(digest.points.photo),
+        "digest_cpu_ms_a_photo": cpu_ms / photos,
+        "digest_bytes_a_photo": digest.nbytes / photos,
+    }
 
 
 def asked_bounds(accuracy: Accuracy, truth: Camera, rasterizer: Rasterizer, units: Units) -> tuple[float, float]:

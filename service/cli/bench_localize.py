@@ -42,6 +42,7 @@ def bench_localize(
     accuracy: Annotated[str, typer.Option(help="Asked for with each photo, as `localize` takes it.")] = "",
     budget_s: Annotated[float | None, typer.Option(help="Time limit per photo, seconds.")] = None,
     budget_renders: Annotated[int | None, typer.Option(help="Limit of renders per photo.", min=1)] = None,
+    photos: Annotated[bool, typer.Option("--photos", help="With a digest of the training photos.")] = False,
     misses: Annotated[Path | None, typer.Option(help="A folder for an image of each miss at 1 deg, 0.01.")] = None,
     json_file: JsonFileOption = None,
 ) -> None:
@@ -73,6 +74,7 @@ def bench_localize(
             accuracy=accuracy_from(parsed_option(accuracy, "accuracy")),
             progress=counter(progress, "photos"),
             cache_dir=settings_of({}).cache_dir,
+            photos=photos,
             on_miss=miss_images.save_miss_images(misses) if misses else None,
         )
     write_json(json_file, outcome)

@@ -9,6 +9,7 @@ from service.pose.refinement.refine_stage import REFINE_STAGE, RefineStageConfig
 from service.pose.refinement.refinement_config import OTHER_LIGHT, RefinementConfig
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, AmbiguityConfig
 from service.pose.retrieval.image_variant import RETRIEVAL, RetrievalConfig
+from service.pose.training_photos.patch_pose import PATCH_POSE, PatchPoseConfig
 from service.pose.verification.ambiguity import ANSWERS, AnswerConfig
 from service.pose.verification.gate import VERIFICATION, VerificationConfig
 from service.pose.verification.mirror_images import MIRROR, MirrorConfig
@@ -26,6 +27,7 @@ class SearchConfig:
     ambiguity: AmbiguityConfig = AMBIGUITY
     answers: AnswerConfig = ANSWERS
     mirror: MirrorConfig = MIRROR
+    patches: PatchPoseConfig = PATCH_POSE
     small_photo_factor: float = 0.77
     """Size of the photo in the stage `retrieve`, relative to `retrieve_full_size`: a whole, sharp photo is found in
     half the time.

@@ -3,8 +3,9 @@
     photo's features -> retrieval scores of rendered views -> matches with the best of them -> scene points -> PnP
     -> while few agree, or the gate refuses what few led to: render there, match again, solve decoupled
     -> refine photometrically on a small render, then on larger ones
-    -> verification gate -> did another lens take the photo, or a camera that turned? Is it mirrored? Do many matches
-       agree on another pose that is as good?
+    -> verification gate -> did another lens take the photo, or a camera that turned?
+    -> where the scene has a digest of its training photos: a more exact pose by their patches
+    -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
 At first a small copy of the photo is compared, rotated as its corners suggest if no view is much like it. Only if the
 gate refuses the answer costlier stages follow: the photo in its full size; larger still, with further views; views
@@ -26,6 +27,7 @@ import numpy as np
 
 from service.errors import InvalidOptions
 from service.estimators.lens_check import check_lens
+from service.estimators.patch_stage import refine_by_patches
 from service.estimators.rivals import check_rivals
 from service.estimators.search_config import SEARCH, SearchConfig
 from service.estimators.search_state import (
@@ -88,6 +90,7 @@ def run(
         yield from run_stage(state, _refine_from_prior(state))
         if state.finished:
             state = yield from check_shutter(state)
+            yield from refine_by_patches(state)
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
             return state.answer()
@@ -100,6 +103,7 @@ def run(
             break
     state = yield from check_lens(state)
     state = yield from check_shutter(state)
+    yield from refine_by_patches(state)
     yield from changed(_doubts(state), state.with_answer)
     return state.answer()
 

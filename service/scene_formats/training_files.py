@@ -86,8 +86,8 @@ def photos_beside(folder: Path, background: tuple[float, float, float] | None) -
     """Return what finds a camera's photo in a scene folder, small; None where there is none of the camera's shape."""
 
     def photo_of(named: NamedCamera) -> Photo | None:
-        path = _photo_path(folder, named.name)
-        if path is None or path.stat().st_size > _MAX_PHOTO_BYTES:
+        path = training_photo_path(folder, named.name)
+        if path is None:
             return None
         try:
             query = open_photo(path.read_bytes()).query(long_side=_PHOTO_PX, background_rgb=background or (0, 0, 0))
@@ -99,6 +99,12 @@ def photos_beside(folder: Path, background: tuple[float, float, float] | None) -
         return query.rgb if is_alike else None
 
     return photo_of
+
+
+def training_photo_path(folder: Path, name: str) -> Path | None:
+    """Return where in a scene folder the photo of a training camera lies; None: it isn't there, or too large a file."""
+    path = _photo_path(folder, name)
+    return None if path is None or path.stat().st_size > _MAX_PHOTO_BYTES else path
 
 
 def _photo_path(folder: Path, name: str) -> Path | None:

@@ -119,6 +119,30 @@ def pose_uncertainty(
     return _with_shutter(found, np.outer(motion, motion) + shutter.covariance)
 
 
+def refinement_covariance(
+    result: RefinementResult,
+    frame: Frame,
+    camera: Camera,
+    lens_prior: LensPrior | None,
+    config: RefinementConfig = REFINEMENT,
+) -> Float64[np.ndarray, "k k"] | None:
+    """Return the covariance of what a refinement on a frame led to, which `camera` rendered; None: undetermined.
+
+    Of the right twist and, where the intrinsics are approximate, of their `correction_vector`; by the pixels and the
+    prior alone, without what is added for errors that a photo doesn't show.
+    """
+    final = result.final_level
+    if final is None:
+        return None
+    photo_from_render = result.pose.camera_from_world @ camera.pose.world_from_camera
+    state = RefinementState(photo_from_render, result.correction, None, final.photometric.copy())
+    _, hessian, scale = _normal_equations(final.level, state, frame, config)
+    if lens_prior is None:
+        return _covariance(hessian[:FOCAL, :FOCAL], scale)
+    of_lens = slice(0, CORRECTION.stop)
+    return _covariance(_with_prior(hessian, scale, lens_prior, result.correction)[of_lens, of_lens], scale)
+
+
 def _with_exact_lens(
     level: PyramidLevel,
     state: RefinementState,
