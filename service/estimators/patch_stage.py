@@ -1,7 +1,7 @@
 """The default estimator's last stage where the scene has a digest of its training photos: a more exact pose.
 
-Photos show more detail than renders, so the place of patches of training photos in the photo tells the pose better than
-photometric refinement alone. The verdict on the place remains; only the covariance becomes smaller.
+Photos show more detail than renders, so the places of patches of training photos in the photo tell the pose better than
+photometric refinement alone. The verdict on the place stays as it is; the covariance becomes smaller.
 """
 
 from __future__ import annotations
@@ -29,44 +29,35 @@ def refine_by_patches(state: SearchState) -> Generator[IterationRecord, None, No
     found = _patch_pose(state, best, points)
     if found is None or not inside_prior(state.images.query.region, found.pose):
         return
-    before = best.refined
-    # That refinement didn't lead here.
-    refined = replace(before, pose=found.pose, correction=found.correction, photometric=None)
+    # The refinement at hand led to another pose.
+    refined = replace(best.refined, pose=found.pose, photometric=None)
     state.best = replace(best, refined=refined, verdict=_verdict(best.verdict, found))
-    step_deg, step_units = pose_distance(before.pose, found.pose)
+    step_deg, step_units = pose_distance(best.refined.pose, found.pose)
     record = replace(state.best.record("refine_by_patches"), num_matches=found.found, num_inliers=found.agreeing)
     yield state.with_answer(replace(record, step_deg=step_deg, step_units=step_units))
 
 
 def _patch_pose(state: SearchState, best: VerifiedPose, points: SurfacePoints) -> PatchPose | None:
-    found = best.refined
-    if found.photometric is None or found.rendered is None:
+    """Return the pose by patches; None with approximate intrinsics, too small a photo, or too few patches."""
+    query, config = state.images.query, state.config
+    rendered, refinement = best.refined.rendered, best.refined.photometric
+    if rendered is None or refinement is None:
         return None
-    images, rendered = state.images.corrected(found.correction), found.rendered
-    covariance = refinement_covariance(
-        found.photometric, rendered.frame, rendered.camera, images.query.lens_prior, state.config.refinement.photometric
-    )
+    if query.lens_prior is not None or query.intrinsics.long_side < config.patches.min_photo_px:
+        return None
+    covariance = refinement_covariance(refinement, rendered.frame, rendered.camera, config.refinement.photometric)
     if covariance is None:
         return None
-    size = images.query.intrinsics
-    return patch_pose(
-        grey(images.resized(size)),
-        images.valid_mask(size),
-        Camera(size, found.pose),
-        found.correction,
-        covariance,
-        rendered,
-        points,
-        state.config.patches,
-    )
+    camera = Camera(query.intrinsics, best.refined.pose)
+    return patch_pose(grey(query.rgb), query.valid_mask, camera, covariance, rendered, points, config.patches)
 
 
 def _verdict(verdict: Verdict, found: PatchPose) -> Verdict:
-    """Return the verdict with the covariance of patches and pixels, where nothing but these makes a pose uncertain."""
-    is_exact = len(found.covariance) == 6
-    if verdict.asked is None or not is_exact or verdict.intrinsics_untested or verdict.shutter_motion:
+    """Return the verdict with the covariance of patches and pixels, unless more than these makes the pose uncertain."""
+    if verdict.asked is None or verdict.intrinsics_untested or verdict.shutter_motion:
         return verdict
+    told = replace(verdict, covariance=found.covariance)
     if verdict.status is not Status.LOCALIZED:
-        return replace(verdict, covariance=found.covariance)
+        return told
     precise = probability_within(found.covariance, *verdict.asked)
-    return replace(verdict, covariance=found.covariance, precise=precise, score=verdict.place_probability * precise)
+    return replace(told, precise=precise, score=verdict.place_probability * precise)

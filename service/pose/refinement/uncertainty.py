@@ -120,16 +120,12 @@ def pose_uncertainty(
 
 
 def refinement_covariance(
-    result: RefinementResult,
-    frame: Frame,
-    camera: Camera,
-    lens_prior: LensPrior | None,
-    config: RefinementConfig = REFINEMENT,
-) -> Float64[np.ndarray, "k k"] | None:
-    """Return the covariance of what a refinement on a frame led to, which `camera` rendered; None: undetermined.
+    result: RefinementResult, frame: Frame, camera: Camera, config: RefinementConfig = REFINEMENT
+) -> Float64[np.ndarray, "6 6"] | None:
+    """Return the covariance of the right twist that a refinement on a frame led to, given the intrinsics.
 
-    Of the right twist and, where the intrinsics are approximate, of their `correction_vector`; by the pixels and the
-    prior alone, without what is added for errors that a photo doesn't show.
+    `camera` rendered the frame. By the pixels alone, without what is added for errors that no photo shows. None:
+    undetermined.
     """
     final = result.final_level
     if final is None:
@@ -137,10 +133,7 @@ def refinement_covariance(
     photo_from_render = result.pose.camera_from_world @ camera.pose.world_from_camera
     state = RefinementState(photo_from_render, result.correction, None, final.photometric.copy())
     _, hessian, scale = _normal_equations(final.level, state, frame, config)
-    if lens_prior is None:
-        return _covariance(hessian[:FOCAL, :FOCAL], scale)
-    of_lens = slice(0, CORRECTION.stop)
-    return _covariance(_with_prior(hessian, scale, lens_prior, result.correction)[of_lens, of_lens], scale)
+    return _covariance(hessian[:FOCAL, :FOCAL], scale)
 
 
 def _with_exact_lens(

@@ -211,5 +211,5 @@ def _refined(photo: TrainingPhoto, start: Pose, levels: int, renders: _Renders) 
     """Refine a photo's pose on a render from there; None: it fails."""
     frame, camera = renders.of(photo, start, keep=True)
     result = refine_photometric(photo.small, frame, camera, camera, levels, valid_mask=photo.small_mask)
-    covariance = refinement_covariance(result, frame, camera, None)
+    covariance = refinement_covariance(result, frame, camera)
     return None if covariance is None else _Refined(result.pose, covariance)

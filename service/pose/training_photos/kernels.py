@@ -189,14 +189,14 @@ def match_patches(photo, patches, warps, start, radius, max_steps, settled_px, m
 
 @kernel
 def linearize_reprojection(points, covariances, observed, transform, k, noise_px, rows, residuals):
-    """Fill whitened residuals (n, 2) of observed places, and d predicted / d unknowns (n, 2, 10), likewise whitened.
+    """Fill whitened residuals (n, 2) of observed places, and d predicted / d right twist of the camera (n, 2, 6).
 
-    The unknowns: right twist of the camera (6), then its `correction_vector` (4). A residual's covariance is that of
-    matching, `noise_px` squared in each direction, and that of the point (`covariances`, (n, 3, 3), in the world) as
-    the photo shows it. `transform` is camera_from_world, `k` fx, fy, cx, cy, the photo's long side, and k1, which is
-    small: the photo is undistorted, but for what is estimated here.
+    A residual's covariance is that of matching, `noise_px` squared in each direction, and that of the point
+    (`covariances`, (n, 3, 3), in the world) as the photo shows it. `transform` is camera_from_world; `k` is fx, fy, cx,
+    cy.
     """
     place = np.empty((2, 3))
+    of_twist = np.zeros((2, 6))
     for i in range(len(points)):
         x, y, z = transform[:3, 3]
         for a in range(3):
@@ -219,33 +219,15 @@ def linearize_reprojection(points, covariances, observed, transform, k, noise_px
         below = sxy * w00
         w11 = 1.0 / np.sqrt(max(syy - below * below, 1e-12))
         w10 = -below * w00 * w11
-        squared = u * u + v * v
-        for c in range(10):
-            du, dv = 0.0, 0.0
-            # A point moves in the camera's frame by -(w x X) - v with the twist (w, v).
-            if c == 0:
-                du, dv = k[0] * u * v, k[1] * (1 + v * v)
-            elif c == 1:
-                du, dv = -k[0] * (1 + u * u), -k[1] * u * v
-            elif c == 2:
-                du, dv = k[0] * v, -k[1] * u
-            elif c == 3:
-                du, dv = -k[0] * inverse, 0.0
-            elif c == 4:
-                du, dv = 0.0, -k[1] * inverse
-            elif c == 5:
-                du, dv = k[0] * u * inverse, k[1] * v * inverse
-            elif c == 6:
-                du, dv = k[0] * u, k[1] * v
-            elif c == 7:
-                du, dv = k[0] * u * squared, k[1] * v * squared
-            elif c == 8:
-                du, dv = k[4], 0.0
-            else:
-                du, dv = 0.0, k[4]
-            rows[i, 0, c] = w00 * du
-            rows[i, 1, c] = w10 * du + w11 * dv
-        radial = 1.0 + k[5] * squared
-        rx, ry = observed[i, 0] - (k[0] * u * radial + k[2]), observed[i, 1] - (k[1] * v * radial + k[3])
+        # A point X moves in the camera's frame by -(w x X) - v with the twist (w, v).
+        of_twist[0, 0], of_twist[1, 0] = k[0] * u * v, k[1] * (1 + v * v)
+        of_twist[0, 1], of_twist[1, 1] = -k[0] * (1 + u * u), -k[1] * u * v
+        of_twist[0, 2], of_twist[1, 2] = k[0] * v, -k[1] * u
+        of_twist[0, 3], of_twist[1, 4] = -k[0] * inverse, -k[1] * inverse
+        of_twist[0, 5], of_twist[1, 5] = k[0] * u * inverse, k[1] * v * inverse
+        for c in range(6):
+            rows[i, 0, c] = w00 * of_twist[0, c]
+            rows[i, 1, c] = w10 * of_twist[0, c] + w11 * of_twist[1, c]
+        rx, ry = observed[i, 0] - (k[0] * u + k[2]), observed[i, 1] - (k[1] * v + k[3])
         residuals[i, 0] = w00 * rx
         residuals[i, 1] = w10 * rx + w11 * ry

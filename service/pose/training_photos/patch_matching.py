@@ -56,17 +56,16 @@ def grey(rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w"]:
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def intrinsics_vector(intrinsics: Intrinsics, k1: float = 0.0) -> Float64[np.ndarray, "6"]:
-    """Return fx, fy, cx, cy, the long side and k1."""
-    k = intrinsics
-    return np.array([k.fx, k.fy, k.cx, k.cy, k.long_side, k1])
+def pinhole_vector(intrinsics: Intrinsics) -> Float64[np.ndarray, "4"]:
+    """Return fx, fy, cx, cy."""
+    return np.array([intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy])
 
 
 def predicted(points: SurfacePoints, camera: Camera, config: PatchConfig = PATCHES) -> PredictedPatches:
     """Project the points and their patches into a camera."""
     k = camera.intrinsics
     px, depth, jacobian = project_surface(
-        points.points_in_world, points.tangents, camera.pose.camera_from_world, intrinsics_vector(k)
+        points.points_in_world, points.tangents, camera.pose.camera_from_world, pinhole_vector(k)
     )
     # A surface seen from behind turns its patch over, which makes the determinant negative.
     area = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]

@@ -1,9 +1,10 @@
-"""The pose of a photo by patches of training photos, from a pose that is off by a few pixels at most.
+"""The pose of a photo with exact intrinsics by patches of training photos, from one that is off by a few pixels.
 
-Patches that the photo should show are found in it at its full size by least-squares matching. Pose and, where they are
-approximate, intrinsics follow from the places by robust Gauss-Newton; their covariance has the jackknife's scale over
-parts of the image, as that of photometric refinement, with which the result is then combined: a weighted mean, each by
-its information.
+Patches that the photo should show are found in it at its full size by least-squares matching. The pose follows from the
+places by robust Gauss-Newton; its covariance has the jackknife's scale over parts of the image, as that of photometric
+refinement, with which the result is then combined: a mean of both, each weighed by its information.
+
+With approximate intrinsics nothing is gained: what patches say of the lens is no more exact than what pixels say.
 """
 
 from __future__ import annotations
@@ -15,19 +16,20 @@ from jaxtyping import Bool, Float64, Int64, UInt8
 
 from service.geometry import moved, project, se3_log, transformed
 from service.interfaces import SurfacePoints
-from service.pose.absolute_pose.lens_prior import correction_of, stepped
 from service.pose.features.rendered_views import RenderedView
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale
 from service.pose.refinement.refinement_config import REFINEMENT
 from service.pose.training_photos.corners import cells_of, take_in_turns
 from service.pose.training_photos.kernels import linearize_reprojection
-from service.pose.training_photos.patch_matching import PredictedPatches, intrinsics_vector, matched, predicted
+from service.pose.training_photos.patch_matching import PredictedPatches, matched, pinhole_vector, predicted
 from service.pose.training_photos.surface_points import selected
-from service.types import NO_CORRECTION, Camera, IntrinsicsCorrection, Pose
+from service.types import Camera, Pose
 
 
 @dataclass(frozen=True, slots=True)
 class PatchPoseConfig:
+    min_photo_px: int = 520
+    """Long side of a photo: one hardly larger than renders has no more detail than refinement has used."""
     max_patches: int = 600
     """Of those that a photo may show; twice as many are no more exact."""
     cells_across: int = 8
@@ -46,15 +48,16 @@ class PatchPoseConfig:
     steps: int = 8
     settled: float = 1e-7
     """Steps of Gauss-Newton, and the largest component (rad, shares of the distance) of the last one."""
-    cauchy_scale: float = 2.0
+    cauchy_scale: float = 1.0
     cutoff: float = 5.0
-    """Residual, in robust standard deviations, at which Cauchy's weight is a half, and beyond which it is 0."""
+    """Residual, in robust standard deviations, at which Cauchy's weight is a half, and beyond which it is 0: places err
+    together where a lens differs from its calibration, and a scale of 2 is less exact then."""
     min_agreeing: int = 40
     min_agreeing_share: float = 0.5
     """Patches that agree with the pose, and their share of those that were found."""
-    weak_prior: float = 1e-3
-    """Share of the photometric information that keeps in place what patches don't determine."""
-    min_variance_scale: float = 0.3
+    damping: float = 1e-9
+    """Of the scaled normal equations: keeps in place what patches don't determine."""
+    min_variance_scale: float = 1.0
     """Lower bound of the jackknife's scale: quarters of one photo may agree by chance."""
 
 
@@ -63,12 +66,11 @@ PATCH_POSE = PatchPoseConfig()
 
 @dataclass(frozen=True, slots=True)
 class PatchPose:
-    """Pose and intrinsics by patches and pixels together."""
+    """The pose by patches and pixels together."""
 
     pose: Pose
-    correction: IntrinsicsCorrection
-    covariance: Float64[np.ndarray, "k k"]
-    """Of the right twist and, where intrinsics are approximate, the `correction_vector`."""
+    covariance: Float64[np.ndarray, "6 6"]
+    """Of the right twist."""
     found: int
     """Patches that the photo shows."""
     agreeing: int
@@ -79,101 +81,83 @@ def patch_pose(
     photo: UInt8[np.ndarray, "h w"],
     valid: Bool[np.ndarray, "h w"] | None,
     camera: Camera,
-    correction: IntrinsicsCorrection,
-    covariance: Float64[np.ndarray, "k k"],
+    covariance: Float64[np.ndarray, "6 6"],
     rendered: RenderedView,
     points: SurfacePoints,
     config: PatchPoseConfig = PATCH_POSE,
 ) -> PatchPose | None:
-    """Return a more exact pose than that of `camera`; None where too few patches agree.
+    """Return a more exact pose than that of `camera`, the photo's own; None where too few patches agree.
 
-    `camera` has the intrinsics of the photo, which is undistorted, `correction` included. `covariance` is that of
-    photometric refinement, of twist and, if it has ten unknowns, correction; `rendered` is a render within a pixel.
+    `covariance` is that of photometric refinement, which led to that pose, of its right twist; `rendered` is a render
+    within a pixel of it.
     """
     where = predicted(points, camera)
     chosen = _chosen(points, where, camera, valid, rendered, config)
     points = selected(points, chosen)
-    where = _taken(where, chosen)
-    places = matched(photo, points.patches, where, config.max_motion_px)
+    places = matched(photo, points.patches, _taken(where, chosen), config.max_motion_px)
     found = np.flatnonzero(~np.isnan(places[:, 0]))
-    if len(found) < config.min_agreeing:
-        return None
     information = inverse_spd(covariance)
-    if information is None:
+    if len(found) < config.min_agreeing or information is None:
         return None
-    return _combined(selected(points, found), places[found], camera, correction, information, config)
+    return _combined(selected(points, found), places[found], camera, information, config)
 
 
 def _combined(
     points: SurfacePoints,
     places: Float64[np.ndarray, "n 2"],
     camera: Camera,
-    correction: IntrinsicsCorrection,
-    information: Float64[np.ndarray, "k k"],
+    information: Float64[np.ndarray, "6 6"],
     config: PatchPoseConfig,
 ) -> PatchPose | None:
     """Solve for the places alone, then take the mean with what was known before, each weighed by its information."""
-    solved = _solved(points, places, camera, information, config)
-    agree = solved.weight > 0
-    agreeing = int(agree.sum())
+    solved = _solved(points, places, camera, config)
+    agreeing = int((solved.weight > 0).sum())
     if agreeing < max(config.min_agreeing, config.min_agreeing_share * len(places)):
         return None
     cells = cells_of(places, camera.intrinsics.width, config.cells_across)
     scale = max(_jackknife(solved, cells, config), config.min_variance_scale)
     by_patches = solved.hessian / scale
-    joint = inverse_spd(information + by_patches)
-    if joint is None or not np.isfinite(scale):
+    joint = inverse_spd(information + by_patches) if np.isfinite(scale) else None
+    if joint is None:
         return None
-    step = joint @ (by_patches @ solved.step)
-    pose = moved(camera.pose, step[:6])
-    changed = stepped(correction, step[6:]) if len(step) > 6 else correction
-    return PatchPose(pose, changed, joint, len(places), agreeing)
+    return PatchPose(moved(camera.pose, joint @ (by_patches @ solved.step)), joint, len(places), agreeing)
 
 
 @dataclass(frozen=True, slots=True)
 class _Solved:
-    step: Float64[np.ndarray, "k"]
-    """From the start: right twist and, if they are unknowns, of the correction."""
-    hessian: Float64[np.ndarray, "k k"]
-    rows: Float64[np.ndarray, "n 2 k"]
+    step: Float64[np.ndarray, "6"]
+    """Right twist from the start."""
+    hessian: Float64[np.ndarray, "6 6"]
+    rows: Float64[np.ndarray, "n 2 6"]
     residuals: Float64[np.ndarray, "n 2"]
     """Whitened, at the solution."""
     weight: Float64[np.ndarray, "n"]
 
 
 def _solved(
-    points: SurfacePoints,
-    places: Float64[np.ndarray, "n 2"],
-    camera: Camera,
-    information: Float64[np.ndarray, "k k"],
-    config: PatchPoseConfig,
+    points: SurfacePoints, places: Float64[np.ndarray, "n 2"], camera: Camera, config: PatchPoseConfig
 ) -> _Solved:
     """Minimize the reprojection errors of the places, with Cauchy's weights and a cut-off, by Gauss-Newton."""
-    size = len(information)
-    rows, residuals = np.empty((len(places), 2, 10)), np.empty((len(places), 2))
-    total, start, pose, weight = np.zeros(size), camera.pose, camera.pose, np.ones(len(places))
+    rows, residuals = np.empty((len(places), 2, 6)), np.empty((len(places), 2))
+    start, pose, weight, hessian = camera.pose, camera.pose, np.ones(len(places)), np.eye(6)
     distance = float(np.median(np.linalg.norm(points.points_in_world - start.position_in_world, axis=1)))
-    hessian = np.zeros((size, size))
+    k = pinhole_vector(camera.intrinsics)
     for _ in range(config.steps):
-        correction = correction_of(total[6:]) if size > 6 else NO_CORRECTION
-        k = intrinsics_vector(camera.intrinsics.corrected(correction), correction.k1)
         linearize_reprojection(
             points.points_in_world, points.covariances, places, pose.camera_from_world, k, config.noise_px,
             rows, residuals,
         )  # fmt: skip
         weight = _weights(residuals, config)
-        flat = rows[:, :, :size].reshape(-1, size)
-        weighted = flat * np.repeat(weight, 2)[:, None]
-        hessian = weighted.T @ flat
-        # Without it a plane would leave focal length and distance undetermined.
-        damped = hessian + config.weak_prior * information
-        step = np.linalg.solve(damped, weighted.T @ residuals.reshape(-1) - config.weak_prior * information @ total)
-        pose = moved(pose, step[:6])
-        total[6:] += step[6:]
-        total[:6] = se3_log(start.camera_from_world @ pose.world_from_camera)
-        if max(np.abs(step[:3]).max(), np.abs(step[3:6]).max() / distance) < config.settled:
+        weighted = rows.reshape(-1, 6) * np.repeat(weight, 2)[:, None]
+        hessian = weighted.T @ rows.reshape(-1, 6)
+        # The units of a rotation and a translation differ: the scene's unit may be anything.
+        scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
+        damped = hessian * np.outer(scale, scale) + config.damping * np.eye(6)
+        step = scale * np.linalg.solve(damped, scale * (weighted.T @ residuals.reshape(-1)))
+        pose = moved(pose, step)
+        if max(np.abs(step[:3]).max(), np.abs(step[3:]).max() / distance) < config.settled:
             break
-    return _Solved(total, hessian, rows[:, :, :size], residuals, weight)
+    return _Solved(se3_log(start.camera_from_world @ pose.world_from_camera), hessian, rows, residuals, weight)
 
 
 def _weights(residuals: Float64[np.ndarray, "n 2"], config: PatchPoseConfig) -> Float64[np.ndarray, "n"]:
