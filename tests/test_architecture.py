@@ -41,7 +41,7 @@ FLOORS = {
         {"absolute_pose"},
         {"matching"},
         {"refinement"},
-        {"retrieval", "descent", "verification"},
+        {"retrieval", "descent", "verification", "training_photos"},
     ],
     "service/web": [
         {"api_model", "hints", "key_file", "api_keys", "settings", "metrics", "viewer_process"},

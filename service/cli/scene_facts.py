@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from service.cli.scenes_index import digest_facts, digest_line
 from service.cli.terminal import registrations_folder, settings_of
 from service.coverage.coverage_cache import coverage_file, read_coverage
 from service.coverage.held_out_photos import held_out_photos
@@ -15,6 +16,8 @@ from service.localize import ASSUMED_TRAINING_PX
 from service.pose.retrieval.floaters import find_floaters, without_floaters
 from service.pose.retrieval.view_placement import coverage, find_views
 from service.pose.retrieval.viewpoints import index_cameras
+from service.pose.training_photos.digest import scene_key
+from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
@@ -65,6 +68,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
             for frame in info.frames
         ],
         "index": _index(searched, rasterizer),
+        "training_photos": _training_photos(path, scene),
         "expected_accuracy": _expected_accuracy(path, searched, rasterizer.name),
     }
     warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
@@ -107,6 +111,14 @@ def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
         "typical_distance": found.typical_distance,
         "interior": found.interior,
     }
+
+
+def _training_photos(path: Path, scene: GaussianScene) -> dict[str, Any] | None:
+    """Return the facts of the digest in the scene's folder; None: there is none for this scene."""
+    if not (path / DIGEST_FILE).is_file():
+        return None
+    digest = read_digest(path / DIGEST_FILE, scene_key(scene))
+    return None if digest is None else digest_facts(digest)
 
 
 def _expected_accuracy(path: Path, searched: GaussianScene, rasterizer: str) -> dict[str, Any] | None:
@@ -157,6 +169,7 @@ def as_lines(facts: dict[str, Any]) -> dict[str, str]:
         },
         "index": placed,
         "coverage": f"{index['coverage']:.1%} of the opaque Gaussians are seen by these views",
+        "training photos": _photos(facts["training_photos"]),
         "expected accuracy": _accuracy(facts),
         "sha256": facts["sha256"],
     }
@@ -170,6 +183,10 @@ def _accuracy(facts: dict[str, Any]) -> str:
     position = f"{expected['median_position_units'] * (scale or 1.0):.2g} {'m' if scale else 'units'}"
     accuracy = f"median {expected['median_rotation_deg']:.2g} degrees, {position}"
     return f"{accuracy}; {expected['found']:.0%} of photos are found ({expected['title']})"
+
+
+def _photos(facts: dict[str, Any] | None) -> str:
+    return "no digest of them: splatfix scenes index --photos" if facts is None else digest_line(facts)
 
 
 def _floaters(facts: dict[str, Any]) -> str:

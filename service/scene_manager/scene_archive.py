@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from service.errors import CorruptScene, UnsupportedFormat
+from service.pose.training_photos.digest_file import DIGEST_FILE
 from service.scene_formats.formats import is_scene_file
 from service.scene_formats.inria import ARGUMENTS, CAMERAS
 from service.scene_formats.layouts import COLMAP_FOLDER, STEPS
@@ -30,7 +31,7 @@ _MAX_NAME_BYTES = 255
 """On all usual file systems."""
 _MAX_DEPTH = 4
 _COPY_BYTES = 1 << 20
-_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER}
+_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER, DIGEST_FILE}
 _PHOTOS = (".jpg", ".jpeg", ".png", ".webp")
 _SYSTEM_FOLDER = "__MACOSX"
 

@@ -43,6 +43,10 @@ class SurfaceCorners:
     """d (1 / depth) / d pixel."""
     patches: UInt8[np.ndarray, "n side side"]
 
+    def some(self, index: Int64[np.ndarray, "m"]) -> SurfaceCorners:
+        """Return some of the corners."""
+        return SurfaceCorners(self.px[index], self.depth[index], self.slope[index], self.patches[index])
+
 
 def surface_corners(
     photo: UInt8[np.ndarray, "h w"],

@@ -9,19 +9,21 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from service.geometry import se3_log
-from service.interfaces import Frame, Matcher, Rasterizer, SurfacePoints
+from service.interfaces import Matcher, Rasterizer, SurfacePoints
 from service.photos.images import photo_size, read_query
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.pose.features.query_images import QueryImages
+from service.pose.features.rendered_views import RenderedView
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import refinement_covariance
 from service.pose.training_photos.corners import surface_corners
+from service.pose.training_photos.effect import distances
 from service.pose.training_photos.patch_matching import grey
 from service.pose.training_photos.surface_points import PosedPhoto, TriangulatedCorners, triangulated_corners
 from service.types import Camera, GaussianScene, NamedCamera, Pose
@@ -31,8 +33,8 @@ from service.types import Camera, GaussianScene, NamedCamera, Pose
 class DigestConfig:
     max_photos: int = 300
     """Of more, every second, third... is read: neighbours in a video show the same, and each takes a megabyte here."""
-    aligned_sample: int = 12
-    """Photos that are refined to find out whether the scene lies where their poses say."""
+    sample: int = 12
+    """Photos that are refined to find out whether the scene lies where their poses say, and what the digest gains."""
     max_misfit: float = 25.0
     """Median of the squared offset in standard deviations of refinement, 6 by chance; scenes whose trainers leave the
     poses alone have 0.7 to 6.4."""
@@ -95,6 +97,9 @@ class PhotoDigest:
     """Median of the points' reprojection errors in the photos, in pixels of the decoded photos."""
     depth_ratio: float
     """Median ratio of triangulated and rendered depth."""
+    effect: tuple[float, float] | None
+    """Median distance from a training photo's pose, in scene units, to which refinement leads without the digest and
+    with it. None where poses were refined against the scene, so that there are no other ones."""
 
     @property
     def nbytes(self) -> int:
@@ -124,29 +129,33 @@ def digest_of(
     config: DigestConfig = DIGEST,
 ) -> PhotoDigest | None:
     """Return the digest of training photos; None where no point is shown by three of them."""
-    renderer = _Renders(rasterizer)
-    poses = _poses(photos, renderer, config)
+    sample = _Sample.of(photos, rasterizer, config)
+    is_off = sample.is_off(photos, config)
+    poses = [_aligned(photo, rasterizer) if is_off else photo.camera.pose for photo in photos]
     posed = [
         PosedPhoto(photo.grey, Camera(photo.camera.intrinsics, pose)) for photo, pose in zip(photos, poses, strict=True)
     ]
     found = []
     for number, photo in enumerate(photos):
-        frame, camera = renderer.of(photo, poses[number])
-        corners = surface_corners(photo.grey, photo.valid_mask, frame, camera)
+        known = None if is_off else sample.refined.get(number)
+        rendered = known.rendered if known else _rendered(photo, poses[number], rasterizer)
+        corners = surface_corners(photo.grey, photo.valid_mask, rendered.frame, rendered.camera)
         found.append(triangulated_corners(number, corners, posed))
         if progress:
             progress(number + 1, len(photos))
     rms = np.concatenate([one.rms_px for one in found]) if found else np.zeros(0)
     if not len(rms):
         return None
+    points = _joined(found, poses)
     return PhotoDigest(
-        points=_joined(found, poses),
+        points=points,
         scene_key=scene_key(scene),
         names=tuple(photo.name for photo in photos),
         sha256=tuple(photo.sha256 for photo in photos),
         offsets=np.stack([_offset(photo.camera.pose, pose) for photo, pose in zip(photos, poses, strict=True)]),
         reprojection_px=float(np.median(rms)),
         depth_ratio=float(np.median(np.concatenate([one.depth_ratio for one in found]))),
+        effect=None if is_off else sample.effect(posed, points),
     )
 
 
@@ -160,56 +169,60 @@ def _offset(given: Pose, used: Pose) -> Float64[np.ndarray, "6"]:
     return np.zeros(6) if given is used else se3_log(used.camera_from_world @ given.world_from_camera)
 
 
-@dataclass(slots=True)
-class _Renders:
-    """Renders at poses of photos; those at given poses are kept until they are used again."""
-
-    rasterizer: Rasterizer
-    kept: dict[str, Frame] = field(default_factory=dict)
-
-    def of(self, photo: TrainingPhoto, pose: Pose, keep: bool = False) -> tuple[Frame, Camera]:
-        """Return a render at a pose, and its camera; from the given pose it is rendered once."""
-        camera = Camera(sized(photo.camera.intrinsics, RENDER_PX), pose)
-        if pose is not photo.camera.pose:
-            return self.rasterizer.render([camera])[0], camera
-        frame = self.kept.pop(photo.name, None) or self.rasterizer.render([camera])[0]
-        if keep:
-            self.kept[photo.name] = frame
-        return frame, camera
-
-
-def _poses(photos: Sequence[TrainingPhoto], renders: _Renders, config: DigestConfig) -> list[Pose]:
-    """Return the given poses or, where the scene doesn't lie where these say, those that refinement leads to."""
-    sample = photos[:: max(1, -(-len(photos) // config.aligned_sample))]
-    misfits = [misfit for photo in sample if (misfit := _misfit(photo, renders)) is not None]
-    if not misfits or np.median(misfits) < config.max_misfit:
-        return [photo.camera.pose for photo in photos]
-    poses = []
-    for photo in photos:
-        first = _refined(photo, photo.camera.pose, 2, renders)
-        second = first and _refined(photo, first.pose, 1, renders)
-        poses.append(second.pose if second else photo.camera.pose)
-    return poses
-
-
-def _misfit(photo: TrainingPhoto, renders: _Renders) -> float | None:
-    """Return the square of the offset that refinement finds, in standard deviations; None: it fails."""
-    found = _refined(photo, photo.camera.pose, 2, renders)
-    if found is None:
-        return None
-    offset = _offset(photo.camera.pose, found.pose)
-    return float(offset @ np.linalg.solve(found.covariance, offset))
-
-
 @dataclass(frozen=True, slots=True)
 class _Refined:
+    """Where refinement leads from a training photo's pose."""
+
+    rendered: RenderedView
+    """From the pose that it began with."""
     pose: Pose
     covariance: Float64[np.ndarray, "6 6"]
 
 
-def _refined(photo: TrainingPhoto, start: Pose, levels: int, renders: _Renders) -> _Refined | None:
+@dataclass(slots=True)
+class _Sample:
+    """Some of the photos, evenly spread, refined against the scene from the given poses."""
+
+    refined: dict[int, _Refined]
+
+    @classmethod
+    def of(cls, photos: Sequence[TrainingPhoto], rasterizer: Rasterizer, config: DigestConfig) -> _Sample:
+        numbers = range(0, len(photos), max(1, -(-len(photos) // config.sample)))
+        tried = {number: _refined(photos[number], photos[number].camera.pose, 2, rasterizer) for number in numbers}
+        return cls({number: found for number, found in tried.items() if found is not None})
+
+    def is_off(self, photos: Sequence[TrainingPhoto], config: DigestConfig) -> bool:
+        """Return whether the scene doesn't lie where the given poses say."""
+        offsets = {number: _offset(photos[number].camera.pose, found.pose) for number, found in self.refined.items()}
+        misfits = [offset @ np.linalg.solve(self.refined[i].covariance, offset) for i, offset in offsets.items()]
+        return bool(misfits) and float(np.median(misfits)) > config.max_misfit
+
+    def effect(self, posed: Sequence[PosedPhoto], points: SurfacePoints) -> tuple[float, float] | None:
+        """Return the median distances of `distances`; None where no photo has them."""
+        found = [
+            distances(number, posed, points, one.rendered, one.pose, one.covariance)
+            for number, one in self.refined.items()
+        ]
+        both = np.array([one for one in found if one is not None]).reshape(-1, 2)
+        return (float(np.median(both[:, 0])), float(np.median(both[:, 1]))) if len(both) else None
+
+
+def _aligned(photo: TrainingPhoto, rasterizer: Rasterizer) -> Pose:
+    """Return the pose to which refinement on two renders leads; the given one where it fails."""
+    first = _refined(photo, photo.camera.pose, 2, rasterizer)
+    second = first and _refined(photo, first.pose, 1, rasterizer)
+    return second.pose if second else photo.camera.pose
+
+
+def _refined(photo: TrainingPhoto, start: Pose, levels: int, rasterizer: Rasterizer) -> _Refined | None:
     """Refine a photo's pose on a render from there; None: it fails."""
-    frame, camera = renders.of(photo, start, keep=True)
-    result = refine_photometric(photo.small, frame, camera, camera, levels, valid_mask=photo.small_mask)
-    covariance = refinement_covariance(result, frame, camera)
-    return None if covariance is None else _Refined(result.pose, covariance)
+    rendered = _rendered(photo, start, rasterizer)
+    camera = rendered.camera
+    result = refine_photometric(photo.small, rendered.frame, camera, camera, levels, valid_mask=photo.small_mask)
+    covariance = refinement_covariance(result, rendered.frame, camera)
+    return None if covariance is None else _Refined(rendered, result.pose, covariance)
+
+
+def _rendered(photo: TrainingPhoto, pose: Pose, rasterizer: Rasterizer) -> RenderedView:
+    camera = Camera(sized(photo.camera.intrinsics, RENDER_PX), pose)
+    return RenderedView(rasterizer.render([camera])[0], camera)

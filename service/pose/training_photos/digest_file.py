@@ -30,6 +30,7 @@ def write_digest(digest: PhotoDigest, path: Path) -> None:
         "sha256": np.array(digest.sha256),
         "offsets": digest.offsets,
         "quality": np.array([digest.reprojection_px, digest.depth_ratio]),
+        "effect": np.array(digest.effect or ()),
         "points_in_world": points.points_in_world,
         "covariances": points.covariances,
         "tangents": points.tangents,
@@ -50,6 +51,10 @@ def write_digest(digest: PhotoDigest, path: Path) -> None:
 def read_digest(path: Path, key: str) -> PhotoDigest | None:
     """Return a stored digest; None, logged, where it can't be read or is of another scene than that of `key`."""
     try:
+        with zipfile.ZipFile(path) as archive:
+            # Whoever uploads a scene may send any file, and a compressed one may unpack to any size.
+            if any(member.compress_type != zipfile.ZIP_STORED for member in archive.infolist()):
+                raise ValueError("it is compressed")
         with path.open("rb") as handle, np.load(handle, allow_pickle=False) as file:
             stored = {name: file[name] for name in file.files}
         digest = _digest_of(stored)
@@ -83,11 +88,14 @@ def _digest_of(stored: dict[str, np.ndarray]) -> PhotoDigest:
     for name, shape in shapes.items():
         if stored[name].shape != shape:
             raise ValueError(f"'{name}' has the shape {stored[name].shape} instead of {shape}")
-    for name in ("points_in_world", "covariances", "tangents", "photo_positions", "offsets", "quality"):
+    for name in ("points_in_world", "covariances", "tangents", "photo_positions", "offsets", "quality", "effect"):
         if not np.all(np.isfinite(stored[name])):
             raise ValueError(f"'{name}' has values that are not finite")
     if points.patches.dtype != np.uint8 or (count and not 0 <= points.photo.min() <= points.photo.max() < photos):
         raise ValueError("its patches are damaged")
     reprojection_px, depth_ratio = stored["quality"].tolist()
+    by_pixels, by_both = stored["effect"].tolist() or (None, None)
+    effect = None if by_pixels is None else (by_pixels, by_both)
     names, hashes = tuple(stored["names"].tolist()), tuple(stored["sha256"].tolist())
-    return PhotoDigest(points, str(stored["scene_key"]), names, hashes, stored["offsets"], reprojection_px, depth_ratio)
+    key, offsets = str(stored["scene_key"]), stored["offsets"]
+    return PhotoDigest(points, key, names, hashes, offsets, reprojection_px, depth_ratio, effect)

@@ -44,7 +44,7 @@ class TriangulationConfig:
     """Between triangulated and rendered depth, relative. 0.05 leaves out points of foliage that are right."""
     match_noise_px: float = 0.3
     """Standard deviation of a place, of which the points' covariances are made."""
-    steps: int = 4
+    steps: int = 3
 
 
 TRIANGULATION = TriangulationConfig()
@@ -77,34 +77,29 @@ def triangulated_corners(
     Twice: predicted by the rendered depth, then by the triangulated one, which also warps the patches better.
     """
     own = photos[number].camera
-    depth = corners.depth
-    points = _on_surface(number, corners, depth, own)
+    points = _on_surface(number, corners, corners.depth, own)
     near = _neighbours(number, points.points_in_world[:: config.every], photos, config)
+    if not near:
+        return TriangulatedCorners(selected(points, np.zeros(0, np.int64)), np.zeros(0), np.zeros(0))
     cameras = [own, *(photos[other].camera for other in near)]
-    good, found, wanted = np.zeros(len(depth), bool), _Triangulated.none(len(depth)), np.ones(len(depth), bool)
+    good, found = np.zeros(0, bool), None
+    depth = corners.depth
     for motion_px in config.max_motion_px:
-        if not near:
-            break
-        seen = [_seen(photos[i], points, wanted, motion_px) for i in near]
-        # What one photo alone shows, or none, is not looked for again.
-        wanted = np.isfinite(np.stack(seen)[:, :, 0]).sum(0) >= config.min_views - 1
-        found = _triangulate(points.points_in_world, np.stack([corners.px, *seen]), cameras, config)
+        places = [matched(photos[i].grey, points.patches, predicted(points, photos[i].camera), motion_px) for i in near]
+        seen = np.stack([corners.px, *places])
+        # What too few photos show isn't looked for again.
+        kept = np.flatnonzero(np.isfinite(seen[:, :, 0]).sum(0) >= config.min_views)
+        corners, points, depth, seen = corners.some(kept), selected(points, kept), depth[kept], seen[:, kept]
+        found = _triangulate(points.points_in_world, seen, cameras, config)
         along = transformed(own.pose.camera_from_world, found.points)[:, 2]
         good = found.is_supported & (np.abs(along / corners.depth - 1) < config.max_depth_error)
         depth = np.where(good, along, depth)
         points = _on_surface(number, corners, depth, own)
         at = np.where(good[:, None], found.points, points.points_in_world)
         points = replace(points, points_in_world=at, covariances=found.covariances.astype(np.float32))
+    assert found is not None
     ratio = depth / corners.depth
     return TriangulatedCorners(selected(points, np.flatnonzero(good)), found.rms_px[good], ratio[good])
-
-
-def _seen(
-    photo: PosedPhoto, points: SurfacePoints, wanted: Bool[np.ndarray, "n"], max_motion_px: float
-) -> Float64[np.ndarray, "n 2"]:
-    """Return where a photo shows the wanted points; NaN: nowhere."""
-    where = predicted(points, photo.camera)
-    return matched(photo.grey, points.patches, replace(where, can_match=where.can_match & wanted), max_motion_px)
 
 
 def selected(points: SurfacePoints, index: Int64[np.ndarray, "m"]) -> SurfacePoints:
@@ -163,11 +158,6 @@ class _Triangulated:
     covariances: Float64[np.ndarray, "n 3 3"]
     rms_px: Float64[np.ndarray, "n"]
     is_supported: Bool[np.ndarray, "n"]
-
-    @classmethod
-    def none(cls, count: int) -> _Triangulated:
-        """Return a result for photos without neighbours."""
-        return cls(np.zeros((count, 3)), np.zeros((count, 3, 3)), np.zeros(count), np.zeros(count, bool))
 
 
 def _triangulate(
