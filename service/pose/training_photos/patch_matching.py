@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from service.interfaces import SurfacePoints
-from service.pose.training_photos.kernels import match_patches, project_surface
+from service.pose.training_photos.patch_kernels import match_patches, project_surface
 from service.types import Camera, Intrinsics
 
 

@@ -20,7 +20,7 @@ from service.pose.features.rendered_views import RenderedView
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale
 from service.pose.refinement.refinement_config import REFINEMENT
 from service.pose.training_photos.corners import cells_of, take_in_turns
-from service.pose.training_photos.kernels import linearize_reprojection
+from service.pose.training_photos.patch_kernels import linearize_reprojection
 from service.pose.training_photos.patch_matching import PredictedPatches, matched, pinhole_vector, predicted
 from service.pose.training_photos.surface_points import selected
 from service.types import Camera, Pose
