@@ -277,6 +277,7 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         '{"units": 0.5}',
         "--misses",
         tmp_path / "misses",
+        "--photos",
         "--json",
         written,
     )
@@ -292,6 +293,7 @@ def test_bench_hands_its_flags_on_and_writes_json(splatfix, monkeypatch, tmp_pat
         "folder": tmp_path, "estimator": "view_index", "matcher": "sift", "start": "hard", "trials": 3, "seed": 4,
         "intrinsics": "withheld", "cameras": "ignored", "modify": ("blur=2",),
         "modify_scene": ("dark=0.5",), "data": None, "layout": "auto", "background": "white", "occluders": tmp_path,
+        "photos": True,
     }  # fmt: skip
     assert json.loads(written.read_text())["per_query"] == [{"photo": "a"}]
     assert "success_5deg_0p05" in told

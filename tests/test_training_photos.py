@@ -25,7 +25,7 @@ from service.pose.features.rendered_views import to_uint8
 from service.pose.training_photos.corners import surface_corners
 from service.pose.training_photos.digest import PhotoDigest, TrainingPhoto, digest_of, scene_key
 from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest, write_digest
-from service.pose.training_photos.patch_kernels import linearize_reprojection, match_patches
+from service.pose.training_photos.patch_kernels import linearize_places, match_patches
 from service.pose.training_photos.patch_matching import PATCHES, grey
 from service.pose.training_photos.surface_points import PosedPhoto, triangulated_corners
 from service.results import PoseEstimate, Status
@@ -267,7 +267,7 @@ def test_reprojection_is_linearized_as_finite_differences_say() -> None:
 
     def residuals_at(one: Pose) -> tuple[np.ndarray, np.ndarray]:
         rows, residuals = np.empty((5, 2, 6)), np.empty((5, 2))
-        linearize_reprojection(points, covariances, observed, one.camera_from_world, k, 0.5, rows, residuals)
+        linearize_places(points, covariances, observed, one.camera_from_world, k, 0.5, rows, residuals)
         return residuals, rows
 
     here, rows = residuals_at(pose)
@@ -283,7 +283,7 @@ def test_a_point_that_is_uncertain_along_x_says_less_of_x() -> None:
     covariances[0, 0, 0] = 0.02**2  # 0.02 units at 4 are 2.5 px
     rows, residuals = np.empty((1, 2, 6)), np.empty((1, 2))
     k, observed = np.array([500.0, 500.0, 0.0, 0.0]), np.array([[3.0, 3.0]])
-    linearize_reprojection(np.array([[0.0, 0.0, 4.0]]), covariances, observed, np.eye(4), k, 0.5, rows, residuals)
+    linearize_places(np.array([[0.0, 0.0, 4.0]]), covariances, observed, np.eye(4), k, 0.5, rows, residuals)
     assert residuals[0] == pytest.approx([3.0 / np.hypot(2.5, 0.5), 3.0 / 0.5], rel=1e-5)
 
 

@@ -15,11 +15,13 @@ from importlib import metadata
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64, UInt8
 
 from service import __version__
 from service.bench.render import room_cameras, synthetic_room
 from service.estimators import ESTIMATORS
 from service.geometry import look_at
+from service.interfaces import SurfacePoints
 from service.loaded_scene import DEFAULT_MATCHER, choose_rasterizer
 from service.matchers import MATCHERS
 from service.operating_system import load_averages, missing_limits
@@ -30,6 +32,8 @@ from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import pose_uncertainty
 from service.pose.retrieval.floaters import find_floaters
 from service.pose.retrieval.free_space import free_space_of
+from service.pose.training_photos.patch_kernels import linearize_places
+from service.pose.training_photos.patch_matching import PATCHES, grey, matched, pinhole_vector, predicted
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, NamedCamera, SceneInfo
@@ -84,7 +88,19 @@ def compile_kernels() -> None:
     estimate_absolute_pose(np.eye(8, 2) * 64.0, points, camera.intrinsics, 4.0, 8)
     linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
     free_space_of(room).enclosures(points)
+    _match_patches(grey(photo), points, camera)
     find_floaters(replace(room, cameras=(NamedCamera("warm", camera),)))
+
+
+def _match_patches(photo: UInt8[np.ndarray, "h w"], points: Float64[np.ndarray, "n 3"], camera: Camera) -> None:
+    tangents = np.tile(np.eye(3, 2, dtype=np.float32), (len(points), 1, 1))
+    patches = np.zeros((len(points), PATCHES.side_px, PATCHES.side_px), np.uint8)
+    covariances, photos = np.zeros((len(points), 3, 3), np.float32), np.zeros(len(points), np.int32)
+    surface = SurfacePoints(points, covariances, tangents, patches, photos, np.zeros((1, 3)))
+    places = matched(photo, patches, predicted(surface, camera), 1.0)
+    whitened, rows = np.empty((len(points), 2)), np.empty((len(points), 2, 6))
+    k = pinhole_vector(camera.intrinsics)
+    linearize_places(points, covariances, places, camera.pose.camera_from_world, k, 0.5, rows, whitened)
 
 
 def processor() -> str:

@@ -33,7 +33,7 @@ from service.types import Camera, GaussianScene, NamedCamera, Pose
 class DigestConfig:
     max_photos: int = 300
     """Of more, every second, third... is read: neighbours in a video show the same, and each takes a megabyte here."""
-    sample: int = 12
+    sample: int = 8
     """Photos that are refined to find out whether the scene lies where their poses say, and what the digest gains."""
     max_misfit: float = 25.0
     """Median of the squared offset in standard deviations of refinement, 6 by chance; scenes whose trainers leave the

@@ -188,7 +188,7 @@ def match_patches(photo, patches, warps, start, radius, max_steps, settled_px, m
 
 
 @kernel
-def linearize_reprojection(points, covariances, observed, transform, k, noise_px, rows, residuals):
+def linearize_places(points, covariances, observed, transform, k, noise_px, rows, residuals):
     """Fill whitened residuals (n, 2) of observed places, and d predicted / d right twist of the camera (n, 2, 6).
 
     A residual's covariance is that of matching, `noise_px` squared in each direction, and that of the point

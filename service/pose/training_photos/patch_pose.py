@@ -20,7 +20,7 @@ from service.pose.features.rendered_views import RenderedView
 from service.pose.refinement.covariance import inverse_spd, jackknife_variance_scale
 from service.pose.refinement.refinement_config import REFINEMENT
 from service.pose.training_photos.corners import cells_of, take_in_turns
-from service.pose.training_photos.patch_kernels import linearize_reprojection
+from service.pose.training_photos.patch_kernels import linearize_places
 from service.pose.training_photos.patch_matching import PredictedPatches, matched, pinhole_vector, predicted
 from service.pose.training_photos.surface_points import selected
 from service.types import Camera, Pose
@@ -120,7 +120,10 @@ def _combined(
     joint = inverse_spd(information + by_patches) if np.isfinite(scale) else None
     if joint is None:
         return None
-    return PatchPose(moved(camera.pose, joint @ (by_patches @ solved.step)), joint, len(places), agreeing)
+    # The squared difference of both solutions in standard deviations, 6 by chance: where it is more, both err by more.
+    difference = float(solved.step @ information @ joint @ by_patches @ solved.step)
+    covariance = max(1.0, difference / 6) * joint
+    return PatchPose(moved(camera.pose, joint @ (by_patches @ solved.step)), covariance, len(places), agreeing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +146,7 @@ def _solved(
     distance = float(np.median(np.linalg.norm(points.points_in_world - start.position_in_world, axis=1)))
     k = pinhole_vector(camera.intrinsics)
     for _ in range(config.steps):
-        linearize_reprojection(
+        linearize_places(
             points.points_in_world, points.covariances, places, pose.camera_from_world, k, config.noise_px,
             rows, residuals,
         )  # fmt: skip
