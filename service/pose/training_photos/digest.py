@@ -116,7 +116,7 @@ class PhotoDigest:
 
 def scene_key(scene: GaussianScene) -> str:
     """Return a hash of where the scene's Gaussians are, with the origin that their positions are relative to."""
-    told = hashlib.sha256(np.ascontiguousarray(scene.means))
+    told = hashlib.sha256(np.ascontiguousarray(scene.means).data)
     told.update(np.asarray(scene.info.origin_in_world, np.float64).tobytes())
     return told.hexdigest()
 
@@ -161,8 +161,8 @@ def digest_of(
 
 def _joined(found: Sequence[TriangulatedCorners], poses: Sequence[Pose]) -> SurfacePoints:
     names = ("points_in_world", "covariances", "tangents", "patches", "photo")
-    joined = [np.concatenate([getattr(one.points, name) for one in found]) for name in names]
-    return SurfacePoints(*joined, np.stack([pose.position_in_world for pose in poses]))
+    joined = {name: np.concatenate([getattr(one.points, name) for one in found]) for name in names}
+    return SurfacePoints(**joined, photo_positions=np.stack([pose.position_in_world for pose in poses]))
 
 
 def _offset(given: Pose, used: Pose) -> Float64[np.ndarray, "6"]:

@@ -94,8 +94,8 @@ def _digest_of(stored: dict[str, np.ndarray]) -> PhotoDigest:
     if points.patches.dtype != np.uint8 or (count and not 0 <= points.photo.min() <= points.photo.max() < photos):
         raise ValueError("its patches are damaged")
     reprojection_px, depth_ratio = stored["quality"].tolist()
-    by_pixels, by_both = stored["effect"].tolist() or (None, None)
-    effect = None if by_pixels is None else (by_pixels, by_both)
+    distances = stored["effect"].tolist()
+    effect = (float(distances[0]), float(distances[1])) if len(distances) == 2 else None
     names, hashes = tuple(stored["names"].tolist()), tuple(stored["sha256"].tolist())
     key, offsets = str(stored["scene_key"]), stored["offsets"]
     return PhotoDigest(points, key, names, hashes, offsets, reprojection_px, depth_ratio, effect)

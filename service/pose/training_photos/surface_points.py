@@ -168,28 +168,38 @@ def _triangulate(
 ) -> _Triangulated:
     """Minimize the reprojection errors of each point, weighed by Cauchy's function; NaN: a camera doesn't show it."""
     points = start.copy()
-    # Where fewer than two photos show a point, it stays where it is.
-    ridge = 1e-9 * np.eye(3)
-    for step in range(config.steps + 1):
-        hessian, pull, errors = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3)), []
-        for camera, px in zip(cameras, seen, strict=True):
-            predicted_px, jacobian = _projected(points, camera)
-            missing = np.isnan(px[:, 0])
-            residual = np.where(missing[:, None], 0.0, px - predicted_px)
-            squared = (residual**2).sum(1)
-            weight = np.where(missing, 0.0, 1.0 / (1.0 + squared / (2 * config.noise_px) ** 2))
-            hessian += np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian)
-            pull += np.einsum("n,nki,nk->ni", weight, jacobian, residual)
-            errors.append(np.where(missing, np.inf, np.sqrt(squared)))
-        hessian += ridge * np.trace(hessian, axis1=1, axis2=2)[:, None, None]
-        if step < config.steps:
-            points = points + np.linalg.solve(hessian, pull[..., None])[..., 0]
-    agree = np.stack(errors) < config.max_error_px
+    for _ in range(config.steps):
+        hessian, pull, _ = _reprojection(points, seen, cameras, config)
+        points = points + np.linalg.solve(hessian, pull[..., None])[..., 0]
+    hessian, _, errors = _reprojection(points, seen, cameras, config)
+    agree = errors < config.max_error_px
     views = agree.sum(0)
-    squares = np.where(agree, np.stack(errors), 0.0) ** 2
-    rms = np.sqrt(squares.sum(0) / np.maximum(views, 1))
+    rms = np.sqrt((np.where(agree, errors, 0.0) ** 2).sum(0) / np.maximum(views, 1))
     supported = (views >= config.min_views) & agree[0] & (rms < config.max_rms_px)
     return _Triangulated(points, config.match_noise_px**2 * np.linalg.inv(hessian), rms, supported)
+
+
+def _reprojection(
+    points: Float64[np.ndarray, "n 3"],
+    seen: Float64[np.ndarray, "views n 2"],
+    cameras: Sequence[Camera],
+    config: TriangulationConfig,
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, "n 3"], Float64[np.ndarray, "views n"]]:
+    """Return each point's hessian and right-hand side, and its errors in pixels; infinite where it isn't seen."""
+    hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+    errors = np.full(seen.shape[:2], np.inf)
+    for view, (camera, px) in enumerate(zip(cameras, seen, strict=True)):
+        predicted_px, jacobian = _projected(points, camera)
+        missing = np.isnan(px[:, 0])
+        residual = np.where(missing[:, None], 0.0, px - predicted_px)
+        squared = (residual**2).sum(1)
+        weight = np.where(missing, 0.0, 1.0 / (1.0 + squared / (2 * config.noise_px) ** 2))
+        hessian += np.einsum("n,nki,nkj->nij", weight, jacobian, jacobian)
+        pull += np.einsum("n,nki,nk->ni", weight, jacobian, residual)
+        errors[view] = np.where(missing, np.inf, np.sqrt(squared))
+    # Where rays are nearly parallel, the point moves along them by what can be solved for.
+    hessian += 1e-9 * np.eye(3) * np.trace(hessian, axis1=1, axis2=2)[:, None, None]
+    return hessian, pull, errors
 
 
 def _projected(
