@@ -47,7 +47,8 @@ NOT_IN_A_SUBPROCESS = {
     "test_errors.py": "brings parts of the service into states by changing them in the test's process",
 }
 """Tests of the API, or files of them, that reach around HTTP into the engine, and how."""
-GO_ON = FileEvent(Path(tempfile.mkdtemp(prefix="splatfix-go-on-")) / "set")
+_FOLDER = tempfile.TemporaryDirectory(prefix="splatfix-go-on-")
+GO_ON = FileEvent(Path(_FOLDER.name) / "set")
 """Held jobs wait for it, in whatever process they run."""
 
 
