@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
@@ -47,6 +49,24 @@ def test_what_views_see_from_a_like_direction_and_distance_is_captured(
     views = [named.camera for named in room.scene.cameras]
     share = captured_share(room.rasterizer.render([camera])[0], camera, views)
     assert share == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(("zoom_of_views", "expected"), [(1.0, 1.0), (16.0, 0.0)])
+def test_a_telephoto_lens_sees_from_afar_what_was_captured_from_near(
+    room: LoadedScene, zoom_of_views: float, expected: float
+) -> None:
+    """A wall is 2 away from the views, and 32 from the pose, outside of the room, whose other wall is left out."""
+    size = zoomed(LENS.with_long_side(128), 16.0)
+    (frame,) = room.rasterizer.render([Camera(size, pose_at(0.0, 0.0))])
+    inside = pose_at(0.0, 0.0)
+    away = Camera(size, look_at(inside.position_in_world - 30.0 * inside.axis_in_world, inside.position_in_world, UP))
+    seen = replace(frame, median_depth=frame.median_depth + np.float32(30.0))
+    views = [replace(n.camera, intrinsics=zoomed(n.camera.intrinsics, zoom_of_views)) for n in room.scene.cameras]
+    assert captured_share(seen, away, views) == pytest.approx(expected, abs=0.05)
+
+
+def zoomed(size: Intrinsics, factor: float) -> Intrinsics:
+    return replace(size, fx=factor * size.fx, fy=factor * size.fy)
 
 
 def test_no_evidence_says_nothing(room: LoadedScene) -> None:

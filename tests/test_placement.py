@@ -12,7 +12,7 @@ from service.bench.render import ROOM, synthetic_room
 from service.geometry import look_at
 from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
-from service.pose.retrieval.free_space import _steps_in_the_clear, free_space_of
+from service.pose.retrieval.free_space import _steps_in_the_clear, fibonacci_directions, free_space_of
 from service.pose.retrieval.index import built_index
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer, lod_proxy, occlusion_depths
 from service.pose.retrieval.view_placement import (
@@ -96,8 +96,11 @@ def test_pixels_show_single_opaque_surfaces() -> None:
         ([0.6, 0.6, 0.9, 0.9, 0.9], [0, 1], False),
         ([1.0, 0.7, 0.9, 0.9, 0.9], [0, 1], True),
         ([1.0, 0.5, 0.9, 0.9, 0.9], [0], True),
-        ([0.75, 0.45, 0.0, 0.0, 0.0], [0, 1], True),
-        ([0.75, 0.44, 0.0, 0.0, 0.0], [0], True),
+        ([0.9, 0.8, 0.0, 0.0, 0.0], [0, 1], True),
+        ([0.9, 0.79, 0.0, 0.0, 0.0], [0, 1], False),
+        ([0.85, 0.5, 0.0, 0.0, 0.0], [0], True),
+        # As open as a bowl: no room, though a view near its bottom is closed.
+        ([0.95, 0.6, 0.0, 0.0, 0.0], [0, 1], False),
     ],
 )
 def test_good_views_by_hand(enclosures: list[float], good: list[int], interior: bool) -> None:
@@ -161,6 +164,31 @@ def test_an_object_before_a_far_background_is_looked_at() -> None:
     at_it = [v for v in near if -v.position_in_world @ v.axis_in_world > 0.8 * np.linalg.norm(v.position_in_world)]
     assert len(at_it) >= 10
     assert min(np.linalg.norm(v.position_in_world) for v in views) > 1.0  # none in the object
+
+
+def test_a_hollow_object_is_looked_at_from_outside() -> None:
+    """A bowl, three quarters of a sphere: from its middle three quarters of all directions are closed."""
+    sphere = fibonacci_directions(COUNT)
+    positions, seen, interior = places(blobs(sphere[sphere[:, 2] < 0.5], 0.03))
+    assert not interior
+    assert seen > 0.9
+    # All around, and from as far as photos of the whole are taken; 60 degrees wide, they show it whole from 2 on.
+    away = np.linalg.norm(positions, axis=1)
+    octants = {tuple(p > 0) for p in positions[away > 1.5]}
+    assert len(octants) == 8
+    assert (away > 2).any()
+
+
+def test_best_views_from_afar_by_hand() -> None:
+    """Candidates at one and at four radii, of which the far ones show more background."""
+    scene = blobs(fibonacci_directions(500), 0.03)
+    config = replace(FEW, score_quantile=1.0, enclosure_quantile=1.0)
+    views = _Views(free_space_of(scene), CpuRasterizer(scene), config)
+    places = [[1.0, 0, 0], [0, 1.0, 0], [4.0, 0, 0], [0, 4.0, 0]]
+    views.poses = [look_at(np.array(place), np.zeros(3), np.array([0, 0, 1.0])) for place in places]
+    views.scores, views._enclosures = [0.8, 0.39, 0.2, 0.09], [0.0] * 4
+    assert views.good().tolist() == [0]
+    assert views.good(or_best_from_afar=True).tolist() == [0, 2]
 
 
 def test_no_view_is_inside_a_cloud_of_floaters() -> None:

@@ -72,13 +72,14 @@ class PlacementConfig:
     """Share of the opaque Gaussians that any good view sees: the search ends there, or when a round adds less."""
     least_seen_share: float = 0.25
     """The share of them, seen by the fewest good views, that a round aims at."""
-    interior_enclosure: float = 0.85
+    interior_enclosure: float = 0.7
     relative_enclosure: float = 0.6
     enclosure_quantile: float = 0.95
     """The scene is an interior if this quantile of the solid views' enclosures (shares of closed directions) is at
-    least `interior_enclosure`; a good view then needs `relative_enclosure` of that quantile. A closed room has 1.00,
-    the inside of a hollow object 0.75, other objects and open scenes 0.50 to 0.62. Of a room that is taken for an open
-    scene, views are wasted; of an object that is taken for a room, all views are in its inside."""
+    least `interior_enclosure`, and...; a good view then needs `relative_enclosure` of that quantile."""
+    room_enclosure: float = 0.85
+    """...the median of those above a half is at least this: within a room it is 0.95, within hollow objects 0.6 to 0.8.
+    A room that is taken for an open scene wastes some views; of a bowl that is taken for a room all are in it."""
     min_views: int = 64
     max_views: int = 1000
     covered_share: float = 0.93
@@ -262,12 +263,17 @@ class _Views:
             by_octave = [limits[octave] for octave in octaves]
             least = np.minimum(least, by_octave)
         solid = np.flatnonzero((scores >= least) & (scores > 0))
-        # Not the maximum: a single view may stand in a closet.
-        limit = float(np.quantile(enclosures[solid], self._config.enclosure_quantile)) if len(solid) else 0.0
-        self._least_enclosed = (
-            self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
-        )
+        self._least_enclosed = self._least_enclosure(enclosures[solid])
         return solid[enclosures[solid] >= self._least_enclosed]
+
+    def _least_enclosure(self, enclosures: Float64[np.ndarray, "k"]) -> float:
+        """Return the enclosure that a good view needs, by those of solid ones; 0 where the scene is no interior."""
+        within = enclosures[enclosures > 0.5]
+        if not len(within) or float(np.median(within)) < self._config.room_enclosure:
+            return 0.0
+        # Not the maximum: a single view may stand in a closet.
+        limit = float(np.quantile(enclosures, self._config.enclosure_quantile))
+        return self._config.relative_enclosure * limit if limit >= self._config.interior_enclosure else 0.0
 
     def _least_score(self, scores: Float64[np.ndarray, "n"]) -> float:
         return self._config.min_score_share * float(np.quantile(scores, self._config.score_quantile))
