@@ -245,6 +245,10 @@ def facts(**changes: Any) -> dict[str, Any]:
         "training_size": {"px": 800, "source": "manifest"}, "index": index | searched, "sha256": "0" * 64,
         "warnings": ["first", "second"], "background": [0, 0, 0], "frames": [],
         "expected_accuracy": expected,
+        "training_photos": {
+            "photos": 12, "points": 3456, "bytes": 1.25e6, "reprojection_px": 0.256, "poses_refined": False,
+            "distance_without": 0.0123, "distance_with": 0.00456,
+        },
     } | changes  # fmt: skip
 
 
@@ -286,6 +290,20 @@ def test_floaters_are_told_with_what_becomes_of_them(found: int, left_out: bool,
     assert told in scene_facts.as_lines(facts(**changes))["floaters"]
 
 
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({}, "training photos are localized 0.012 units off without them, 0.0046 with them"),
+        ({"poses_refined": True}, "the camera file's poses are not those of the scene"),
+        ({"distance_with": None}, "no photo was localized by them"),
+    ],
+)
+def test_a_digest_of_training_photos_is_told_with_its_effect(changes: dict[str, Any], told: str) -> None:
+    line = scene_facts.as_lines(facts(training_photos=facts()["training_photos"] | changes))["training photos"]
+    assert line.startswith("3,456 points of 12 photos, 1.2 MB; they agree within 0.26 px; ")
+    assert told in line
+
+
 def test_what_is_unknown_is_told_as_such() -> None:
     by_cameras = {"placed_by": "training cameras", "views": 12, "coverage": 0.5}
     changes = {
@@ -294,12 +312,14 @@ def test_what_is_unknown_is_told_as_such() -> None:
         "on_earth": False,
         "registration": None,
         "expected_accuracy": None,
+        "training_photos": None,
         "render_mode": "antialiased",
         "warnings": [],
     }
     size = {"px": None, "source": "unknown: each photo's own, within 640 to 960"}
     lines = scene_facts.as_lines(facts(**changes, index=by_cameras, training_size=size))
     assert lines["up"] == lines["metres per unit"] == "unknown"
+    assert lines["training photos"] == "no digest of them: splatfix scenes index --photos"
     assert (lines["geo anchor"], lines["registration"]) == ("no", "none")
     assert lines["format"] == "ply, antialiased"
     assert lines["expected accuracy"].startswith("not measured")
