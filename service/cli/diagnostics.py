@@ -27,6 +27,7 @@ from service.matchers import MATCHERS
 from service.operating_system import load_averages, missing_limits
 from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
+from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
 from service.pose.absolute_pose.unknown_lens import linearize_reprojection
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import pose_uncertainty
@@ -36,7 +37,7 @@ from service.pose.training_photos.patch_kernels import linearize_places
 from service.pose.training_photos.patch_matching import PATCHES, grey, matched, pinhole_vector, predicted
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
-from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, NamedCamera, SceneInfo
+from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,9 @@ def compile_kernels() -> None:
     pose_uncertainty(photo, frame, camera, camera, None)
     points = room.means[:8].astype(np.float64)
     estimate_absolute_pose(np.eye(8, 2) * 64.0, points, camera.intrinsics, 4.0, 8)
+    seen = np.eye(8, 2) * 64.0
+    one = RigMatches(seen, points, camera.intrinsics, Pose(np.eye(4)), 4.0)
+    estimate_rig_pose([one, replace(one, photo_px=seen + 8.0)], 8, [camera.pose])
     linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
     free_space_of(room).enclosures(points)
     _match_patches(grey(photo), points, camera)
