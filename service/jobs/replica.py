@@ -6,8 +6,8 @@ Methods are coroutines, so that cancels and frames arrive while a job runs; the 
 from __future__ import annotations
 
 import asyncio
+import copy
 import os
-import pickle
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
@@ -169,8 +169,9 @@ async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) ->
 
 
 def _portable(error: Exception) -> Exception:
-    """Return what survives pickling: the error, or one of the same text."""
+    """Return what survives being sent: the error, or one of the same text."""
     try:
-        return pickle.loads(pickle.dumps(error))
+        # Errors are made again in the same way on the other side.
+        return copy.deepcopy(error)
     except Exception:
         return RuntimeError(f"{type(error).__name__}: {error}")
