@@ -321,6 +321,7 @@ def test_doctor_finds_the_parts_at_work(splatfix):
     assert "SPLATFIX_WORKERS" in told
 
 
+@pytest.mark.ci
 def test_serve_prints_a_line_that_works_opens_the_browser_and_ends_when_told(room, photo, tmp_path):
     curl = shutil.which("curl")
     if not curl:
@@ -614,6 +615,7 @@ def test_a_scene_is_registered_by_a_length_and_a_floor(splatfix, room, tmp_path)
     assert "nothing to register by" in errors
 
 
+@pytest.mark.ci
 def test_a_scene_is_registered_by_another_one(splatfix, room, tmp_path):
     """By renders of the room turned about z and twice as large, in the room itself, whose unit is 3 m."""
     scene, other = tmp_path / "turned", tmp_path / "room"

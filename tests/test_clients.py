@@ -102,7 +102,7 @@ def test_the_python_client_tells_errors_in_one_line(place):
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl")
-@pytest.mark.parametrize("keys", [True, False])
+@pytest.mark.parametrize("keys", [pytest.param(True, marks=pytest.mark.ci), False])
 def test_the_curl_lines_work_as_written(place, keyless, keys):
     client, key, folder = place
     service = client if keys else keyless

@@ -38,7 +38,7 @@ BLOCKS = [block for block in blocks() if block.document not in ELSEWHERE and not
 PYTHON = [block for block in BLOCKS if block.language == "python"]
 LOCALIZES = re.compile(r"curl .*/localize$|\S*splatfix localize .*path/to/scene_folder")
 LINES = [
-    pytest.param(line, id=f"{block}-{i}")
+    pytest.param(line, id=f"{block}-{i}", marks=() if block.document == "README.md" else pytest.mark.ci)
     for block in BLOCKS
     if block.language == "sh"
     for i, line in enumerate(lines_of(block.text))

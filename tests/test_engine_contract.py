@@ -430,6 +430,7 @@ def test_a_service_whose_engine_dies_makes_the_attempt_again(stepping):
         assert finished(client, path)["state"] == "succeeded"
 
 
+@pytest.mark.ci
 def test_a_job_that_kills_its_engine_is_given_up(stepping):
     app = create_app(settings(crashes=1), {"room": make_scene()}, subprocess=True)
     with serving(app) as client:

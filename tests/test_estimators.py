@@ -241,6 +241,7 @@ def test_a_refinement_that_does_not_settle_is_followed_by_another_match(room: Lo
     assert_near(found.pose, unseen_pose(4))
 
 
+@pytest.mark.ci
 def test_a_photo_half_hidden_is_found_or_refused_but_never_wrong(room: LoadedScene) -> None:
     truth = unseen_pose(5)
     query = photo_at(room, truth)
@@ -269,6 +270,7 @@ def test_a_photo_of_another_place_is_not_localized(room: LoadedScene, tmp_path: 
         assert ("sample_poses" in stages) is (effort == "exhaustive")
 
 
+@pytest.mark.ci
 def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, tmp_path: Path) -> None:
     other = LoadedScene.of(replace(room.scene, sh=room.scene.sh[::-1]))  # the same walls, painted otherwise
     photo = photo_at(room, unseen_pose())
@@ -289,6 +291,7 @@ def test_of_two_rooms_the_one_that_the_photo_shows_is_named(room: LoadedScene, t
     assert localize_in_scenes(turned, [other, room]).loaded is room
 
 
+@pytest.mark.ci
 def test_without_training_cameras_the_room_is_found_from_the_inside(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -51,6 +51,7 @@ def test_they_stand_in_the_room_and_are_the_same_each_time(room: LoadedScene) ->
     assert all(camera.pose.world_from_camera[2, 1] < 0 for camera in cameras)
 
 
+@pytest.mark.ci
 def test_they_are_rendered_only_for_a_photo_that_needs_them_which_is_found(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:

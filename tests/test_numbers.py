@@ -129,6 +129,7 @@ def test_photos_are_localized_in_the_files_own_coordinates(at_origin, at_utm, im
     assert np.linalg.norm(tracked.position_in_world - truth.position_in_world) < 0.03  # seen: 0.014
 
 
+@pytest.mark.ci
 def test_a_region_elsewhere_excludes_the_pose(at_utm, image):
     photo = query_of((255 * image + 0.5).astype(np.uint8), intrinsics=LENS)
     box = BoxPrior(np.full(3, -5.0), np.full(3, 5.0))

@@ -47,6 +47,7 @@ def started_without(*arguments: str | Path, folder: Path) -> subprocess.Popen[st
     )
 
 
+@pytest.mark.ci
 def test_the_service_localizes_without_what_other_systems_lack(tmp_path):
     service = started_without("serve", STUDIO, "--port", "0", "--no-viewer", folder=tmp_path)
     try:

@@ -240,6 +240,7 @@ def test_a_reader_that_fails_does_not_keep_another_from_its_files(install, tmp_p
     assert load_scene(tmp_path / "scene.npz").count == load_scene(room).count
 
 
+@pytest.mark.ci
 def test_an_estimator_and_a_scene_format_of_the_folder_localize(tmp_path):
     """In a process of its own, for the folder is read at start; the method answers with the first training camera."""
     room = write_room(tmp_path / "room")

@@ -142,6 +142,7 @@ def test_an_open_tile_shows_everything():
     assert np.abs(frame.rgb - truth.rgb.numpy())[:, 48:].mean() > 0.02
 
 
+@pytest.mark.ci
 def test_an_approximate_image_lacks_at_most_what_little_light_is_left(create):
     """Three in a hundred of a pixel's light; and gradients are not those of an approximate image."""
     scene = make_scene(3000)

@@ -66,6 +66,7 @@ def test_photos_that_are_hidden_by_more_than_half_fail_alone(room):
     assert Status.LOCALIZED not in [localize(photo.query, room, fast).verdict.status for photo in photos(room)]
 
 
+@pytest.mark.ci
 def test_photos_that_fail_alone_are_localized_together(room):
     found = localize_rig(photos(room), room)
     assert found.estimate.verdict.status is Status.LOCALIZED

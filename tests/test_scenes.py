@@ -428,6 +428,7 @@ def test_a_scene_file_that_is_a_zip_is_no_archive(tmp_path):
         assert load_scene(stored.path).count == 300
 
 
+@pytest.mark.ci
 def test_checkpoints_are_uploaded_only_where_that_is_allowed(tmp_path):
     splats = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh0": (1, 3)}
     file = io.BytesIO()

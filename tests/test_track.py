@@ -135,6 +135,7 @@ def test_a_jump_is_not_followed_into_a_wrong_place(room):
     assert not followed(found)
 
 
+@pytest.mark.ci
 def test_a_photo_of_elsewhere_on_the_way_is_not_localized(room):
     """Every answer that is called localized is right, whatever comes in between."""
     tracker, truth = Tracker(room), path(4)
