@@ -15,6 +15,7 @@ from typing import Any
 
 import psycopg  # pyright: ignore[reportMissingImports]
 import psycopg_pool  # pyright: ignore[reportMissingImports]
+from psycopg.conninfo import conninfo_to_dict  # pyright: ignore[reportMissingImports]
 
 from service.errors import StorageFailed
 
@@ -32,10 +33,10 @@ class Connection:
         self._connection = connection
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> psycopg.Cursor:
-        return self._connection.execute(statement.replace("?", "%s"), values)
+        return self._connection.execute(statement.replace("?", "%s").encode(), values)
 
     def executemany(self, statement: str, rows: Sequence[Sequence[Any]]) -> None:
-        self._connection.cursor().executemany(statement.replace("?", "%s"), rows)
+        self._connection.cursor().executemany(statement.replace("?", "%s").encode(), rows)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +189,7 @@ class PostgresListener:
 def unprotected(address: str) -> str:
     """Return why others may read what goes to a database, as a phrase; empty if they can't."""
     try:
-        parts = psycopg.conninfo.conninfo_to_dict(address)
+        parts = conninfo_to_dict(address)
     except psycopg.Error:
         return "the address can't be read"
     hosts = str(parts.get("hostaddr") or parts.get("host") or "").split(",")

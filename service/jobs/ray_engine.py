@@ -74,7 +74,7 @@ class RayEngine:
                 "include_dashboard": False,
                 "object_store_memory": 500_000_000,
             }
-            where = {"address": self._ray.address} if self._ray.address else local
+            where: dict[str, Any] = {"address": self._ray.address} if self._ray.address else local
             ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
         if self._coordinator is not None:
             return
