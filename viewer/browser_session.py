@@ -103,6 +103,9 @@ class BrowserSession:
         try:
             action()
         except (ServiceError, ValueError) as error:
+            # A browser that has left is told nothing: requests under way end with its client.
+            if self._queue.closed:
+                return
             log.warning("%s", error)
             self._controls.headline.content = headline_html(None, 0, str(error))
         except Exception:
