@@ -6,6 +6,7 @@ Lines that call curl or `splatfix localize` are run in a folder with the names t
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import re
@@ -87,10 +88,13 @@ def test_the_numerics_run_on_one_thread():
 
 @pytest.fixture
 def untraced() -> Iterator[None]:
-    """Without the tracer of a coverage run, which would double the time."""
+    """Without the tracer of a coverage run, which would double the time, and collecting other tests' garbage."""
     tracer = sys.gettrace()
     sys.settrace(None)
+    gc.collect()
+    gc.freeze()
     yield
+    gc.unfreeze()
     sys.settrace(tracer)
 
 
