@@ -15,7 +15,7 @@ from service.errors import BackendMissing, InvalidImage, SceneNotFound
 from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, Tools
 from service.matchers import MATCHERS
-from service.pose.features.untold_background import WHITE, has_white_border, shows_background
+from service.pose.features.unknown_background import WHITE, has_white_border, shows_background
 from service.pose.retrieval.floaters import without_floaters
 from service.pose.training_photos.digest import DIGEST, PhotoDigest, TrainingPhoto, digest_of, scene_key
 from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
@@ -169,7 +169,7 @@ class LoadedScene:
         return found
 
     def as_seen_by(self, query: Query) -> LoadedScene:
-        """Return this scene, over white where its background is untold, shows, and is white in the photo.
+        """Return this scene, over white where its background is unknown, shows, and is white in the photo.
 
         The first such photo has the scene's view index made again, over white.
         """

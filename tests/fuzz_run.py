@@ -151,7 +151,8 @@ def checkpoint_target() -> Target:
     from service.scene_formats.gaussians import MAX_GAUSSIANS, checked
 
     # In this process: one of its own, as the service starts, takes seconds.
-    checkpoint._extracted = lambda path, folder: checkpoint.told(extracted(path, folder, MAX_GAUSSIANS), path.name)
+    read = lambda path, folder: extracted(path, folder, MAX_GAUSSIANS)  # noqa: E731
+    checkpoint._extracted = lambda path, folder: checkpoint.checked_answer(read(path, folder), path.name)
     shapes = {"means": (3, 3), "quats": (3, 4), "scales": (3, 3), "opacities": (3,), "sh0": (3, 1, 3)}
     whole = BytesIO()
     torch.save({"step": 1, "splats": {name: torch.ones(shape) for name, shape in shapes.items()}}, whole)

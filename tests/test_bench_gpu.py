@@ -494,13 +494,13 @@ def test_gradients_agree_within_a_ten_thousandth_of_their_norm(clock, room, off,
     ],
 )
 def test_poses_agree_if_one_is_localized(clock, tmp_path, monkeypatch, statuses, units, within):
-    shared = PlantedScene(clock, spoilt=0)
+    shared = PlantedScene(clock, degraded=0)
     truth = named_cameras(1)[0].camera
     (tmp_path / "p.png").write_bytes(encode_image(np.full((60, 80, 3), 0.5, np.float32), "png"))
     shared.photos = [SimpleNamespace(name="p", path=tmp_path / "p.png", camera=truth)]
     shared.scene = SimpleNamespace(info=SimpleNamespace(background_rgb=(0, 0, 0)))
     shared.units = Units(np.zeros(3), 0.5, False)
-    monkeypatch.setattr(gpu_equality, "spoilt_photos", lambda *_: iter(()))
+    monkeypatch.setattr(gpu_equality, "degraded_renders", lambda *_: iter(()))
 
     def localize(query, loaded):
         assert query.intrinsics.fx == LENS.fx
@@ -518,17 +518,17 @@ def test_poses_agree_if_one_is_localized(clock, tmp_path, monkeypatch, statuses,
     assert row["cpu_truth_deg_units"] == [0, 0]
 
 
-def test_spoilt_photos_are_taken_near_cameras_and_are_the_same_every_time():
+def test_degraded_renders_are_taken_near_cameras_and_are_the_same_every_time():
     large = LENS.resized(320, 240)
     cameras = tuple(NamedCamera(each.name, Camera(large, each.camera.pose)) for each in named_cameras(4))
     loaded = SimpleNamespace(scene=SimpleNamespace(cameras=cameras), rasterizer=OffBy())
-    found = list(gpu_equality.spoilt_photos(loaded, 60, 160, units_per_scene_unit=10.0))
-    again = list(gpu_equality.spoilt_photos(loaded, 2, 160, units_per_scene_unit=10.0))
+    found = list(gpu_equality.degraded_renders(loaded, 60, 160, units_per_scene_unit=10.0))
+    again = list(gpu_equality.degraded_renders(loaded, 2, 160, units_per_scene_unit=10.0))
     assert [data for _, data, _ in again] == [data for _, data, _ in found[:2]]
     turned, shifted = [], []
     for number, (name, _, camera) in enumerate(found):
         label, taken_from, *specs = name.split()
-        assert (int(label), tuple(specs)) == (number, gpu_equality.SPOILT_BY[number % 6])
+        assert (int(label), tuple(specs)) == (number, gpu_equality.DEGRADED_BY[number % 6])
         start = next(each.camera.pose for each in cameras if each.name == taken_from)
         if "roll=12" not in specs:
             degrees, distance = pose_distance(camera.pose, start)

@@ -24,11 +24,11 @@ from service.codec import decode, encode
 from service.coverage.calibration import Calibration, brier_score, calibrated
 from service.coverage.coverage_cache import coverage_file, read_coverage, write_coverage
 from service.coverage.coverage_map import CoverageMap, Trial, heading_of
+from service.coverage.degraded_renders import DEGRADATION, degraded_render
 from service.coverage.held_out_photos import held_out_photos
 from service.coverage.measurement import COVERAGE, Measurement, measured_coverage
 from service.coverage.plan import PLAN, _reached, find_places, novelty, plan_axes, pose_at, spread
 from service.coverage.plan_drawing import drawn_plan, level_colour
-from service.coverage.spoilt_photos import SPOIL, spoilt_photo
 from service.errors import CorruptScene
 from service.geometry import look_at, moved, project, transformed
 from service.loaded_scene import LoadedScene
@@ -74,7 +74,7 @@ def estimator() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         module = "service.coverage.measurement."
-        patch.setattr(module + "spoilt_photo", lambda camera, *_: camera.pose)
+        patch.setattr(module + "degraded_render", lambda camera, *_: camera.pose)
         patch.setattr(module + "read_query", lambda data, **_: held_out_pose(data[0]))
         patch.setattr(module + "localize_in_scene", answer)
         patch.setattr("service.pose.retrieval.free_views.FreeViews.of", lambda *_: ())
@@ -152,22 +152,22 @@ def test_a_measurement_is_the_same_again_and_can_be_cancelled(measured):
         measured_coverage(loaded, Measurement(cancel=cancelled, config=few))
 
 
-def test_a_spoilt_photo_is_the_render_through_a_lens_that_is_a_little_different(measured):
+def test_a_degraded_photo_is_the_render_through_a_lens_that_is_a_little_different(measured):
     loaded = measured[0]
     camera = Camera(PHOTO, look_at(np.zeros(3), np.array([1.0, 0.0, 0.0]), Z))
     clean = replace(
-        SPOIL, gain_sigma=0.0, white_balance_sigma=0.0, vignetting=(0.0, 0.0), blur_px=(0.01, 0.011),
+        DEGRADATION, gain_sigma=0.0, white_balance_sigma=0.0, vignetting=(0.0, 0.0), blur_px=(0.01, 0.011),
         noise=(0.0, 0.0), k1_sigma=0.0, focal_sigma=0.0, jpeg_quality=(99, 100),
     )  # fmt: skip
     render = loaded.rasterizer.render([camera])[0].rgb
-    same = spoilt_photo(camera, loaded.rasterizer, np.random.default_rng(0), clean)
+    same = degraded_render(camera, loaded.rasterizer, np.random.default_rng(0), clean)
     assert np.abs(same.rgb / 255 - render).mean() < 0.01  # JPEG's losses: 0.004
     assert same.intrinsics.trust == "approximate"
-    spoilt = spoilt_photo(camera, loaded.rasterizer, np.random.default_rng(0))
-    assert np.abs(spoilt.rgb / 255 - render).mean() > 0.03
-    assert spoilt.intrinsics.fx != pytest.approx(240.0, abs=0.1)
+    degraded = degraded_render(camera, loaded.rasterizer, np.random.default_rng(0))
+    assert np.abs(degraded.rgb / 255 - render).mean() > 0.03
+    assert degraded.intrinsics.fx != pytest.approx(240.0, abs=0.1)
     lens = replace(clean, k1_sigma=0.05)
-    bent = spoilt_photo(camera, loaded.rasterizer, np.random.default_rng(0), lens).rgb / 255
+    bent = degraded_render(camera, loaded.rasterizer, np.random.default_rng(0), lens).rgb / 255
     off = np.abs(bent - render).mean(2)
     assert off[100:140, 140:180].mean() < 0.5 * off[:40, :40].mean()  # the middle stays, the corners move
 

@@ -177,7 +177,7 @@ def test_published_figures_are_of_todays_options() -> None:
 def test_the_gpu_bench_measures_what_its_table_says() -> None:
     said = {row[0]: numbers(row[1]) for row in rows_of("results/gpu.md", "part | what")}
     assert said["pictures"] == [FULL.views, *FULL.widths]
-    assert said["poses"] == [FULL.photos, FULL.spoilt]
+    assert said["poses"] == [FULL.photos, FULL.degraded]
     assert said["throughput"] == list(FULL.at_a_time)
     assert said["sizes"] == [min(FULL.sizes) / 1e6, max(FULL.sizes) / 1e6]
     assert FULL.sizes[2:] == tuple(1_000_000 * count for count in (1, 2, 4, 8, 12))

@@ -281,7 +281,7 @@ def gsplat_checkpoint(path: Path, **other: object) -> Path:
 @pytest.fixture
 def in_this_process(monkeypatch):
     """Loads checkpoints here: starting PyTorch takes seconds."""
-    load = lambda path, folder: checkpoint.told(checkpoint_process.extracted(path, folder, 10**6), path.name)  # noqa: E731
+    load = lambda path, folder: checkpoint.checked_answer(checkpoint_process.extracted(path, folder, 10**6), path.name)  # noqa: E731
     monkeypatch.setattr(checkpoint, "_extracted", load)
 
 

@@ -86,7 +86,7 @@ def fused(steps: list[Step], facts: OdometryFacts | None = None, info: SceneInfo
         fusion.move(step.time_s, step.odom)
         if step.fix is not None:
             fusion.fix(step.time_s, step.fix, SIGMA, DEPTH)
-        told.append(fusion.told())
+        told.append(fusion.reported())
     return told
 
 
@@ -144,13 +144,13 @@ def test_after_a_silence_nothing_is_told_until_a_frame_is_found():
     for step in steps[:40]:
         fusion.move(step.time_s, step.odom)
         fusion.fix(step.time_s, step.fix or step.truth, SIGMA, DEPTH)
-    assert fusion.told() is not None
+    assert fusion.reported() is not None
     for step in steps[40:50]:
         fusion.move(step.time_s + 20, step.odom)
-        assert fusion.told() is None
+        assert fusion.reported() is None
         assert fusion.carried() is None
     fusion.fix(steps[49].time_s + 20, steps[49].truth, SIGMA, DEPTH)
-    told = fusion.told()
+    told = fusion.reported()
     assert told is not None
     assert told.resets == 1
     assert scale_error(told) < 0.05  # that of before
@@ -186,7 +186,7 @@ def test_fixes_from_one_viewpoint_are_no_surer_together():
     for number in range(0, 300, 3):
         fusion.move(number / 30, rest.odom)
         fusion.fix(number / 30, off, SIGMA, DEPTH)
-        told = fusion.told()
+        told = fusion.reported()
         assert told is not None
         spread.append(np.sqrt(np.trace(told.covariance[3:6, 3:6])))
     assert spread[-1] > 0.9 * spread[0]
@@ -205,7 +205,7 @@ def test_gravity_holds_the_tilt_and_a_wrong_one_is_not_believed():
         for step in steps[::15]:
             fusion.move(step.time_s, step.odom)
             fusion.fix(step.time_s, step.fix or step.truth, rough, DEPTH)
-            told = fusion.told()
+            told = fusion.reported()
             assert told is not None
             up_in_world = told.world_from_odom[:3, :3] @ UP / told.scale
             errors.append(np.degrees(np.arccos(up_in_world[2])))

@@ -14,9 +14,9 @@ from service.bench import live_film, track
 from service.bench.live_film import FILM, make_film
 from service.bench.pose_metrics import Units
 from service.bench.track import SEQUENCE, smooth_path
-from service.coverage import plan, spoilt_photos
+from service.coverage import degraded_renders, plan
+from service.coverage.degraded_renders import DEGRADATION, GAMMA, degraded_render
 from service.coverage.plan import PLAN
-from service.coverage.spoilt_photos import GAMMA, SPOIL, spoilt_photo
 from service.geometry import moved, pose_distance
 from service.interfaces import Frame
 from service.photos.images import read_query
@@ -149,11 +149,11 @@ def test_frames_have_the_stated_exposure_noise_and_quality(monkeypatch: pytest.M
     assert np.mean([rgb.std() for rgb, _ in seen]) == pytest.approx(0.03, rel=0.05)
 
 
-# ------------------------------------------------------------------ spoilt photos of the coverage map
+# ------------------------------------------------------------------ degraded photos of the coverage map
 
 BARE = replace(
-    SPOIL, gain_sigma=0.0, white_balance_sigma=0.0, vignetting=(0.0, 0.0), blur_px=(0.01, 0.011), noise=(0.0, 0.0),
-    k1_sigma=0.0, focal_sigma=0.0,
+    DEGRADATION, gain_sigma=0.0, white_balance_sigma=0.0, vignetting=(0.0, 0.0), blur_px=(0.01, 0.011),
+    noise=(0.0, 0.0), k1_sigma=0.0, focal_sigma=0.0,
 )  # fmt: skip
 
 
@@ -164,8 +164,8 @@ def draws(count: int, call: Any) -> np.ndarray:
 
 def test_gain_and_white_balance_have_the_stated_spread() -> None:
     even = np.full((4, 4, 3), np.float32(0.2))
-    config = replace(BARE, gain_sigma=SPOIL.gain_sigma, white_balance_sigma=SPOIL.white_balance_sigma)
-    light = draws(600, lambda rng: np.log(spoilt_photos._lit(even, rng, config)[0, 0].astype(float) / 0.2) * GAMMA)
+    config = replace(BARE, gain_sigma=DEGRADATION.gain_sigma, white_balance_sigma=DEGRADATION.white_balance_sigma)
+    light = draws(600, lambda rng: np.log(degraded_renders._lit(even, rng, config)[0, 0].astype(float) / 0.2) * GAMMA)
     assert light[:, 1].std() == pytest.approx(0.3, rel=0.08)
     # Red gains what blue loses.
     balance = (light[:, 0] - light[:, 2]) / 2
@@ -175,10 +175,10 @@ def test_gain_and_white_balance_have_the_stated_spread() -> None:
 
 def test_corners_lose_up_to_35_hundredths_of_the_light() -> None:
     even = np.full((101, 101, 3), np.float32(0.5))
-    config = replace(BARE, vignetting=SPOIL.vignetting)
+    config = replace(BARE, vignetting=DEGRADATION.vignetting)
 
     def lost(rng: np.random.Generator) -> list[float]:
-        lit = spoilt_photos._lit(even, rng, config)[..., 0].astype(float)
+        lit = degraded_renders._lit(even, rng, config)[..., 0].astype(float)
         return [1 - (lit[at] / 0.5) ** GAMMA for at in ((0, 0), (100, 100), (50, 50), (0, 50))]
 
     shares = draws(300, lost)
@@ -193,10 +193,10 @@ def test_corners_lose_up_to_35_hundredths_of_the_light() -> None:
 def test_blur_and_noise_fill_their_ranges() -> None:
     edge = np.zeros((40, 800, 3), np.float32)
     edge[:, 400:] = 1.0
-    sharp = replace(BARE, blur_px=SPOIL.blur_px)
+    sharp = replace(BARE, blur_px=DEGRADATION.blur_px)
 
     def sigma(rng: np.random.Generator) -> float:
-        row = np.diff(spoilt_photos._sensed(edge, rng, sharp)[20, :, 0].astype(float))
+        row = np.diff(degraded_renders._sensed(edge, rng, sharp)[20, :, 0].astype(float))
         at = np.arange(len(row)) - 399
         return float(np.sqrt((row * at**2).sum()))
 
@@ -205,28 +205,28 @@ def test_blur_and_noise_fill_their_ranges() -> None:
     assert np.sqrt(2 / (np.exp(1 / 0.18) + 2)) <= blurs.min() < 0.2
     assert 1.1 < blurs.max() <= 1.2
     even = np.full((60, 80, 3), np.float32(0.5))
-    noisy = replace(BARE, noise=SPOIL.noise)
-    noise = draws(80, lambda rng: spoilt_photos._sensed(even, rng, noisy).std() / np.sqrt(0.55))
+    noisy = replace(BARE, noise=DEGRADATION.noise)
+    noise = draws(80, lambda rng: degraded_renders._sensed(even, rng, noisy).std() / np.sqrt(0.55))
     assert 0.005 * 0.95 < noise.min() < 0.0065
     assert 0.028 < noise.max() <= 0.03 * 1.05
     # Its variance grows with the signal.
-    dark = spoilt_photos._sensed(np.full((60, 80, 3), np.float32(0.2)), np.random.default_rng(3), noisy)
-    light = spoilt_photos._sensed(np.full((60, 80, 3), np.float32(0.7)), np.random.default_rng(3), noisy)
+    dark = degraded_renders._sensed(np.full((60, 80, 3), np.float32(0.2)), np.random.default_rng(3), noisy)
+    light = degraded_renders._sensed(np.full((60, 80, 3), np.float32(0.7)), np.random.default_rng(3), noisy)
     assert light.std() / dark.std() == pytest.approx(np.sqrt(0.75 / 0.25), rel=0.02)
 
 
 def test_what_is_sent_is_a_jpeg_of_640_pixels_with_a_focal_length_three_hundredths_off(monkeypatch) -> None:
     qualities, lenses, rng = [], [], np.random.default_rng(0)
-    monkeypatch.setattr(spoilt_photos, "encode_image", lambda rgb, quality: qualities.append(quality) or rgb)
+    monkeypatch.setattr(degraded_renders, "encode_image", lambda rgb, quality: qualities.append(quality) or rgb)
     monkeypatch.setattr(
-        spoilt_photos, "read_query", lambda rgb, intrinsics: SimpleNamespace(rgb=rgb, intrinsics=intrinsics)
+        degraded_renders, "read_query", lambda rgb, intrinsics: SimpleNamespace(rgb=rgb, intrinsics=intrinsics)
     )
-    monkeypatch.setattr(spoilt_photos, "undistorted", lambda image, lens: lenses.append(lens) or (image, lens))
+    monkeypatch.setattr(degraded_renders, "undistorted", lambda image, lens: lenses.append(lens) or (image, lens))
     for change in ("_lit", "_sensed"):
-        monkeypatch.setattr(spoilt_photos, change, lambda rgb, rng, config: rgb)
+        monkeypatch.setattr(degraded_renders, change, lambda rgb, rng, config: rgb)
     camera = Camera(Intrinsics(1280, 960, 1200.0, 1200.0, 640.0, 480.0), HERE)
     grey = Grey()
-    photos = [spoilt_photo(camera, grey, rng) for _ in range(60)]  # type: ignore[arg-type]
+    photos = [degraded_render(camera, grey, rng) for _ in range(60)]  # type: ignore[arg-type]
     sent = [each.intrinsics for each in photos]
     assert {(k.width, k.height, k.trust) for k in sent} == {(640, 480, "approximate")}
     assert {each.rgb.shape for each in photos} == {(480, 640, 3)}

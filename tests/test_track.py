@@ -19,7 +19,7 @@ from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
 from service import tracking as track
 from service.bench import track as bench
-from service.bench.live import Told, figures
+from service.bench.live import SessionLog, figures
 from service.bench.live_film import FilmConfig, Shot, make_film
 from service.bench.pose_metrics import Units
 from service.errors import InvalidImage, SceneNotFound
@@ -492,7 +492,7 @@ def test_the_figures_of_a_live_bench_are_those_of_what_was_heard():
         Shot("jumped", 0.9, b"", Pose(np.eye(4))),
         Shot("jumped", 1.0, b"", Pose(np.eye(4))),
     ]
-    told = Told(shots)
+    told = SessionLog(shots)
 
     def hear(number: int, at_s: float, off: float | None, status: str = "localized") -> None:
         matrix = (

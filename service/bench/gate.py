@@ -1,10 +1,10 @@
 """`splatfix bench gate`: gather right and wrong poses, fit the verification gate's model, and test it.
 
-Right poses are the estimator's answers to test photos, as they are and spoilt within reason, that lie within the
+Right poses are the estimator's answers to test photos, as they are and degraded within reason, that lie within the
 bound. Wrong ones are made by stress:
 
     foreign     photos of the other scenes, localized in this one      garbage   patterns and noise, localized
-    mirrored    the test photos, left and right exchanged, localized   beyond    spoilt beyond reason, localized
+    mirrored    the test photos, left and right exchanged, localized   beyond    degraded beyond reason, localized
     moved       true poses moved by 0.06 to 1.5 units and up to 8 degrees, as they are (by 0.002 to 0.012 units and up
                 to 0.12 degrees they are right: samples of what less exact methods answer: near)
     drifted     the same, aligned from there, where that doesn't lead back

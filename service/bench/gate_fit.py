@@ -2,7 +2,7 @@
 
 Weights and floors are fitted on all scenes but one and tested on that one, for each in turn (with a single scene, on
 three quarters of its photos and tested on the rest); the counts are of those tests. The model itself is fitted on all.
-Floors are of right poses of photos spoilt within reason.
+Floors are of right poses of photos degraded within reason.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class _Table:
     doubted: Bool[np.ndarray, "n"]
     """What is refused for another reason is not for the signals to decide."""
     usual: Bool[np.ndarray, "n"]
-    """Right, and of a photo spoilt within reason: what floors are of."""
+    """Right, and of a photo degraded within reason: what floors are of."""
     matched: Bool[np.ndarray, "n"]
     kinds: np.ndarray
     folds: Int64[np.ndarray, "n"]
@@ -72,7 +72,7 @@ class _Table:
     @classmethod
     def of(cls, samples: Sequence[Sample]) -> _Table:
         right, kinds = np.array([s.right for s in samples]), np.array([s.kind for s in samples])
-        # Photos spoilt beyond reason may be refused: they don't lower the floors.
+        # Photos degraded beyond reason may be refused: they don't lower the floors.
         usual = right & ~np.char.startswith(kinds, "beyond")
         matched, doubted = np.array([s.matched for s in samples]), np.array([s.doubted for s in samples])
         return cls(right, doubted, usual, matched, kinds, _folds(samples))

@@ -34,7 +34,7 @@ GRADIENT_BOUND = 1e-4
 POSE_BOUND = (0.02, 0.001)
 """Degrees and normalized units between the poses found with either renderer."""
 GRADIENT_PX = 200
-SPOILT_BY = (
+DEGRADED_BY = (
     ("blur=1.5", "noise=0.03"), ("gain=0.7", "jpeg=40"), ("white_balance=1.2", "gamma=1.3"), ("roll=12",),
     ("crop=0.6", "saturation=0.5"), ("scale=0.5", "jpeg=60"),
 )  # fmt: skip
@@ -91,8 +91,8 @@ def gradients(shared: Shared) -> Iterator[Row]:
 def poses(shared: Shared) -> Iterator[Row]:
     """Yield for each photo, the scene's own and rendered ones, what is found with either renderer.
 
-    Its own photos are sent as they are; rendered ones are taken near training cameras and spoilt, in turn, by
-    `SPOILT_BY`.
+    Its own photos are sent as they are; rendered ones are taken near training cameras and degraded, in turn, by
+    `DEGRADED_BY`.
     """
     background = shared.scene.info.background_rgb
     for name, data, truth in _photos(shared):
@@ -121,13 +121,13 @@ def _photos(shared: Shared) -> Iterator[tuple[str, bytes, Camera]]:
     for photo in shared.photos:
         yield photo.name, photo.path.read_bytes(), photo.camera
     work = shared.work
-    yield from spoilt_photos(shared.reference, work.spoilt, work.spoilt_px, shared.units.units_per_scene_unit)
+    yield from degraded_renders(shared.reference, work.degraded, work.degraded_px, shared.units.units_per_scene_unit)
 
 
-def spoilt_photos(
+def degraded_renders(
     loaded: LoadedScene, count: int, long_side_px: int, units_per_scene_unit: float
 ) -> Iterator[tuple[str, bytes, Camera]]:
-    """Yield photos rendered near training cameras and spoilt, the same every time: name, PNG file, true camera."""
+    """Yield photos rendered near training cameras and degraded, the same every time: name, PNG file, true camera."""
     rng = np.random.default_rng(0)
     per_unit = np.array([1.0] * 3 + [1 / units_per_scene_unit] * 3)
     cameras = loaded.scene.cameras
@@ -136,7 +136,7 @@ def spoilt_photos(
         pose = moved(named.camera.pose, rng.normal(size=6) * _AWAY * per_unit)
         camera = Camera(named.camera.intrinsics.with_long_side(long_side_px), pose)
         (frame,) = loaded.rasterizer.render([camera])
-        specs = SPOILT_BY[number % len(SPOILT_BY)]
+        specs = DEGRADED_BY[number % len(DEGRADED_BY)]
         photo = modify(Photo(np.clip(frame.rgb, 0, 1), camera.intrinsics, pose), specs, rng)
         name = f"{number:02} {named.name} {' '.join(specs)}"
         yield name, encode_image(photo.pixels(), "png"), Camera(photo.intrinsics, photo.pose)

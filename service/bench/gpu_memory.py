@@ -90,19 +90,19 @@ def out_of_memory(shared: Shared) -> Iterator[Row]:
     (before,) = rasterizer.render([camera])
     try:
         limit(scene.nbytes // 2)
-        yield {"case": "a scene is loaded", "happens": _told(lambda: rasterizer.of(scene))}
+        yield {"case": "a scene is loaded", "happens": _outcome(lambda: rasterizer.of(scene))}
         if choose_rasterizer()[0] == shared.renderer:
             loaded = LoadedScene.of(scene)
             yield {"case": "a scene is loaded by default", "happens": f"{loaded.rasterizer.name}: {loaded.warnings}"}
         limit(0)
-        yield {"case": "an image is rendered", "happens": _told(lambda: rasterizer.render([camera]))}
+        yield {"case": "an image is rendered", "happens": _outcome(lambda: rasterizer.render([camera]))}
     finally:
         limit(None)
     (after,) = rasterizer.render([camera])
     yield {"case": "there is memory again", "happens": "the same image" if _same(before, after) else "another image"}
 
 
-def _told(attempt: Any) -> str:
+def _outcome(attempt: Any) -> str:
     try:
         attempt()
     except Exception as error:  # which one is the result

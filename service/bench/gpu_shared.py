@@ -41,9 +41,9 @@ class Workload:
     """Cameras for comparisons and times of renders."""
     photos: int
     """Of the scene's test photos."""
-    spoilt: int
-    """Rendered and spoilt photos."""
-    spoilt_px: int
+    degraded: int
+    """Rendered and degraded photos."""
+    degraded_px: int
     repeats: int
     """Localizations of each photo for latencies."""
     at_a_time: tuple[int, ...]

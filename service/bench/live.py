@@ -50,8 +50,8 @@ LINK = LinkConfig()
 
 
 @dataclass(slots=True)
-class Told:
-    """What a client sent and heard."""
+class SessionLog:
+    """What a client sent and received."""
 
     shots: Sequence[Shot]
     sent_at: dict[int, float] = field(default_factory=dict)
@@ -79,9 +79,41 @@ def run(
 ) -> dict[str, Any]:
     """Return the object that `--json` writes: figures of each session, and of the service. Raises SceneError.
 
-    The service runs on `cores` processors; with `withheld` it isn't told the camera's intrinsics. With `odometry`
+    The service runs on `cores` processors; with `withheld` it isn't given the camera's intrinsics. With `odometry`
     frames bring a device's, in metres that the scene knows nothing of.
     """
+    film, camera, units = _filmed(folder, seconds, seed, odometry, cache_dir, progress, config)
+    with _service(folder, cores, cache_dir) as (url, scene):
+        _warm_up(url, scene, film, camera)
+        before = _cpu_s(url)
+        began, own = time.perf_counter(), time.process_time()
+        logs = play(film, url, scene, sessions, None if withheld else camera, seed, link)
+        wall_s, own_s = time.perf_counter() - began, time.process_time() - own
+        server_s = _cpu_s(url) - before
+    return {
+        "scene": scene,
+        "seed": seed,
+        "frames": len(film),
+        "cores": cores,
+        "intrinsics": "withheld" if withheld else "given",
+        "service_cpu_share": server_s / wall_s,
+        "service_cpu_ms_a_frame": 1e3 * server_s / max(1, sum(len(one.answers) for one in logs)),
+        "clients_cpu_share": own_s / wall_s,
+        "odometry": odometry,
+        "sessions": [figures(one, units, camera) for one in logs],
+    }
+
+
+def _filmed(
+    folder: Path,
+    seconds: float,
+    seed: int,
+    odometry: bool,
+    cache_dir: Path | None,
+    progress: Callable[[int, int], None] | None,
+    config: FilmConfig,
+) -> tuple[Sequence[Shot], Intrinsics, Units]:
+    """Render a walk through a scene, which isn't kept in memory; return its frames, their camera, and the units."""
     loaded = LoadedScene.of(load_scene(folder), cache_dir=cache_dir)
     training = [named.camera for named in loaded.scene.cameras]
     if len(training) < 2:
@@ -95,58 +127,44 @@ def run(
     if odometry:
         up = -np.sum([pose.world_from_camera[:3, 1] for pose in stations], 0)
         film = with_odometry(film, units, up / np.linalg.norm(up), seed)
-    del loaded
-    with _service(folder, cores, cache_dir) as (url, scene):
-        _warm_up(url, scene, film, camera)
-        before = _cpu_s(url)
-        began, own = time.perf_counter(), time.process_time()
-        told = play(film, url, scene, sessions, None if withheld else camera, seed, link)
-        wall_s, own_s = time.perf_counter() - began, time.process_time() - own
-        server_s = _cpu_s(url) - before
-    return {
-        "scene": scene,
-        "seed": seed,
-        "frames": len(film),
-        "cores": cores,
-        "intrinsics": "withheld" if withheld else "given",
-        "service_cpu_share": server_s / wall_s,
-        "service_cpu_ms_a_frame": 1e3 * server_s / max(1, sum(len(one.answers) for one in told)),
-        "clients_cpu_share": own_s / wall_s,
-        "odometry": odometry,
-        "sessions": [figures(one, units, camera) for one in told],
-    }
+    return film, camera, units
 
 
 def play(
     film: Sequence[Shot], url: str, scene: str, sessions: int, camera: Intrinsics | None, seed: int,
     link: LinkConfig = LINK,
-) -> list[Told]:  # fmt: skip
+) -> list[SessionLog]:  # fmt: skip
     """Send a film in several sessions at once, each through a link of its own; return what each heard."""
-    told = [Told(film) for _ in range(sessions)]
+    logs = [SessionLog(film) for _ in range(sessions)]
     rngs = np.random.default_rng(seed).spawn(sessions)
     given = None if camera is None else _as_sent(camera)
     threads = [
         threading.Thread(target=_session, args=(one, url, scene, given, rng, link))
-        for one, rng in zip(told, rngs, strict=True)
+        for one, rng in zip(logs, rngs, strict=True)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    return told
+    return logs
 
 
 def _session(
-    told: Told, url: str, scene: str, intrinsics: dict[str, float] | None, rng: np.random.Generator, link: LinkConfig
+    log: SessionLog,
+    url: str,
+    scene: str,
+    intrinsics: dict[str, float] | None,
+    rng: np.random.Generator,
+    link: LinkConfig,
 ) -> None:
     # Not metric: a scene's scale would be known from its manifest.
-    odometry = None if told.shots[0].odom is None else {"metric": False}
+    odometry = None if log.shots[0].odom is None else {"metric": False}
     with Live(url, scene, intrinsics=intrinsics, odometry=odometry, proxy=None) as live:
         start = time.perf_counter()
-        listener = threading.Thread(target=_listen, args=(told, live, start))
+        listener = threading.Thread(target=_listen, args=(log, live, start))
         listener.start()
         arrives = 0.0
-        for number, shot in enumerate(told.shots):
+        for number, shot in enumerate(log.shots):
             delay = link.delay_s + rng.uniform(-link.spread_s, link.spread_s)
             if rng.random() < link.loss:
                 continue
@@ -154,21 +172,21 @@ def _session(
             time.sleep(max(0.0, start + arrives - time.perf_counter()))
             odom = None if shot.odom is None else shot.odom.world_from_camera.tolist()
             frame_id = live.send(shot.jpeg, shot.time_s, odom_from_camera=odom)
-            told.sent_at[frame_id], told.shot_of[frame_id] = time.perf_counter() - start, number
+            log.sent_at[frame_id], log.shot_of[frame_id] = time.perf_counter() - start, number
         time.sleep(1.0)  # for the last answers
         live.close()
         listener.join()
 
 
-def _listen(told: Told, live: Live, start: float) -> None:
+def _listen(log: SessionLog, live: Live, start: float) -> None:
     with suppress(LiveClosed):
         while True:
             answer = live.answer()
             assert answer is not None
-            told.answers[answer.id] = answer
-            told.heard_at[answer.id] = time.perf_counter() - start
-            if live.hint and told.hints[-1:] != [live.hint]:
-                told.hints.append(live.hint)
+            log.answers[answer.id] = answer
+            log.heard_at[answer.id] = time.perf_counter() - start
+            if live.hint and log.hints[-1:] != [live.hint]:
+                log.hints.append(live.hint)
 
 
 # ------------------------------------------------------------------ the service
@@ -237,7 +255,7 @@ def _cpu_s(url: str) -> float:
 # ------------------------------------------------------------------ figures
 
 
-def figures(told: Told, units: Units, camera: Intrinsics) -> dict[str, Any]:
+def figures(log: SessionLog, units: Units, camera: Intrinsics) -> dict[str, Any]:
     """Return a session's figures.
 
     used_per_s: answered frames for each second in which frames came, beside the dark. right: of all frames that the
@@ -245,16 +263,16 @@ def figures(told: Told, units: Units, camera: Intrinsics) -> dict[str, Any]:
     the arrival of the first frame after an interruption to the first `localized` answer. With odometry a frame without
     an answer has the pose that the client knows by its odometry; `odometry_figures` has more.
     """
-    shots, answers = told.shots, told.answers
+    shots, answers = log.shots, log.answers
     explained = [n for n, shot in enumerate(shots) if shot.truth is not None]
-    answered = {told.shot_of[i]: answer for i, answer in answers.items()}
+    answered = {log.shot_of[i]: answer for i, answer in answers.items()}
     off = {n: _errors(a, shots[n].truth, units) for n, a in answered.items() if a.world_from_camera}
     more = {}
     if shots[0].odom is not None:
-        shown = displayed(shots, answers, told.heard_at)
+        shown = displayed(shots, answers, log.heard_at)
         kept = {n: pose for n, pose in enumerate(shown) if pose is not None and n not in off}
         off |= {n: errors(pose, truth, units) for n, pose in kept.items() if (truth := shots[n].truth) is not None}
-        more = odometry_figures(shots, answers, told.shot_of, shown, camera, units)
+        more = odometry_figures(shots, answers, log.shot_of, shown, camera, units)
     tracked = [a for a in answers.values() if a.mode == "tracking"]
     times = [a.waited_ms + a.used_ms for a in tracked] or [np.nan]
     localized = {n for n, a in answered.items() if a.status == "localized"}
@@ -264,7 +282,7 @@ def figures(told: Told, units: Units, camera: Intrinsics) -> dict[str, Any]:
     parts = {shot.part: [n for n in explained if shots[n].part == shot.part] for shot in shots if shot.truth}
     fps = 1 / np.median(np.diff([shot.time_s for shot in shots]))
     return {
-        "sent": len(told.sent_at),
+        "sent": len(log.sent_at),
         "used_per_s": fps * len(used) / len(explained),
         "arrival_to_answer_ms_p50": float(np.percentile(times, 50)),
         "arrival_to_answer_ms_p95": float(np.percentile(times, 95)),
@@ -273,8 +291,8 @@ def figures(told: Told, units: Units, camera: Intrinsics) -> dict[str, Any]:
         "localized": len(localized) / len(explained),
         "wrong_localized": sum(n in localized and not _within(error, COARSE) for n, error in off.items()),
         "right_by_part": {part: sum(n in set(right) for n in ns) / len(ns) for part, ns in parts.items()},
-        "back_s": {part: _back_s(told, part, localized) for part in ("steady", "blurred", "jumped", "unlocked")},
-        "hints": told.hints,
+        "back_s": {part: _back_s(log, part, localized) for part in ("steady", "blurred", "jumped", "unlocked")},
+        "hints": log.hints,
         **more,
     }
 
@@ -290,8 +308,8 @@ def _within(error: tuple[float, float], bounds: tuple[float, float]) -> bool:
     return error[0] <= bounds[0] and error[1] <= bounds[1]
 
 
-def _back_s(told: Told, part: str, localized: set[int]) -> float | None:
+def _back_s(log: SessionLog, part: str, localized: set[int]) -> float | None:
     """Return the time from the first frame's arrival in a part to the first localized answer; None: there is none."""
-    ids = [i for i, n in told.shot_of.items() if told.shots[n].part == part]
-    found = [told.heard_at[i] for i in ids if told.shot_of[i] in localized and i in told.heard_at]
-    return min(found) - told.sent_at[ids[0]] if found else None
+    ids = [i for i, n in log.shot_of.items() if log.shots[n].part == part]
+    found = [log.heard_at[i] for i in ids if log.shot_of[i] in localized and i in log.heard_at]
+    return min(found) - log.sent_at[ids[0]] if found else None

@@ -1,4 +1,4 @@
-"""From the share of spoilt renders that are found to the probability that a real photo is: logistic calibration.
+"""From the share of degraded renders that are found to the probability that a real photo is: logistic calibration.
 
     logit p = offset + slope * logit(share)
 
@@ -37,6 +37,8 @@ _SHARES = (0.01, 0.99)
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
+    """A fitted calibration: logit p = offset + slope * logit(share)."""
+
     offset: float = 0.0
     slope: float = 1.0
     photos: int = 0
@@ -45,7 +47,7 @@ class Calibration:
     """Mean squared difference of probability and outcome of these photos, each left out of its own fit."""
 
     def applied(self, shares: Float64[np.ndarray, "k"]) -> Float64[np.ndarray, "k"]:
-        """Return probabilities."""
+        """Return the probability (0..1) for each share of renders found: the share itself where nothing was fitted."""
         if not self.photos:
             return shares
         return _sigmoid(self.offset + self.slope * _logit(shares))
@@ -58,6 +60,7 @@ def calibrated(
 
     Maximum a posteriori, by Newton's method; nothing is changed where there are fewer than MIN_PHOTOS.
     """
+    # With its prior the fit exists for a single photo, too, but the map would be called calibrated by next to nothing.
     if len(shares) < MIN_PHOTOS:
         return Calibration()
     offset, slope = _fit(shares, found, prior)
@@ -111,6 +114,7 @@ def _maximum(
         p = _sigmoid(design @ at)
         gradient = design.T @ (found - p) - precision @ (at - mean)
         hessian = (design * (p * (1 - p))[:, None]).T @ design + precision
+        # Where the sigmoid is flat a full Newton step overshoots: no weight moves by more than 1 at once.
         step = np.linalg.solve(hessian, gradient)
         at = at + step / max(1.0, float(np.abs(step).max()))
     return at

@@ -31,6 +31,7 @@ def coverage_file(
     config: CoverageConfig = COVERAGE,
 ) -> Path:
     """Return the file of a scene's map; `searched` is the scene that photos are localized in (`LoadedScene`)."""
+    # Floaters are left out by an opacity of 0: the file's hash doesn't show which were.
     visible = int(np.count_nonzero(searched.opacities))
     photos = [(photo.name, *_stamp(photo.path)) for photo in held_out]
     parts = (VERSION, searched.info.sha256, visible, len(searched.cameras), rasterizer, matcher, config, photos)
@@ -52,6 +53,7 @@ def read_coverage(path: Path) -> CoverageMap | None:
 
 def write_coverage(found: CoverageMap, path: Path) -> None:
     """Store a map; a disk that refuses is logged, for the map is there without it."""
+    # Renamed when it is whole, so that no reader sees half a map; two processes that measure it write two drafts.
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -64,5 +66,6 @@ def write_coverage(found: CoverageMap, path: Path) -> None:
 
 
 def _stamp(path: Path) -> tuple[int, int]:
+    # Size and time: hashing all photos would take longer than reading the map.
     facts = path.stat()
     return facts.st_size, facts.st_mtime_ns

@@ -21,7 +21,7 @@ has against those nearby."""
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One photo that was localized: a spoilt render, or a held-out real photo."""
+    """One photo that was localized: a degraded render, or a held-out real photo."""
 
     pose: Pose
     """The true one, in the world."""
@@ -56,7 +56,7 @@ class CoverageMap:
     novelties: Float64[np.ndarray, "c h"]
     """Of each place and heading (`plan.novelty`)."""
     trials: tuple[Trial, ...]
-    """Of spoilt renders."""
+    """Of degraded renders."""
     real_trials: tuple[Trial, ...]
     """Of held-out real photos, where the scene's folder has some."""
     calibration: Calibration
@@ -85,7 +85,7 @@ class CoverageMap:
         return np.where(self.sees_scene, self.calibration.applied(rates).reshape(self.sees_scene.shape), 0.0)
 
     def rates_near(self, trials: Sequence[Trial]) -> Float64[np.ndarray, "k"]:
-        """Return the probability that a spoilt render is found where other photos were taken, before calibration."""
+        """Return the probability that a degraded render is found where other photos were taken, before calibration."""
         return self._rates(*self._coordinates(trials), np.array([trial.novelty for trial in trials]))
 
     def _coordinates(self, trials: Sequence[Trial]) -> tuple[Float64[np.ndarray, "k 2"], Float64[np.ndarray, "k"]]:
@@ -96,6 +96,7 @@ class CoverageMap:
         self, at: Float64[np.ndarray, "k 2"], headings: Float64[np.ndarray, "k"], novelties: Float64[np.ndarray, "k"]
     ) -> Float64[np.ndarray, "k"]:
         """Predict by the novelty, and add what the trials nearby were better or worse (Nadaraya-Watson's average)."""
+        # A view of nothing fails for want of a scene, and says nothing about places that see it.
         tried = [trial for trial in self.trials if trial.status is not None]
         if not tried:
             return np.zeros(len(at))
@@ -112,6 +113,7 @@ class CoverageMap:
     def expected_accuracy(self) -> ExpectedAccuracy:
         """Summarize: what to expect of a photo that is taken where the scene was captured."""
         probabilities = self.probabilities[self.sees_scene]
+        # A render differs from the scene by nothing but light and lens: its errors are smaller than a photo's.
         found = [trial for trial in (self.real_trials or self.trials) if trial.found]
         errors = np.array([(trial.rotation_deg, trial.position_units) for trial in found]).reshape(-1, 2)
         middle = np.median(errors, 0) if found else np.full(2, np.nan)
@@ -124,6 +126,8 @@ class CoverageMap:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedAccuracy:
+    """What to expect of a photo that is taken where the scene was captured: shares and probabilities in 0..1."""
+
     found: float
     """Mean probability over all places and headings that see the scene."""
     sure_share: float
@@ -134,8 +138,11 @@ class ExpectedAccuracy:
 
 
 def heading_of(pose: Pose, plan_from_world: Float64[np.ndarray, "3 3"]) -> float:
-    """Return the heading of a camera; that of a camera that looks straight up or down is that of its upper edge."""
+    """Return the heading of a camera (rad, -pi..pi, as in `CoverageMap`); of one that looks straight up or down that of
+    the image's upper or lower edge, whichever points ahead.
+    """
     axis = plan_from_world @ pose.axis_in_world
+    # Within 6 degrees of the vertical the axis has no heading but noise.
     if np.hypot(axis[0], axis[1]) < 0.1:
         axis = plan_from_world @ -pose.world_from_camera[:3, 1] * (1 if axis[2] < 0 else -1)
     return float(np.arctan2(axis[1], axis[0]))

@@ -24,6 +24,8 @@ TRUTH = "truth.json"
 
 @dataclass(frozen=True, slots=True)
 class HeldOutPhoto:
+    """A photo that the scene was not trained on, with the camera that took it."""
+
     name: str
     path: Path
     camera: Camera
@@ -42,6 +44,7 @@ def held_out_photos(folder: Path) -> list[HeldOutPhoto]:
     file, manifest = TransformsFile.open(path), read_manifest(folder)
     found = []
     for name in file.split("test") or ():
+        # A split may name photos that were never posed, and data sets are published without their photos.
         photo = file.photo_file(name) if name in file.frames else None
         if photo is not None:
             camera, world_from_scene = file.camera(name, manifest).camera, manifest.world_from_scene

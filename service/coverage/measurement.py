@@ -1,4 +1,4 @@
-"""Measures a coverage map: localizes spoilt renders spread over the scene, and held-out real photos, on all cores."""
+"""Measures a coverage map: localizes degraded renders spread over the scene, and held-out real photos, on all cores."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import numpy as np
 
 from service.coverage.calibration import Calibration, calibrated
 from service.coverage.coverage_map import CoverageMap, Trial
+from service.coverage.degraded_renders import DEGRADATION, DegradationConfig, degraded_render
 from service.coverage.held_out_photos import HeldOutPhoto
 from service.coverage.plan import PLAN, PlanConfig, find_places, novelty, spread
-from service.coverage.spoilt_photos import SPOIL, SpoilConfig, spoilt_photo
 from service.geometry import pose_distance
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Request, localize_in_scene
@@ -30,12 +30,14 @@ from service.types import Camera, Query
 
 @dataclass(frozen=True, slots=True)
 class CoverageConfig:
+    """How many photos a map is measured with, and how each is made and searched for."""
+
     trials: int = 160
-    """Spoilt renders: some 50 s of the studio on two cores."""
+    """Degraded renders: some 50 s of the studio on two cores."""
     budget_renders: int = 60
     """Of each photo: what takes longer is not found in a second or two, and a user has taken the next photo."""
     plan: PlanConfig = PLAN
-    spoil: SpoilConfig = SPOIL
+    degradation: DegradationConfig = DEGRADATION
 
 
 COVERAGE = CoverageConfig()
@@ -63,9 +65,11 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
     index.free_views.of(loaded.searched, loaded.rasterizer, loaded.matcher, index.views)
     captured = [named.camera for named in loaded.searched.cameras] or [view.camera for view in index.views]
     distance = _distance(index.views)
+    # A fixed seed: a scene has the same places whenever its map is measured.
     places = find_places(loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan)
     pairs = spread(places, config.trials)
     runner = _Runner(loaded, how, captured, distance, len(pairs) + len(how.held_out))
+    # Threads suffice: most of the time is spent in kernels, which release the GIL.
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="coverage") as pool:
         cameras = [places.cameras[cell][heading] for cell, heading in pairs]
         trials = tuple(pool.map(runner.try_render, cameras, range(len(cameras))))
@@ -83,6 +87,7 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         Calibration(),
         0.0,
     )
+    # The fit needs the probabilities of the map without a calibration, hence two steps.
     calibration = calibrated(found.rates_near(real), np.array([trial.found for trial in real], bool))
     return replace(found, calibration=calibration, seconds=time.perf_counter() - began)
 
@@ -105,13 +110,15 @@ class _Runner:
         self._done, self._lock = 0, threading.Lock()
 
     def try_render(self, camera: Camera, seed: int) -> Trial:
+        # By the trial's number: which thread takes which trial depends on the machine's load.
         rng = np.random.default_rng([1, seed])
-        return self._tried(spoilt_photo(camera, self._loaded.rasterizer, rng, self._how.config.spoil), camera)
+        return self._tried(degraded_render(camera, self._loaded.rasterizer, rng, self._how.config.degradation), camera)
 
     def try_photo(self, photo: HeldOutPhoto) -> Trial:
-        told = replace(photo.camera.intrinsics, trust="approximate")
+        # As users' photos come: exact intrinsics would promise more than those get.
+        sent = replace(photo.camera.intrinsics, trust="approximate")
         query = read_query(
-            photo.path.read_bytes(), intrinsics=told, background_rgb=self._loaded.scene.info.background_rgb
+            photo.path.read_bytes(), intrinsics=sent, background_rgb=self._loaded.scene.info.background_rgb
         )
         # Inside of the scene, as the capture's cameras are.
         pose = shifted(photo.camera.pose, -np.array(self._loaded.scene.info.origin_in_world))

@@ -80,12 +80,14 @@ def find_places(
     rows = [[_camera(m, h, captured, at, plan, config.reach * distance, config) for h in headings] for m in middles]
     heights = np.array([np.median([plan[2] @ c.pose.position_in_world for c in row]) for row in rows])
     positions = np.column_stack([middles, heights]) @ plan
+    # At so few pixels the reduced scene shows the same surfaces as the whole one, in less time.
     search = lod_proxy(scene, rasterizer, rng)
     least = config.min_solid_share * float(np.median(_solid_shares(search, captured[:64], distance, config)))
     flat = [camera for row in rows for camera in row]
     solid = _solid_shares(search, flat, distance, config)
     standing = np.array([camera.pose.position_in_world for camera in flat])
     free = ~space.occupied(standing) & _reached(standing, at @ plan, space)
+    # Where half of the capture's cameras see nothing solid the median is 0, and everything would pass.
     sees = (free & (solid >= max(least, 1e-9))).reshape(len(middles), config.headings)
     kept = np.flatnonzero(sees.any(1))
     return Places(
@@ -120,6 +122,7 @@ def _reached(
     starts = captured[near].reshape(-1, 3)
     directions = (rays / np.maximum(apart, 1e-12)[..., None]).reshape(-1, 3)
     clear = space.free_distance(starts, directions, float(apart.max())).reshape(apart.shape)
+    # A surface occupies whole cells, so free space ends up to a cell before it.
     return np.asarray((clear >= apart - space.cell).any(1))
 
 
@@ -130,6 +133,7 @@ def plan_axes(captured: Sequence[Camera], up_in_world: tuple[float, float, float
     """
     up = np.array(up_in_world) if up_in_world else -np.sum([c.pose.world_from_camera[:3, 1] for c in captured], 0)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
+    # The world axis that is least parallel to up: its projection into the plan can't vanish.
     first = np.eye(3)[int(np.argmin(np.abs(up)))]
     first = first - (first @ up) * up
     first /= np.linalg.norm(first)
@@ -171,7 +175,7 @@ def _camera(
     reach: float,
     config: PlanConfig,
 ) -> Camera:
-    """Return a camera at a place that looks along a heading, otherwise like the nearest camera of the capture."""
+    """Return a camera at a place that looks along a heading (rad), otherwise like the nearest camera of the capture."""
     directions = np.array([heading_of(camera.pose, plan) for camera in captured])
     chords = 2 * np.abs(np.sin(0.5 * (directions - heading)))
     apart = np.linalg.norm(at[:, :2] - middle, axis=1) / reach
@@ -182,6 +186,7 @@ def _camera(
 
 def pose_at(at: Float64[np.ndarray, "3"], heading: float, pitch: float, plan: Float64[np.ndarray, "3 3"]) -> Pose:
     """Return an upright camera at a position of the plan with this heading and pitch (rad, above the horizon)."""
+    # An axis parallel to up has no upright camera.
     pitch = float(np.clip(pitch, np.radians(-85), np.radians(85)))
     axis = np.array([np.cos(heading) * np.cos(pitch), np.sin(heading) * np.cos(pitch), np.sin(pitch)])
     return look_at(at @ plan, (at + axis) @ plan, plan[2])
@@ -202,6 +207,7 @@ def spread(places: Places, count: int) -> Int64[np.ndarray, "k 2"]:
         return pairs
     angles = places.headings_rad[pairs[:, 1]]
     at = (places.positions[pairs[:, 0]] @ places.plan_from_world.T)[:, :2] / places.cell
+    # Opposite headings at one place count as far apart as places at a distance of four cells.
     coordinates = np.column_stack([at, 2 * np.cos(angles), 2 * np.sin(angles)])
     chosen, apart = [0], np.linalg.norm(coordinates - coordinates[0], axis=1)
     while len(chosen) < min(count, len(pairs)):

@@ -64,6 +64,7 @@ def _shade(image: UInt8[np.ndarray, "h w 3"], at: np.ndarray) -> None:
     inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
     counts = np.bincount(y[inside] * width + x[inside], minlength=height * width).reshape(height, width)
     smooth = cv2.GaussianBlur(counts.astype(np.float32), (0, 0), 1.5)
+    # The densest pixels are walls, seen along their height: relative to those floors would be white.
     dark = np.clip(smooth / max(float(np.quantile(smooth, 0.98)), 1e-6), 0, 1)[..., None]
     image[:] = (image * (1 - 0.35 * dark)).astype(np.uint8)
 
@@ -75,6 +76,7 @@ def _wedge(
     # Image rows go down, the plan's second axis up.
     rim = middle + radius * np.stack([np.cos(angles), -np.sin(angles)], 1)
     corners = np.concatenate([middle + 0.25 * (rim[[0]] - middle), rim, middle + 0.25 * (rim[[-1]] - middle)])
+    # In sixteenths of a pixel (the last argument): whole pixels would make narrow wedges uneven.
     cv2.fillPoly(image, [np.rint(corners * 16).astype(np.int32)], colour, cv2.LINE_AA, 4)
 
 

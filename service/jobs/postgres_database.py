@@ -80,17 +80,17 @@ class PostgresDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """Lend a connection; each statement is a transaction of its own. Raises StorageFailed."""
-        with self._told("read"), self._pool.connection() as connection:
+        with self._storage_errors("read"), self._pool.connection() as connection:
             yield Connection(connection)
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
         """Lend a connection; commit at the end, or undo all on an error. Raises StorageFailed."""
-        with self._told("write"), self._pool.connection() as connection, connection.transaction():
+        with self._storage_errors("write"), self._pool.connection() as connection, connection.transaction():
             yield Connection(connection)
 
     @contextmanager
-    def _told(self, what: str) -> Iterator[None]:
+    def _storage_errors(self, what: str) -> Iterator[None]:
         try:
             yield
         except psycopg.Error as error:

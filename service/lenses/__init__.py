@@ -1,4 +1,4 @@
-"""What earlier photos of a camera told of its lens, as the prior of its next photo.
+"""What was estimated of a lens from earlier photos, as the prior of its next photo.
 
     photo's header -> key: whose camera, in which setting -> store -> estimate -> prior of the photo's intrinsics
     sure answer -> measurement without what the prior said -> estimate updated, or widened where they contradict

@@ -70,17 +70,17 @@ class Viewpoint:
 
 @dataclass(frozen=True, slots=True)
 class LensMeasurement:
-    """What one photo tells of its lens."""
+    """The estimate of a lens from one photo alone, without the prior that the photo was localized with."""
 
     value: Components
     sigma: Components
-    """Infinite: it tells nothing."""
+    """Standard deviations; infinite where nothing was measured."""
     viewpoint: Viewpoint
 
 
 @dataclass(frozen=True, slots=True)
 class LensEstimate:
-    """What all photos so far tell of a lens."""
+    """The estimate of a lens from all its photos so far."""
 
     mean: Components
     sigma: Components
@@ -115,6 +115,7 @@ def updated(
     """
     noise = np.hypot(found.sigma, config.photo_sigma)
     if estimate is None:
+        # An infinite variance would make the next gain infinity over infinity; 1 is far beyond any lens.
         return LensEstimate(found.value, _components(np.minimum(noise, 1.0)), 1, 1, found.viewpoint)
     if not found.viewpoint.differs(estimate.viewpoint, config):
         return estimate

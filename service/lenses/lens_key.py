@@ -31,14 +31,15 @@ class LensKey:
     @property
     def id(self) -> str:
         """16 hexadecimal digits, the same for the same key."""
+        # Stored and shown in URLs: Python's own hash differs between processes.
         return hashlib.sha256(json.dumps(asdict(self)).encode()).hexdigest()[:16]
 
 
 def lens_key(owner: str, camera_id: str | None, camera: CameraIdentity) -> LensKey | None:
     """Return the key of a photo's lens; None where nothing names the camera, or the photo was evidently cropped.
 
-    A crop has another focal length in long sides than the photos that the camera makes. `camera_id` comes beside what
-    EXIF says, which tells the lenses of one phone apart.
+    A crop has another focal length in long sides than the photos that the camera makes. `camera_id` does not replace
+    what EXIF says: that distinguishes the lenses of one phone.
     """
     if camera.is_cropped or not (camera_id or camera.is_named):
         return None

@@ -44,12 +44,13 @@ class LensMemory:
         self.store = store
 
     def recall(self, owner: str, camera_id: str | None, camera: CameraIdentity) -> RecalledLens | None:
-        """Return what earlier photos of the owner told of the lens; None if they told nothing."""
+        """Return the intrinsics and their prior by earlier photos of the owner; None if none was learnt from."""
         key = lens_key(owner, camera_id, camera)
         lens = self.store.find(key.id) if key else None
         if lens is None:
             return None
         focal_sigma, k1_sigma, *shift_sigmas = lens.estimate.prior_sigma()
+        # A prior has one scale for both directions.
         shift_sigma = max(shift_sigmas)
         if _is_turned_unknown(camera):
             # The centre is assumed, from which the principal point lies in an unknown direction.
@@ -73,6 +74,7 @@ class LensMemory:
         found = measured(answer, camera, recalled) if key else None
         if key is None or found is None:
             return False
+        # Inside of the store's transaction: two photos that end at once both count.
         self.store.change(key, lambda known: updated(known, found))
         return True
 
@@ -80,7 +82,7 @@ class LensMemory:
 def measured(
     answer: PoseEstimate, camera: CameraIdentity, recalled: RecalledLens | None = None
 ) -> LensMeasurement | None:
-    """Return what a photo alone tells of its lens; None where the answer isn't sure, or the lens wasn't estimated.
+    """Return a photo's own measurement of its lens; None where the answer isn't sure, or the lens wasn't estimated.
 
     An answer's estimate holds what its prior said: the information (inverse variance) of the prior is taken out again,
     lest what is recalled confirms itself.
@@ -96,6 +98,7 @@ def measured(
     if recalled is not None:
         value, sigma = _without_prior(value, sigma, _stored_values(recalled.intrinsics, camera), recalled.prior)
     if _is_turned_unknown(camera):
+        # Turned the wrong way, the shift would be learnt with the opposite sign.
         value[2:], sigma[2:] = (0.0, 0.0), (math.inf, math.inf)
     if sigma[0] > LENS_MEMORY.max_focal_sigma:
         return None
@@ -114,8 +117,8 @@ def _without_prior(
     own = whole - of_prior
     with np.errstate(divide="ignore", invalid="ignore"):
         evidence = (whole * posterior - of_prior * centre) / own
-        told = own >= _LEAST_INFORMATION * whole
-        return np.where(told, evidence, posterior).tolist(), np.where(told, own**-0.5, np.inf).tolist()
+        measures = own >= _LEAST_INFORMATION * whole
+        return np.where(measures, evidence, posterior).tolist(), np.where(measures, own**-0.5, np.inf).tolist()
 
 
 def _viewpoint(answer: PoseEstimate) -> Viewpoint:
@@ -129,7 +132,7 @@ def _viewpoint(answer: PoseEstimate) -> Viewpoint:
 
 
 def _is_turned_unknown(camera: CameraIdentity) -> bool:
-    """Whether the photo is stored upright, so that nothing tells in which direction the camera's frame was turned."""
+    """Whether the photo is stored upright, so that the direction in which the camera's frame was turned is unknown."""
     return camera.height > camera.width
 
 

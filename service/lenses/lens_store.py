@@ -17,6 +17,8 @@ from service.lenses.lens_key import LensKey
 
 @dataclass(frozen=True, slots=True)
 class StoredLens:
+    """A lens as it is kept: whose it is, and its estimate."""
+
     key: LensKey
     estimate: LensEstimate
     updated: float
@@ -71,6 +73,7 @@ class MemoryLensStore:
         with self._lock:
             known = self._lenses.get(key.id)
             changed = StoredLens(key, learn(known and known.estimate), time.time())
+            # A dictionary keeps a changed entry's old place: it has to be taken out to become the latest.
             self._lenses.pop(key.id, None)
             self._lenses[key.id] = changed
             while len(self._lenses) > self._limit:

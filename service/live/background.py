@@ -13,7 +13,7 @@ Result = TypeVar("Result")
 
 
 class Background(Generic[Result]):
-    """Runs one call beside its owner, whose thread keeps its share of the core. For one owner's thread."""
+    """Runs one call at a time, on a thread that yields the core to its owner's. Its methods are for one thread."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, "live", lower_priority)
@@ -26,8 +26,9 @@ class Background(Generic[Result]):
         return self._running is None
 
     def start(self, call: Callable[[threading.Event], Result]) -> None:
-        """Begin a call; the event that it gets says that its result isn't wanted any more. Only while idle."""
+        """Begin a call; the event that it gets is set when its result isn't wanted any more. Only while idle."""
         assert self._running is None
+        # An event of its own: a call that was cancelled may still be ending, and must not be taken for this one.
         self._cancel = threading.Event()
         self._running = self._pool.submit(call, self._cancel)
 
@@ -39,7 +40,7 @@ class Background(Generic[Result]):
         return done.result()
 
     def cancel(self) -> None:
-        """Tell the call that its result isn't wanted."""
+        """Set the call's event: its result isn't wanted."""
         self._cancel.set()
 
     def close(self) -> None:

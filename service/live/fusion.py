@@ -1,7 +1,7 @@
 """The device's odometry and the scene: `world_from_odom`, and where a frame is that has no pose of its own.
 
     frame's odometry -> reset? -> carry the estimate to it -> the frame's fix, if it has one -> fit the window
-    -> move what is told towards the estimate, by a small step a frame
+    -> move what is reported towards the estimate, by a small step a frame
 
 `odometry_fit` has the equations. The window holds one fix for each viewpoint, the newest there. The odometry began anew
 where it moves faster than anybody carries a camera or was silent for seconds, where it contradicts two fixes in a row,
@@ -42,7 +42,7 @@ class FusionConfig:
     """Time between two fits while the viewpoint stays."""
     step: float = 0.01
     step_deg: float = 0.2
-    """By how much the told pose of the camera moves at most a frame beside the odometry."""
+    """By how much the reported pose of the camera moves at most a frame beside the odometry."""
     most_speed: float = 6.0
     most_turn_deg_s: float = 700.0
     """Beyond which an odometry didn't move but began anew,"""
@@ -73,7 +73,7 @@ class FusionConfig:
     most_turn_deg: float = 4.0
     most_share: float = 0.04
     """Standard deviations of a carried pose, the second as a share of the distance to what is seen, beyond which it
-    isn't told."""
+    isn't reported."""
 
 
 FUSION = FusionConfig()
@@ -92,8 +92,8 @@ class _Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
-    """What the client is told at one sample."""
+class _Reported:
+    """What is reported to the client at one sample."""
 
     sample: _Sample
     pose: Pose
@@ -121,7 +121,7 @@ class Fusion:
         self._fitted: Fix | None = None
         self._against: list[Fix] = []
         """The newest fixes, all of which contradict the estimate."""
-        self._told: _Told | None = None
+        self._reported: _Reported | None = None
         self._up_in_odom: Float64[np.ndarray, "3"] | None = None
         if facts.up_in_odom is not None:
             self._up_in_odom = np.array(facts.up_in_odom) / np.linalg.norm(facts.up_in_odom)
@@ -139,6 +139,7 @@ class Fusion:
     def move(self, time_s: float, odom_from_camera: Pose, up_in_camera: Sequence[float] | None = None) -> None:
         """Take a frame's odometry; times don't descend."""
         last = self._samples[-1] if self._samples else None
+        # A frame of the same time has no velocity to divide by.
         if last is not None and time_s <= last.time_s:
             return
         if up_in_camera is not None:
@@ -161,7 +162,7 @@ class Fusion:
         self._samples.append(_Sample(time_s, odom_from_camera, velocity, way, self.resets))
         while self._samples[0].time_s < time_s - self._config.kept_s:
             self._samples.popleft()
-        self._tell()
+        self._update_reported()
 
     def fix(
         self, time_s: float, pose: Pose, covariance: Float64[np.ndarray, "6 6"], depth: float, run: int = 0
@@ -171,6 +172,7 @@ class Fusion:
         Fixes of one run were followed from frame to frame. `depth` is the distance to what is seen, scene units.
         """
         sample = next((s for s in reversed(self._samples) if s.time_s == time_s), None)
+        # An answer to a frame from before the odometry began anew relates to none of the samples since.
         if sample is None or sample.segment != self.resets:
             return
         fix = Fix(time_s, pose, covariance, sample.pose, sample.velocity, sample.velocity, sample.way, depth, run)
@@ -217,20 +219,19 @@ class Fusion:
             return None
         return pose, covariance[:6, :6]
 
-    def told(self) -> FusedOdometry | None:
-        """Return the similarity for the newest sample as it is told: what is left to the estimate is in its
+    def reported(self) -> FusedOdometry | None:
+        """Return the similarity for the newest sample as it is reported; what it lacks to the estimate is part of its
         covariance."""
-        estimate, told = self._carried(late=True), self._told
-        if estimate is None or told is None or self._fit is None:
+        estimate, reported = self._carried(late=True), self._reported
+        if estimate is None or reported is None or self._fit is None:
             return None
-        left = se3_log(told.pose.camera_from_world @ estimate[0].world_from_camera)
-        left = np.append(left, self._fit.log_scale - told.log_scale)
-        # True = told moved by what is left, and by the error of the estimate.
+        left = se3_log(reported.pose.camera_from_world @ estimate[0].world_from_camera)
+        left = np.append(left, self._fit.log_scale - reported.log_scale)
+        # True = reported moved by what is left, and by the error of the estimate.
         covariance = estimate[1] + np.outer(left, left)
-        scale = float(np.exp(told.log_scale))
-        return FusedOdometry(
-            similarity(told.pose, told.sample.pose, scale), scale, frozen(covariance), self._fit.offset_s, self.resets
-        )
+        scale = float(np.exp(reported.log_scale))
+        world_from_odom = similarity(reported.pose, reported.sample.pose, scale)
+        return FusedOdometry(world_from_odom, scale, frozen(covariance), self._fit.offset_s, self.resets)
 
     # ------------------------------------------------------------------ the parts
 
@@ -286,7 +287,7 @@ class Fusion:
         self._samples = deque(replace(s, segment=self.resets) if s.time_s >= time_s else s for s in self._samples)
         self._fixes, self._against = [], []
         self._last.clear()
-        self._fit = self._fitted = self._told = None
+        self._fit = self._fitted = self._reported = None
 
     def _keep(self, fix: Fix) -> bool:
         """Take a fix into the window; return whether it is the first from its viewpoint."""
@@ -313,12 +314,13 @@ class Fusion:
         if self._scale is None:
             return
         fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
+        # Both forget what contradicts the newest fixes, which the fit was still drawn to.
         if self._turned_against(fit, fix):
             fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
         if not self._scale.learn(fit.log_scale, float(np.sqrt(fit.covariance[6, 6]))):
             fit = fit_odometry(self._fixes, self._priors(self._scale), self._config.fit)
         self._fit, self._fitted = fit, self._fixes[-1]
-        self._tell()
+        self._update_reported()
 
     def _priors(self, scale: ScaleMemory) -> Priors:
         up_sigma = float(np.hypot(np.radians(self._facts.up_sigma_deg), SCENE_UP_SIGMA))
@@ -362,15 +364,15 @@ class Fusion:
         covariance[:6, :6] += drift(max(0.0, sample.way - self._fitted.way), scale, self._config.fit)
         return pose, covariance
 
-    def _tell(self) -> None:
-        """Carry what is told to the newest sample, and a step towards the estimate."""
+    def _update_reported(self) -> None:
+        """Carry the reported pose to the newest sample, and a step towards the estimate."""
         estimate = self._carried(late=True)
         if estimate is None or self._fit is None:
-            self._told = None
+            self._reported = None
             return
-        aim, sample, before, config = estimate[0], self._samples[-1], self._told, self._config
+        aim, sample, before, config = estimate[0], self._samples[-1], self._reported, self._config
         if before is None or not self._facts.smooth:
-            self._told = _Told(sample, aim, self._fit.log_scale)
+            self._reported = _Reported(sample, aim, self._fit.log_scale)
             return
         if sample is before.sample:
             return
@@ -384,7 +386,7 @@ class Fusion:
             scale * config.step / max(float(np.linalg.norm(left[3:])), 1e-12),
         )
         log_scale = before.log_scale + share * (self._fit.log_scale - before.log_scale)
-        self._told = _Told(sample, moved(carried, share * left), log_scale)
+        self._reported = _Reported(sample, moved(carried, share * left), log_scale)
 
 
 def similarity(world_from_camera: Pose, odom_from_camera: Pose, scale: float) -> Float64[np.ndarray, "4 4"]:

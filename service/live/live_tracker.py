@@ -94,7 +94,7 @@ LIVE = LiveConfig()
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What the background found out."""
+    """The result of a search, or of a check by the whole gate, in the background."""
 
     query: Query
     """With the session's intrinsics when it began."""
@@ -154,6 +154,7 @@ class LiveTracker:
         if frame.odom_from_camera is not None:
             self._fusion.move(frame.time_s, frame.odom_from_camera, frame.up_in_camera)
             self._views.add(frame, frame.odom_from_camera, self._fusion.resets)
+        # First: the background may have found where to look for this frame.
         self._take_over()
         followed = None
         if self._past and self._is_due(frame):
@@ -172,6 +173,7 @@ class LiveTracker:
     def _checked_size(self, frame: LiveFrame) -> tuple[int, int]:
         if not frame.data.startswith(b"\xff\xd8\xff"):
             raise InvalidImage("a frame is a JPEG.", where="frame")
+        # By the header: a picture that is too large must not be decoded.
         width, height = photo_size(frame.data)
         if width * height > self._config.max_pixels:
             raise InvalidImage(
@@ -197,7 +199,7 @@ class LiveTracker:
     def _answer(self, frame: LiveFrame, size: tuple[int, int], followed: _Followed | None) -> LiveAnswer:
         mode: Mode = "lost" if self._searches else "relocalizing"
         astray = frame.time_s - self._verified_s > self._config.unverified_s
-        odometry = self._told(frame)
+        odometry = self._reported(frame)
         if followed is None or astray:
             carried = None if frame.odom_from_camera is None else self._fusion.carried()
             if carried is None:
@@ -212,13 +214,13 @@ class LiveTracker:
             frame.id, frame.time_s, "tracking", size, pose, verdict, followed.query.photo_intrinsics, odometry=odometry
         )
 
-    def _told(self, frame: LiveFrame) -> FusedOdometry | None:
-        told = None if frame.odom_from_camera is None else self._fusion.told()
-        if told is None or not any(self._origin):
-            return told
-        matrix = told.world_from_odom.copy()
+    def _reported(self, frame: LiveFrame) -> FusedOdometry | None:
+        reported = None if frame.odom_from_camera is None else self._fusion.reported()
+        if reported is None or not any(self._origin):
+            return reported
+        matrix = reported.world_from_odom.copy()
         matrix[:3, 3] += self._origin
-        return replace(told, world_from_odom=frozen(matrix))
+        return replace(reported, world_from_odom=frozen(matrix))
 
     def _keep(self, frame: LiveFrame) -> None:
         """Keep some frames while a search runs, to follow the camera from its answer to now."""
@@ -286,6 +288,7 @@ class LiveTracker:
         if followed is None or unverified_s > self._config.search_after_s or self._doubt is not None:
             if self._is_dark(query):
                 return
+            # Most lost cameras are found by a single frame, in less time.
             rig = self._rig(query) if self._searches % 3 == 2 else []
             if rig:
                 self._background.start(lambda cancel: self._searched_together(rig, query, time_s, cancel))
@@ -348,7 +351,7 @@ class LiveTracker:
         return _Found(followed.query, time_s, None, verdict, self._loaded)
 
     def _take_over(self) -> None:
-        """Take over what the background found out since the last frame."""
+        """Take over the result of the background since the last frame."""
         found = self._background.result()
         if found is None:
             return

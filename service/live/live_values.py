@@ -13,7 +13,7 @@ from service.results import Verdict
 from service.types import Intrinsics, Pose, PriorRegion
 
 Mode = Literal["tracking", "carried", "relocalizing", "lost"]
-"""`tracking`: the frame has a pose of its own. `carried`: it has none, but odometry since frames that had one tells it.
+"""`tracking`: the frame has a pose of its own. `carried`: it has none, but one by odometry since frames that had one.
 `relocalizing`: it has none, and the first search since then is under way. `lost`: searches have ended without an
 answer; they go on."""
 
@@ -29,7 +29,7 @@ class OdometryFacts:
     up_sigma_deg: float = 1.0
     """Standard deviation of that, and of the frames' own up."""
     smooth: bool = True
-    """Whether what is told follows the estimate by small steps."""
+    """Whether what is reported follows the estimate by small steps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class FusedOdometry:
     """Of the twist (rotation rad, translation units) in the frame's camera, and of the scale's logarithm: the true
     camera is where world_from_odom has it, moved by exp(twist)."""
     offset_s: float
-    """By how much the odometry's poses are late: at `time_s` it tells where the camera was `offset_s` later."""
+    """By how much the odometry's poses are late: its pose at `time_s` is that of the camera `offset_s` later."""
     resets: int
     """How often it began anew so far."""
 

@@ -131,7 +131,9 @@ def fit_odometry(fixes: Sequence[Fix], priors: Priors, config: FitConfig = FIT) 
 
 
 def drift(way: float, scale: float, config: FitConfig = FIT) -> Float64[np.ndarray, "6 6"]:
-    """Return the covariance that the odometry's drift over a way adds to a pose."""
+    """Return the covariance that the odometry's drift over a way adds to a pose: rotation rad^2, translation in scene
+    units squared; `scale` in scene units per unit of the odometry.
+    """
     grown = way + way**2
     return np.diag([grown * config.turn_drift**2] * 3 + [grown * (config.drift_share * scale) ** 2] * 3)
 

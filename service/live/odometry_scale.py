@@ -27,6 +27,7 @@ class ScaleMemory:
         What is remembered came in part from fixes that are still there: it counts with a quarter of its weight.
         """
         doubled = max(2 * self.sigma, _LEAST_SIGMA)
+        # What was known before any of these fixes counts in full: they aren't part of it.
         return (self.log_scale, doubled) if doubled < self._before[1] else self._before
 
     def learn(self, log_scale: float, sigma: float) -> bool:
@@ -35,6 +36,7 @@ class ScaleMemory:
         Return False, and forget what was known, if the fixes alone contradict that.
         """
         expected, of_prior = self.prior()
+        # Informations (inverse variances) of independent sources add up, so the prior's can be taken out again.
         alone = max(sigma**-2 - of_prior**-2, 1e-12) ** -0.5
         by_fixes = (log_scale / sigma**2 - expected / of_prior**2) * alone**2
         if abs(by_fixes - expected) > _CONTRADICTION * math.hypot(alone, of_prior):

@@ -46,6 +46,7 @@ class Pace:
             return None
         offered, possible = self._came / span_s, self._used / max(self._busy_s, 1e-6)
         hint = Hint(self._rate(offered, possible), self._size())
+        # Each window starts from nothing: an average over the whole session would answer to a change too late.
         self._used, self._came, self._busy_s, self._since_s = 0, 0, 0.0, at_s
         changed = hint != self.hint
         self.hint = hint

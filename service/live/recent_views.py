@@ -28,6 +28,7 @@ class RecentViews:
         if segment != self._segment:
             self._kept, self._segment = [], segment
         self.newest = odom_from_camera
+        # Compared with the last one that was kept, not with the last frame: a slow camera never differs from that.
         if not self._kept or _differ(self._kept[-1][1], odom_from_camera):
             self._kept = [*self._kept, (frame, odom_from_camera)][-MOST - 1 :]
 

@@ -33,6 +33,8 @@ from service.registration.similarity_fit import (
 
 @dataclass(frozen=True, slots=True)
 class ConsensusConfig:
+    """How many samples are tried, and when an observation is an outlier."""
+
     samples: int = 200
     """Minimal samples, at most; all of them where there are fewer."""
     refined: int = 4
@@ -49,7 +51,10 @@ CONSENSUS = ConsensusConfig()
 def agreeing(
     evidence: Evidence, rng: np.random.Generator, config: ConsensusConfig = CONSENSUS
 ) -> tuple[Fit, list[int]]:
-    """Return the fit to the observations that agree, and their numbers. Needs at least one observation or direction."""
+    """Return the fit to the largest set of observations without an outlier, and their numbers; see the module.
+
+    Needs at least one observation or direction.
+    """
     count, noise = len(evidence.observations), unknown_noise(evidence.observations)
     half = count if count < 4 else max((count + 3) // 2, min(count - 1, 4))
     starts = list(_starts(evidence, rng, config))
@@ -63,7 +68,7 @@ def agreeing(
     # Half: as long as most observations are right, those that agree best are.
     core = fit_similarity(evidence, sorted(order[:half]), core.similarity, noise)
     core_variance = max(_variance(core), _floor(evidence))
-    # From all downwards: the largest set that hangs together wastes no right observation.
+    # From all downwards: the largest set without an outlier wastes no right observation.
     for size in range(count, half, -1):
         used = sorted(order[:size])
         fit = fit_similarity(evidence, used, core.similarity, noise)
@@ -193,7 +198,7 @@ def _pairs(seen: Sequence[Observation], numbers: Sequence[int]) -> tuple[np.ndar
 
 
 def _of_all(evidence: Evidence, placed: Sequence[int], turned: Sequence[int]) -> Similarity:
-    """Return a start from everything at once; what nothing tells is that of the scene."""
+    """Return a start from everything at once; where nothing determines a part, the scene's own axes and unit."""
     seen, fixed = evidence.observations, evidence.metres_per_unit
     metric = fixed or (evidence.lengths[0].metres / evidence.lengths[0].units if evidence.lengths else None)
     rotation = np.eye(3)
@@ -287,5 +292,5 @@ def umeyama(
 
 
 def free_parameters(evidence: Evidence) -> int:
-    """Return how many parameters are estimated."""
+    """Return how many of the similarity's seven parameters are estimated: a given scale isn't."""
     return PARAMETERS - (evidence.metres_per_unit is not None)

@@ -20,7 +20,7 @@ from service.registration.similarity_fit import PARAMETERS, Fit, fit_similarity
 
 @dataclass(frozen=True, slots=True)
 class DeterminacyConfig:
-    """When a part counts as determined; below, its standard deviation tells the rest."""
+    """Standard deviations below which a part counts as determined, and those of the wide prior."""
 
     log_scale: float = 0.25
     rotation: float = 0.26
@@ -138,7 +138,7 @@ def _reason(
     if not placed:
         why = "no observation has a position in the target frame"
     elif axes[0] == 0:
-        why = f"all {len(placed)} places are one, as far as their noise tells"
+        why = f"all {len(placed)} places are one within their noise"
     elif axes[1] == 0 and "heading" not in parts:
         why = f"all {len(placed)} places lie on one line, about which the scene may turn"
     else:

@@ -38,10 +38,10 @@ class GatherOptions:
     """What the user states beside the places."""
 
     up: tuple[float, float, float] | None = None
-    """What is up in the target frame; None: what the file's kind tells."""
+    """What is up in the target frame; None: what the file's kind implies."""
     metres_per_unit: float | None = None
     drift: float | None = None
-    """None: what the file's kind tells."""
+    """As `Evidence.drift`; None: what the file's kind implies."""
 
 
 def gathered(
@@ -84,6 +84,7 @@ def gathered(
         heights=heights if not observations else (),
         up=up,
         metres_per_unit=options.metres_per_unit,
+        # A drift is of places in order of time, which picked points aren't.
         drift=(known.drift if options.drift is None else options.drift) if not points else 0.0,
         may_be_turned=known.may_be_turned,
     )

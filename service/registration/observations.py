@@ -83,6 +83,7 @@ class Length:
 
     @property
     def units(self) -> float:
+        """The distance in the scene's units."""
         return float(np.linalg.norm(self.to_in_world - self.from_in_world))
 
 

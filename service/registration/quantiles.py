@@ -20,6 +20,7 @@ def f_quantile(probability: float, numerator: float, denominator: float) -> floa
     low, high = 0.0, 1.0
     while _f_cdf(high, numerator, denominator) < probability:
         low, high = high, 2 * high
+    # So many halvings of an interval exhaust a float's digits.
     for _ in range(60):
         middle = (low + high) / 2
         low, high = (middle, high) if _f_cdf(middle, numerator, denominator) < probability else (low, middle)

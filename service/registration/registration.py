@@ -57,6 +57,10 @@ class PlacedPose:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
+    """The similarity from a scene's world to the target frame, with its covariance, and which parts of it are
+    determined.
+    """
+
     target_from_world: Float64[np.ndarray, "4 4"]
     """A similarity from the scene's world to metres; arbitrary in the parts that aren't determined."""
     centre_in_world: Float64[np.ndarray, "3"]
@@ -95,6 +99,7 @@ class Registration:
 
     @property
     def scale(self) -> float:
+        """Metres per scene unit, by the matrix; arbitrary where the scale isn't determined."""
         return float(np.cbrt(np.linalg.det(self.target_from_world[:3, :3])))
 
     @property
@@ -104,10 +109,12 @@ class Registration:
 
     @property
     def metres_per_unit_sigma(self) -> float | None:
+        """Its standard deviation; None where the scale isn't determined."""
         return self.scale * float(np.sqrt(self.covariance[6, 6])) if "scale" in self.determined else None
 
     @property
     def up_in_world(self) -> Float64[np.ndarray, "3"] | None:
+        """Unit vector of the target's up axis in the scene's world; None where it isn't determined."""
         if "up" not in self.determined or self.up_in_target is None:
             return None
         return self.target_from_world[:3, :3].T @ np.array(self.up_in_target) / self.scale

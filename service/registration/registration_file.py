@@ -19,11 +19,14 @@ FILE = "registration.json"
 KEPT = 20
 """Revisions; older ones are dropped."""
 _MAX_BYTES = 16 * 1024 * 1024
+# One for all scenes: `RegistrationFile` is a value, several of which may name one file, and registering is rare.
 _LOCK = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True)
 class History:
+    """The registrations of a scene that are kept, oldest first."""
+
     last_revision: int = 0
     """The highest number that was ever given."""
     revisions: tuple[Registration, ...] = ()

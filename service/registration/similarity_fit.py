@@ -47,6 +47,7 @@ class Similarity:
 
     @property
     def matrix(self) -> Float64[np.ndarray, "4 4"]:
+        """target_from_world, on homogeneous coordinates."""
         result = np.eye(4)
         result[:3, :3] = self.scale * self.rotation
         result[:3, 3] = self.shift - result[:3, :3] @ self.centre_in_world
@@ -58,6 +59,7 @@ class Similarity:
         return replace(self, shift=shift, centre_in_world=centre_in_world)
 
     def moved(self, step: Float64[np.ndarray, "7"]) -> Similarity:
+        """Return the similarity after a step of the parameters; see the module for their order."""
         return replace(
             self,
             rotation=so3_exp(step[:3]) @ self.rotation,
@@ -110,17 +112,23 @@ class Fit:
 
     @property
     def information(self) -> Float64[np.ndarray, "7 7"]:
+        """The normal matrix of the parameters, J^T cov^-1 J."""
         return self.jacobian.T @ self.jacobian
 
     @property
     def cost(self) -> float:
+        """The sum of squares of the whitened residuals."""
         return float(self.whitened @ self.whitened)
 
     def redundancy(self, kind: Kind) -> float:
+        """Return how many of a kind's residuals are left over for its noise: their number less the trace of the hat
+        matrix.
+        """
         mine = self.of_kind(kind)
         return float(mine.sum() - np.trace(self.hat[np.ix_(mine, mine)]))
 
     def of_kind(self, kind: Kind) -> np.ndarray:
+        """Return which of the whitened residuals are of a kind."""
         return np.concatenate(
             [np.full(len(row.residual), row.kind == kind) for row in self.rows] or [np.zeros(0, bool)]
         )

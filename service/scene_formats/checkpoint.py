@@ -64,10 +64,10 @@ def _extracted(path: Path, folder: Path) -> dict[str, Any]:
         raise CorruptScene(
             f"its loader crashed or took too long or too much memory ({type(error).__name__}).", where=path.name
         ) from error
-    return told(json.loads(done.stdout), path.name)
+    return checked_answer(json.loads(done.stdout), path.name)
 
 
-def told(answer: dict[str, Any], where: str) -> dict[str, Any]:
+def checked_answer(answer: dict[str, Any], where: str) -> dict[str, Any]:
     """Return what the other process tells. Raises what it reports: CorruptScene, UnsupportedFormat."""
     if "unsupported" in answer:
         raise UnsupportedFormat(answer["unsupported"], where=where, hint="Export the scene as .ply.")

@@ -57,7 +57,7 @@ class VerificationConfig:
     unrecognised: float = 0.35
     """Mean of the scaled signals of a kind below which nothing was recognised: foreign photos have 0.0 to 0.3."""
     unlike: float = 0.3
-    """Scaled mean of the global appearance below which no other signal is measured: right poses of photos spoilt within
+    """Scaled mean of the global appearance below which nothing else is measured: right poses of photos degraded within
     reason and beyond have 0.76 and more, those of photos of other scenes 0.0 to 0.36."""
     min_features: int = 30
     """Features of a photo; with fewer, that is the reason of a refusal."""

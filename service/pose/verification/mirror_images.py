@@ -18,7 +18,7 @@ class MirrorConfig:
     """When a photo's mirror image is localized, too."""
 
     beyond_doubt: float = 0.99
-    """Correlation of gradients that no mirrored photo reaches (0.985 seen), but of the others, spoilt ones too, 79 % on
+    """Correlation of gradients that no mirrored photo reaches (0.985 seen), but of others, degraded ones too, 79 % on
     chair and 56 % on materials do."""
     max_loss_ratio: float = 2.0
     """Times the answer's residual, after one refinement: of mirrored photos the mirror image has 0.6 to 1.6, of half of

@@ -1,7 +1,7 @@
 """How probably a pose in the right place is as exact as was asked for, by its covariance.
 
 The error of the pose, a twist, has a multivariate t distribution with the covariance as its scale matrix: its tails are
-heavier than a normal distribution's, for photos that are spoilt err by more than their covariance says. Asked is the
+heavier than a normal distribution's, for degraded photos err by more than their covariance says. Asked is the
 probability that rotation and position are both within their bounds, whatever the two have to do with one another. In
 whitened coordinates that region is star-shaped about 0: in each direction s it ends at one radius R(s), and the
 probability is the mean, over all directions, of the distribution function of the radius at R(s). The radius is

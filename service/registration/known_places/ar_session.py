@@ -60,11 +60,11 @@ def _place(frame: Mapping[str, Any], where: str) -> KnownPlace:
 
 
 def _intrinsics(frame: Mapping[str, Any], where: str) -> Intrinsics | None:
-    """Return the pinhole camera, which phones' undistorted pictures have; None where it isn't told."""
-    told = {name: frame[key] for key, name in _LENSES.items() if key in frame}
-    if len(told) < len(_LENSES):
+    """Return the pinhole camera, which phones' undistorted pictures have; None where it is not stated."""
+    stated = {name: frame[key] for key, name in _LENSES.items() if key in frame}
+    if len(stated) < len(_LENSES):
         return None
     try:
-        return intrinsics_from({**told, "trust": "approximate"})
+        return intrinsics_from({**stated, "trust": "approximate"})
     except BadInput as error:
         raise InvalidRequest(str(error), where=where) from None

@@ -1,4 +1,4 @@
-"""A place that a file tells: what is known of a photo in the target frame, before the photo is localized."""
+"""A known place: what a file states of a photo in the target frame, before the photo is localized."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class KnownPlace:
 
 @dataclass(frozen=True, slots=True)
 class KnownPlaces:
-    """What one file tells."""
+    """The known places of one file, and what holds for all of them."""
 
     kind: str
     """The reader's name for it, which results repeat."""
@@ -90,7 +90,7 @@ def in_metres(known: KnownPlaces, origin: Origin | None = None) -> tuple[KnownPl
 def observation_of(
     place: KnownPlace, name: str, pose: Pose, covariance: Float64[np.ndarray, "6 6"] | None, orientation: int = 1
 ) -> Observation:
-    """Return what a localized photo tells of the registration.
+    """Return a localized photo as an observation of the registration.
 
     `pose` and its covariance are those of the upright photo; `orientation` is EXIF's, by which it was turned.
     """

@@ -51,6 +51,7 @@ def read(text: str, name: str) -> KnownPlaces:
             raise InvalidRequest("must be a list of places, or an object with the list as 'places'.", where=name)
         return table(data, up, name)
     rows = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    # An empty cell is a value that isn't known: its column is for other rows.
     return table([{k: v for k, v in row.items() if v not in (None, "")} for row in rows], None, name)
 
 

@@ -32,6 +32,8 @@ _KEYS = ("points", "lengths", "floor")
 
 @dataclass(frozen=True, slots=True)
 class ScenePoints:
+    """Points, lengths and floor points that were picked in the scene."""
+
     known: KnownPlaces
     """Of the points, in their order."""
     in_world: tuple[Float64[np.ndarray, "3"], ...]
@@ -59,7 +61,7 @@ def read(data: Any, where: str) -> ScenePoints:
 def floor_evidence(
     floor: Float64[np.ndarray, "n 3"], above: Float64[np.ndarray, "3"], up: Sequence[float]
 ) -> tuple[Direction, list[Height]]:
-    """Return what floor points tell: their normal is up, towards a point above them, and their height is 0.
+    """Return floor points as evidence: their normal is up, towards a point above them, and their height is 0.
 
     Raises InvalidRequest for fewer than three, or for points on a line.
     """

@@ -48,7 +48,7 @@ def read(text: str, name: str) -> KnownPlaces:
 
 
 def at_time(known: KnownPlaces, time_s: float, name: str) -> KnownPlace:
-    """Return where the camera was at a time. Raises InvalidRequest if the trajectory doesn't tell."""
+    """Return the pose at a time (on the trajectory's clock), interpolated. Raises InvalidRequest where it has a gap."""
     times = np.array([place.time_s for place in known.places], np.float64)
     after = int(np.searchsorted(times, time_s))
     if after < len(times) and times[after] == time_s:
@@ -59,10 +59,10 @@ def at_time(known: KnownPlaces, time_s: float, name: str) -> KnownPlace:
             where=name,
             hint="Give the photos' times on the trajectory's clock: --times.",
         )
-    before, behind = known.places[after - 1], known.places[after]
+    before, later = known.places[after - 1], known.places[after]
     share = float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
-    position = _known(before.position) * (1 - share) + _known(behind.position) * share
-    first, second = _known(before.target_from_camera), _known(behind.target_from_camera)
+    position = _known(before.position) * (1 - share) + _known(later.position) * share
+    first, second = _known(before.target_from_camera), _known(later.target_from_camera)
     rotation = first @ so3_exp(share * so3_log(first.T @ second))
     return KnownPlace(name, position, None, rotation, time_s=time_s)
 

@@ -58,8 +58,8 @@ def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Read
         problems = [*problems, _NO_SCENE]
     readiness = Readiness(
         ready=scenes.ready and not problems,
-        pending=_told(scenes.pending, visible, {}),
-        failed=[*_told(scenes.failed, visible, cures), *problems],
+        pending=_visible_notes(scenes.pending, visible, {}),
+        failed=[*_visible_notes(scenes.failed, visible, cures), *problems],
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
@@ -68,7 +68,7 @@ def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Read
     return readiness
 
 
-def _told(notes: Sequence[SceneNote], visible: Visible, cures: Mapping[str, str]) -> list[str]:
+def _visible_notes(notes: Sequence[SceneNote], visible: Visible, cures: Mapping[str, str]) -> list[str]:
     """Return notes as sentences, each with what to do."""
     hidden = "a scene that this key may not use"
     told = [(note, f"{note} {cures.get(note.scene, '')}".rstrip()) for note in notes]

@@ -96,7 +96,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.LensNotFound("lens '0123456789abcdef' not found.", where="lens"), "/lenses/0123456789abcdef"),
     (
         e.RegistrationFailed(
-            "scale, up, heading, position can't be determined: all 4 places are one, as far as their noise tells.",
+            "scale, up, heading, position can't be determined: all 4 places are one within their noise.",
             where="registration",
             hint="Add places elsewhere, photos with poses, a length, or what is up.",
         ),

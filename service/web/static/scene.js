@@ -131,7 +131,7 @@ function coverageParts(state, map) {
       ["Brier score", map.brier === null ? null : map.brier.toFixed(3)],
     ]));
   } else if (!running) {
-    parts.push(h("p", {}, "Not measured yet. The service localizes renders that are spoilt as photos are, all over the scene; photos take longer meanwhile."));
+    parts.push(h("p", {}, "Not measured yet. The service localizes renders that are degraded as photos are, all over the scene; photos take longer meanwhile."));
   }
   if (running) {
     const total = coverage.total || null;

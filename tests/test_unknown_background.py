@@ -11,7 +11,7 @@ from service.bench.render import synthetic_room
 from service.geometry import look_at, pose_distance
 from service.loaded_scene import WHITE_ASSUMED, LoadedScene
 from service.localize import localize
-from service.pose.features.untold_background import WHITE, has_white_border
+from service.pose.features.unknown_background import WHITE, has_white_border
 from service.render.cpu import CpuRasterizer
 from service.results import Status
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Query

@@ -19,7 +19,7 @@ GAMMA = 2.2
 
 
 @dataclass(frozen=True, slots=True)
-class SpoilConfig:
+class DegradationConfig:
     """Ranges of phone photos: standard deviations of normal distributions, or bounds of uniform ones."""
 
     long_side_px: int = 640
@@ -40,23 +40,24 @@ class SpoilConfig:
     """Rendered beyond each side, for the lens to bend in."""
 
 
-SPOIL = SpoilConfig()
+DEGRADATION = DegradationConfig()
 
 
-def spoilt_photo(
-    camera: Camera, rasterizer: Rasterizer, rng: np.random.Generator, config: SpoilConfig = SPOIL
+def degraded_render(
+    camera: Camera, rasterizer: Rasterizer, rng: np.random.Generator, config: DegradationConfig = DEGRADATION
 ) -> Query:
-    """Render at a camera of the scene, spoil the image, and read it as a photo with approximate intrinsics."""
+    """Render at a camera of the scene, degrade the image, and read it as a photo with approximate intrinsics."""
     rgb, kept = _through_lens(camera, rasterizer, rng, config)
     rgb = _sensed(_lit(rgb, rng, config), rng, config)
+    # In a camera's order: lens, light, sensor, compression; the noise must come before JPEG, and after the blur.
     data = encode_image(rgb, quality=int(rng.integers(*config.jpeg_quality)))
     factor = float(np.exp(rng.normal(0, config.focal_sigma)))
-    told = replace(kept.intrinsics, fx=kept.intrinsics.fx * factor, fy=kept.intrinsics.fy * factor, trust="approximate")
-    return read_query(data, intrinsics=told)
+    fx, fy = kept.intrinsics.fx * factor, kept.intrinsics.fy * factor
+    return read_query(data, intrinsics=replace(kept.intrinsics, fx=fx, fy=fy, trust="approximate"))
 
 
 def _through_lens(
-    camera: Camera, rasterizer: Rasterizer, rng: np.random.Generator, config: SpoilConfig
+    camera: Camera, rasterizer: Rasterizer, rng: np.random.Generator, config: DegradationConfig
 ) -> tuple[Float32[np.ndarray, "h w 3"], Camera]:
     """Return the render as a lens with some radial distortion shows it, with its camera."""
     k = replace(camera.intrinsics, model="PINHOLE", distortion=()).with_long_side(config.long_side_px)
@@ -71,11 +72,12 @@ def _through_lens(
 
 
 def _lit(
-    rgb: Float32[np.ndarray, "h w 3"], rng: np.random.Generator, config: SpoilConfig
+    rgb: Float32[np.ndarray, "h w 3"], rng: np.random.Generator, config: DegradationConfig
 ) -> Float32[np.ndarray, "h w 3"]:
     height, width = rgb.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     squared = ((x / width - 0.5) ** 2 + (y / height - 0.5) ** 2) * 2
+    # Red and blue change in opposite directions, as they do with a light's colour temperature.
     balance = np.exp(rng.normal(0, config.white_balance_sigma)) ** np.array([1, 0, -1])
     gain = np.exp(rng.normal(0, config.gain_sigma)) * balance
     light = rgb**GAMMA * gain * (1 - rng.uniform(*config.vignetting) * squared[..., None])
@@ -83,7 +85,7 @@ def _lit(
 
 
 def _sensed(
-    rgb: Float32[np.ndarray, "h w 3"], rng: np.random.Generator, config: SpoilConfig
+    rgb: Float32[np.ndarray, "h w 3"], rng: np.random.Generator, config: DegradationConfig
 ) -> Float32[np.ndarray, "h w 3"]:
     """Blur by a separable Gaussian, and add noise whose variance grows with the signal."""
     sigma = rng.uniform(*config.blur_px) * max(rgb.shape[:2]) / 800
@@ -95,5 +97,6 @@ def _sensed(
         padded, size = np.pad(rgb, pad, mode="edge"), rgb.shape[axis]
         shifted = np.stack([padded.take(range(i, i + size), axis) for i in range(len(kernel))])
         rgb = np.tensordot(kernel, shifted, 1).astype(np.float32)
+    # Shot noise goes with the root of the signal; the constant is the sensor's noise in the dark.
     noise = rng.uniform(*config.noise) * np.sqrt(rgb + 0.05) * rng.standard_normal(rgb.shape, np.float32)
     return np.clip(rgb + noise, 0, 1).astype(np.float32)

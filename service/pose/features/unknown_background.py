@@ -19,7 +19,7 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class UntoldBackgroundConfig:
+class UnknownBackgroundConfig:
     """When white is assumed."""
 
     border_share: float = 0.02
@@ -36,13 +36,13 @@ class UntoldBackgroundConfig:
     """A view shows the background if this share of it is less opaque than `max_alpha`."""
 
 
-UNTOLD_BACKGROUND = UntoldBackgroundConfig()
+UNKNOWN_BACKGROUND = UnknownBackgroundConfig()
 
 
 def has_white_border(
     rgb: UInt8[np.ndarray, "h w 3"],
     valid: Bool[np.ndarray, "h w"] | None = None,
-    config: UntoldBackgroundConfig = UNTOLD_BACKGROUND,
+    config: UnknownBackgroundConfig = UNKNOWN_BACKGROUND,
 ) -> bool:
     """Return whether at least half of the photo's border is white; invalid pixels don't count (None: all are valid)."""
     width = max(1, round(config.border_share * max(rgb.shape[:2])))
@@ -55,7 +55,7 @@ def has_white_border(
 
 
 def shows_background(
-    rasterizer: Rasterizer, cameras: Sequence[Camera], config: UntoldBackgroundConfig = UNTOLD_BACKGROUND
+    rasterizer: Rasterizer, cameras: Sequence[Camera], config: UnknownBackgroundConfig = UNKNOWN_BACKGROUND
 ) -> bool:
     """Return whether the median of some evenly spread views leaves part of the image uncovered."""
     chosen = cameras[:: max(1, len(cameras) // config.views)]
