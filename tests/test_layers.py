@@ -18,6 +18,7 @@ from service.results import Candidates
 from service.types import Camera, Pose
 from viewer.camera_views import SceneExtent, view_from_behind, view_through
 from viewer.frusta import viser_frustum
+from viewer.layers.anchor_layer import AnchorLayer
 from viewer.layers.candidate_layer import CandidateLayer
 from viewer.layers.layer import Layer, linear_colours, quaternion_wxyz
 from viewer.layers.match_layer import MatchLayer
@@ -383,6 +384,62 @@ def test_another_scene_begins_with_its_own_view_size_and_background(canvas: Canv
     assert "/training cameras/cameras" in canvas.nodes
     away = training.pose.position_in_world - 3 * training.pose.axis_in_world
     assert scene.hit(away.tolist(), training.pose.axis_in_world.tolist()) is training
+
+
+def test_views_of_a_scene_and_its_floor_plan(canvas: Canvas) -> None:
+    canvas.camera = SimpleNamespace(aspect=1.5)
+    scene, training = Scene3D(canvas), Camera(PHOTO, orbit(0.6))
+    # Without a scene nothing can be looked at.
+    scene.look_from_above()
+    scene.look_at_first()
+    scene.look_from_behind(orbit(0.2))
+    scene.set_visible("floor plan", True)
+    assert vars(canvas.camera) == {"aspect": 1.5}
+    assert canvas.nodes == {}
+    assert not scene.is_visible("coverage")
+    centres = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    splats = Splats(centres, np.tile(np.float32(1e-4), (200, 6)), np.full((200, 4), 200, np.uint8), 200)
+    described = SimpleNamespace(background_rgb=(0.0, 0.0, 0.0), cameras=(SimpleNamespace(camera=training),))
+    described.metres_per_unit = 1.0
+    shown: Any = SimpleNamespace(description=described, splats=splats, extent=EXTENT)
+    scene.show_scene(shown, orbit(0.2))
+    # Megabytes that most browsers never need; this one has asked for them, and gets them with each scene.
+    assert "/floor plan/points" in canvas.nodes
+    scene.set_visible("floor plan", False)
+    scene.show_scene(shown, orbit(0.2))
+    assert "/floor plan/points" not in canvas.nodes
+    scene.set_visible("coverage", True)
+    assert "/floor plan/points" not in canvas.nodes
+    scene.set_visible("floor plan", True)
+    assert canvas.nodes["/floor plan/points"].visible
+    scene.look_from_above()
+    down = canvas.camera.look_at - canvas.camera.position
+    assert np.allclose(down / np.linalg.norm(down), [0, 0, -1])
+    scene.look_at_first()
+    assert np.allclose(canvas.camera.position, view_through(training, EXTENT, 1.0).position)
+    scene.look_through(Camera(PHOTO, orbit(0.4)))
+    assert np.allclose(canvas.camera.position, orbit(0.4).position_in_world)
+    # What was measured and picked in one scene isn't in the next one.
+    origin = centres[0] + np.array([0, 0, 50.0])
+    for _ in range(2):
+        scene.measure(origin.tolist(), [0.0, 0.0, -1.0])
+    scene.anchors.pick(np.array([1.0, 2.0, 3.0]))
+    assert {"/anchors/picked"} <= set(canvas.nodes)
+    assert any(path.startswith("/measured distance") for path in canvas.nodes)
+    scene.show_scene(shown, None)
+    assert not any(path.startswith(("/measured distance", "/anchors")) for path in canvas.nodes)
+
+
+def test_a_picked_point_is_drawn_larger_than_anchors(canvas: Canvas) -> None:
+    layer = on(canvas, AnchorLayer)
+    layer.show({"door": np.array([1.0, 1.0, 1.0])})
+    layer.pick(np.array([1.0, 2.0, 3.0]))
+    anchor, picked = canvas.nodes["/anchors/points"], canvas.nodes["/anchors/picked"]
+    np.testing.assert_array_equal(picked.points, [[1, 2, 3]])
+    # Both are smaller than a camera's frustum, so that they don't hide it.
+    depth = EXTENT.frustum_depth
+    assert 0.05 * depth < anchor.point_size < picked.point_size < 0.5 * depth
+    assert not np.array_equal(anchor.colors, picked.colors)
 
 
 # ------------------------------------------------------------------ where the view goes

@@ -213,6 +213,19 @@ def test_up_comes_from_the_scene_else_from_its_cameras() -> None:
     np.testing.assert_allclose(camera_views.scene_extent(nothing, cameras, (0.0, -2.0, 0.0)).up, [0, -1, 0], atol=1e-9)
 
 
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])
+def test_without_cameras_a_scene_is_seen_whole_from_a_little_above(up: tuple[float, float, float]) -> None:
+    scene = camera_views.SceneExtent(np.array([10.0, 20.0, 30.0]), 4.0, np.array(up), frustum_depth=0.3)
+    view = camera_views.initial_view(scene, [])
+    away = view.position - scene.centre
+    np.testing.assert_array_equal(view.look_at, scene.centre)
+    np.testing.assert_array_equal(view.up, up)
+    # Two and a half radii away, half as far up as to the side.
+    assert np.linalg.norm(away) == pytest.approx(10.0)
+    assert away @ np.array(up) == pytest.approx(10 * 0.5 / np.sqrt(1.25), rel=1e-6)
+    assert np.arctan(4.0 / 10.0) < view.fov_rad / 2 < np.arctan(1.0)  # nine tenths of the scene fill the picture
+
+
 @pytest.mark.parametrize(("width", "height"), [(300, 400), (400, 300), (200, 200), (64, 900)])
 def test_match_lines_end_where_the_matches_are(width: int, height: int) -> None:
     # Black pictures, each with one white pixel; the match between them must be drawn from the one to the other.
