@@ -34,10 +34,12 @@ check: setup
 test: check
 	$(PYTEST) -m "not browser and not ci"
 
-# What several machines share, with the packages that only they need. PostgreSQL's server is the system's.
+# What several machines share, and the peer of `bench peer`, with the packages that only they need. PostgreSQL's server
+# is the system's.
 test-fleet: setup
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray]"
-	$(BIN)/pytest -rs tests/test_fronts.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray,peer]"
+	$(BIN)/pytest -rs tests/test_fronts.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
+		tests/test_bench_peer.py
 
 # All tests, and which lines they run in their own process.
 coverage: check

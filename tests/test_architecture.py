@@ -116,6 +116,7 @@ WRAPPED = {
     "segno": {"service/cli/qr_code.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
     "ray": {"service/jobs/ray_engine.py"},
+    "pycolmap": {"service/bench/peer/colmap.py"},
     "psycopg": {"service/jobs/postgres_database.py"},
     "psycopg_pool": {"service/jobs/postgres_database.py"},
     "filelock": {"service/operating_system.py"},

@@ -15,6 +15,7 @@ from service.cli.bench_gpu import bench_gpu
 from service.cli.bench_live import bench_live
 from service.cli.bench_localize import bench_localize
 from service.cli.bench_paper import bench_paper
+from service.cli.bench_peer import bench_peer
 from service.cli.bench_render import bench_render
 from service.cli.bench_rigs import bench_rigs
 from service.cli.bench_scale import bench_scale
@@ -36,3 +37,4 @@ bench_app.command("ablation")(bench_ablation)
 bench_app.command("field")(bench_field)
 bench_app.command("evaluate")(bench_evaluate)
 bench_app.command("fleet")(bench_fleet)
+bench_app.command("peer")(bench_peer)
