@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from service.geometry import moved, pose_distance, se3_log
-from service.interfaces import Frame, Rasterizer, RenderTally
+from service.interfaces import Rasterizer, RenderTally
 from service.loaded_scene import LoadedScene
 from service.localize import (
     Cancelled,
@@ -274,18 +274,13 @@ def refine_from(
         # Estimating the uncertainty includes a step, which is taken.
         pose = moved(pose, uncertainty.last_step)
         turn, way = np.linalg.norm(uncertainty.last_step[:3]), np.linalg.norm(uncertainty.last_step[3:])
-        if size.fx * (turn + way / _typical_depth(rendered.frame)) < config.settled_px:
+        if size.fx * (turn + way / typical_depth(rendered.frame)) < config.settled_px:
             break
     return None if uncertainty is None else TrackedPose(pose, rendered, first.loss, uncertainty)
 
 
 def _size(rendered: RenderedView) -> tuple[int, int]:
     return rendered.camera.intrinsics.width, rendered.camera.intrinsics.height
-
-
-def _typical_depth(frame: Frame) -> float:
-    depth = frame.median_depth[::8, ::8]
-    return float(np.median(depth[depth > 0])) if (depth > 0).any() else 1.0
 
 
 def verify_tracked(
@@ -336,7 +331,7 @@ class SharedIntrinsics:
             return
         turn_deg, way = pose_distance(self.seen_from, found.pose)
         frame, camera = found.rendered.frame, found.rendered.camera
-        if turn_deg < config.new_view_deg and way < config.new_view_share * _typical_depth(frame):
+        if turn_deg < config.new_view_deg and way < config.new_view_share * typical_depth(frame):
             return
         photo, valid = images.resized(camera.intrinsics), images.valid_mask(camera.intrinsics)
         start = Camera(camera.intrinsics, found.pose)
