@@ -252,6 +252,43 @@ def test_a_searchs_answer_is_taken_unless_the_camera_was_found_meanwhile(tracker
     assert (tracker._doubt, tracker._run) == (None, 2)
 
 
+@pytest.mark.parametrize(
+    ("status", "reason", "doubt", "fixes", "verified"),
+    [
+        (Status.LOCALIZED, Reason.VERIFIED, None, 1, True),
+        (Status.LOCALIZED, Reason.VERIFIED, Reason.FEW_INLIERS, 0, True),
+        (Status.UNCERTAIN, Reason.LOW_COVERAGE, None, 0, False),
+        (Status.NOT_LOCALIZED, Reason.LOW_COVERAGE, None, 0, None),
+    ],
+)
+def test_a_followed_frame_counts_by_its_verdict(tracker, monkeypatch, status, reason, doubt, fixes, verified):
+    fixed: list[Any] = []
+    told = replace(VERIFIED, status=status, reason=reason, covariance=np.eye(6))
+    frame_seen = SimpleNamespace(median_depth=np.full((8, 8), 3.0, np.float32))
+    found = SimpleNamespace(pose=at(2.0), rendered=SimpleNamespace(frame=frame_seen))
+    learnt: list[Any] = []
+    monkeypatch.setattr(live_tracker, "photometric_verdict", lambda *_: told)
+    monkeypatch.setattr(live_tracker, "QueryImages", lambda query, matcher: "images")
+    monkeypatch.setattr(tracker, "_refined", lambda images, expected: found)
+    tracker._loaded = SimpleNamespace(matcher=None)
+    tracker._lens = SimpleNamespace(update=lambda *given: learnt.append(given))
+    tracker._fusion = SimpleNamespace(fix=lambda *given: fixed.append(given), predicted=lambda *given: given[-1])
+    tracker._past.append((9.0, at()))
+    tracker._doubt, tracker._searches, tracker._run = doubt, 2, 4
+    answer = tracker._followed(bright(), 9.1)
+    assert tracker._tried_s == 9.1
+    assert len(fixed) == fixes
+    if fixes:
+        time_s, pose, covariance, depth, run = fixed[0]
+        assert (time_s, pose, depth, run) == (9.1, found.pose, 3.0, 4)
+        assert np.array_equal(covariance, np.eye(6))
+    assert (tracker._verified_s == 9.1) is (verified is True)
+    assert (learnt == [("images", found)]) is (verified is True)
+    assert tracker._searches == (0 if fixes else 2)
+    assert (answer is None) is (verified is None)
+    assert len(tracker._past) == (1 if verified is None else 2)
+
+
 def test_a_check_says_what_there_is_to_doubt(tracker):
     wrong = replace(VERIFIED, status=Status.NOT_LOCALIZED, reason=Reason.RENDER_MISMATCH)
     for checked, doubt in ((wrong, Reason.RENDER_MISMATCH), (VERIFIED, None)):
@@ -308,7 +345,7 @@ def test_positions_are_told_in_the_scenes_own_world(tracker):
 
 
 def test_frames_show_different_things_from_15_degrees_or_30_centimetres_on():
-    for other, differs in ((at(turn_deg=14.9), False), (at(turn_deg=15.1), True), (at(0.29), False), (at(0.31), True)):
+    for other, differs in ((at(turn_deg=14.9), False), (at(turn_deg=15.1), True), (at(0.3), False), (at(0.31), True)):
         views = RecentViews()
         views.add(frame(1), at(), 0)
         views.add(frame(2), other, 0)

@@ -451,6 +451,7 @@ def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():
 
     background: Background[int] = Background()
     with closing(background):
+        assert background.result() is None
         background.start(call)
         assert began.wait(10)
         assert not background.idle
