@@ -352,6 +352,17 @@ def test_the_odometry_is_broken_where_one_step_of_four_fixes_contradicts_it():
     assert not broken()
 
 
+def test_odometry_goes_on_from_the_first_fix_after_the_break():
+    fusion = Fusion(OdometryFacts(), replace(INFO, metres_per_unit=1.0))
+    for number in range(4):
+        fusion.move(0.3 * number, at(0.25 * (number >= 2)))
+        fusion.fix(0.3 * number, at(), EXACT, DEPTH)
+    assert fusion.resets == 1
+    fusion.move(1.2, at(0.35))
+    for since_s, x in ((0.6, 5.1), (0.3, 9.0)):
+        assert fusion.predicted(since_s, at(5.0), 1.2, at(9.0)).position_in_world[0] == pytest.approx(x)
+
+
 def step_fixes(off: float, off_deg: float, sigma: float, late: float = 0.0) -> tuple[Fix, Fix]:
     moving = np.array([0.0, 0.0, 0.0, late, 0.0, 0.0])
     covariance = np.eye(6) * sigma**2

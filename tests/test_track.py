@@ -462,6 +462,10 @@ def test_what_runs_beside_yields_and_ends_when_it_is_not_wanted():
         assert background.idle
     if sys.platform == "linux":
         assert nice > os.getpriority(os.PRIO_PROCESS, 0)
+    ended, other = threading.Event(), Background[None]()
+    other.start(lambda cancel: (cancel.wait(10), time.sleep(0.05), ended.set())[-1])
+    other.close()
+    assert ended.is_set()
 
 
 def test_the_film_of_a_live_bench_has_its_parts_and_true_poses(room):
