@@ -20,7 +20,7 @@ from service.live.pace import Pace
 from service.live.recent_views import RecentViews
 from service.photos.images import encode_image
 from service.results import Reason, Status, Verdict
-from service.types import Intrinsics, Pose, SceneInfo
+from service.types import Intrinsics, IntrinsicsCorrection, LensPrior, Pose, SceneInfo
 
 LENS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 VERIFIED = Verdict(Status.LOCALIZED, Reason.VERIFIED, 0.9, 80, 0.9, 0.9, None)
@@ -289,6 +289,28 @@ def test_a_followed_frame_counts_by_its_verdict(tracker, monkeypatch, status, re
     assert len(tracker._past) == (1 if verified is None else 2)
 
 
+def test_a_lens_that_a_search_estimated_is_that_of_the_next_frames(tracker):
+    learnt: list[Any] = []
+    tracker._lens = SimpleNamespace(set=lambda *given: learnt.append(given), correction=IntrinsicsCorrection(2.0))
+    approximate, exact = replace_of(bright(), lens_prior=LensPrior(0.5)), bright()
+    verdict = replace(VERIFIED, correction_sigma=(0.02, 0.0, 0.0, 0.0))
+    for query, lens, focal_sigma in (
+        (exact, None, verdict), (approximate, LENS, verdict), (approximate, None, VERIFIED),
+        (approximate, None, verdict),
+    ):  # fmt: skip
+        found = estimate(Status.LOCALIZED, at(1.0))
+        found.verdict = focal_sigma
+        found.records[-1].lens, found.records[-1].correction = lens, IntrinsicsCorrection(1.5)
+        tracker._background.found = _Found(query, 5.0, found, None, tracker._loaded)
+        tracker._take_over()
+    ((pose, correction, prior),) = learnt
+    assert (pose.position_in_world[0], correction.focal_factor, prior) == (1.0, 3.0, LensPrior(0.02))
+
+
+def replace_of(query: Any, **changes: Any) -> Any:
+    return SimpleNamespace(**vars(query) | changes)
+
+
 def test_a_check_says_what_there_is_to_doubt(tracker):
     wrong = replace(VERIFIED, status=Status.NOT_LOCALIZED, reason=Reason.RENDER_MISMATCH)
     for checked, doubt in ((wrong, Reason.RENDER_MISMATCH), (VERIFIED, None)):
@@ -410,6 +432,13 @@ def test_a_rate_up_to_a_quarter_too_high_is_left(busy_s, fps):
     pace = Pace(60)
     told = [hint for k in range(30) if (hint := pace.used(k * 30 / 29 / 20, busy_s, 0, 640))]
     assert [hint.max_fps for hint in told] == ([fps] if fps else [])
+
+
+def test_a_rate_exactly_a_quarter_too_high_is_left():
+    pace = Pace(60)
+    # 30 frames in 1.5 s, each of which takes a sixteenth.
+    assert not [pace.used(at_s, 0.0625, 0, 640) for at_s in [0.0] * 29 + [1.5]][-1]
+    assert pace.used(2.0, 0.0625, 0, 640) is None
 
 
 def test_advice_rises_by_half_at_once_where_clearly_more_could_be_used():
