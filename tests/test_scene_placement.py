@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from service.bench.fleet_simulation import FleetModel, FleetSimulation
-from service.errors import CorruptScene, SceneInUse, SceneNotFound, SceneTooLarge, SceneUnloaded
+from service.errors import (
+    BadInput,
+    CorruptScene,
+    SceneInUse,
+    SceneNotFound,
+    SceneNotReady,
+    SceneTooLarge,
+    SceneUnloaded,
+)
 from service.jobs.engine import HeldScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
 from service.jobs.scene_coordinator import SceneCoordinator
@@ -101,6 +110,7 @@ def test_scenes_that_are_needed_together_come_together():
     choice = run_job(table, "w", "x", "x")
     assert set(table.scenes(choice.replica)) >= {"w", "x"}
     assert not table.could_hold(("w", "x", "y"))
+    assert placement(300, w=100, x=100, y=100).could_hold(("w", "x", "y"))
 
 
 def test_what_a_scene_really_takes_counts():
@@ -112,6 +122,26 @@ def test_what_a_scene_really_takes_counts():
     assert list(table.scenes("a")) == ["x"]
     table.dropped("a", "x")
     assert table.size("x") == 240
+
+
+def test_each_byte_of_the_budget_counts():
+    for budget, dropped in ((300, ()), (299, ("v",)), (200, ("v",)), (199, ("v", "w")), (100, ("v", "w")), (99, None)):
+        table = placement(None, "a", v=100, w=100, x=100)
+        run_job(table, "v")
+        run_job(table, "w")
+        table._config = PlacementConfig(budget)
+        choice = table.choose(("x",))
+        assert (choice and choice.drop) == dropped, budget
+
+
+def test_where_the_likely_replicas_are_full_any_other_may_have_room():
+    """Ten replicas, of which the one with most jobs is the only one whose scene leaves room."""
+    table = placement(100, "abcdefghij", small=1, x=99, **{f"s{k}": 100 for k in range(9)})
+    busy = [run_job(table, "small", keep=True).replica for _ in range(3)]
+    assert len(set(busy)) == 1
+    for k in range(9):
+        run_job(table, f"s{k}", keep=True)
+    assert table.choose(("x",)) == Choice(busy[0], ("x",), ())
 
 
 def test_nothing_is_left_of_a_replica_that_is_gone():
@@ -310,14 +340,85 @@ def test_a_load_that_fails_leaves_nothing_and_is_told_to_all():
         assert all(isinstance(e, CorruptScene) for e in await asyncio.gather(*waiting, return_exceptions=True))
         assert coordinator._placement.copies("torn") == {}
         assert [coordinator._placement.jobs(name) for name in coordinator._placement.replicas()] == [0, 0]
+        loads = fleet.loads.copy()
         for ask in (coordinator.hold_later, coordinator.hold):
             with pytest.raises(CorruptScene):  # not loaded again by each request
                 await ask("f", "torn")
+        assert fleet.loads == loads
+        with pytest.raises(CorruptScene):
+            await coordinator.where("torn")
         assert (await coordinator.scene("torn")).state == "failed"
         held = await coordinator.hold_later("f", AUTO)
         assert "torn" not in held.held.ids
 
     with_fleet(check)
+
+
+def test_a_scene_that_fails_is_tried_again_after_5_seconds_then_10_and_300_at_most(monkeypatch):
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        for number, pause_s in enumerate((5, 10, 20, 40, 80, 160, 300, 300)):
+            with pytest.raises(CorruptScene):
+                await coordinator.hold_later("f", "torn")
+            clock.now += pause_s - 0.01
+            with pytest.raises(CorruptScene):
+                await coordinator.hold_later("f", "torn")
+            assert fleet.loads.count("torn") == number + 1
+            clock.now += 0.01
+        # One that is asked for by an operator is tried at once.
+        await coordinator.load("torn")
+        await asyncio.sleep(0.02)
+        assert fleet.loads.count("torn") == 9
+
+    clock = SimpleNamespace(now=1000.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr("service.jobs.scene_coordinator.time", clock)
+    with_fleet(check)
+
+
+def test_a_scene_is_asked_for_where_the_fewest_jobs_are():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        with pytest.raises(SceneNotReady):
+            await coordinator.where("x")
+        await asyncio.sleep(0.02)
+        assert fleet.loads == ["x"]  # it is loaded because it was asked for
+        first = await coordinator.where("x")
+        await coordinator.hold_later("f", "x")
+        coordinator._placement.loaded("r2" if first is fleet.replicas[0] else "r1", "x", 100)
+        assert await coordinator.where("x") is not first
+        await coordinator.unload("x")
+        with pytest.raises(SceneUnloaded):
+            await coordinator.where("x")
+
+    with_fleet(check)
+
+
+def test_a_scene_without_a_file_stays_in_memory(monkeypatch):
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        (replica,) = fleet.replicas
+        for name in ("b", "w", "x", "b", "y"):
+            await coordinator.release((await coordinator.hold_later("f", name)).held.token)
+        assert replica.scenes == {"b", "y"}
+        with pytest.raises(BadInput):
+            await coordinator.unload("b")
+
+    async def built_in(self: FakeReplica) -> list[SceneStatus]:
+        self.scenes.add("b")
+        return [SceneStatus("b", "ready", memory_bytes=100)]
+
+    monkeypatch.setattr(FakeReplica, "_built_in", built_in)
+    with_fleet(check, replicas=1)
+
+
+def test_a_file_of_the_same_name_replaces_a_scene():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        (replica,) = fleet.replicas
+        await coordinator.release((await coordinator.hold_later("f", "x")).held.token)
+        await coordinator.add(StoredScene("x", Path("x")), False)
+        assert replica.scenes == {"x"}
+        await coordinator.add(StoredScene("x", Path("elsewhere")), False)
+        assert replica.scenes == set()
+        assert (await coordinator.scene("x")).state == "unloaded"
+
+    with_fleet(check, replicas=1)
 
 
 def test_who_needs_a_scene_waits_until_others_let_go():
