@@ -318,7 +318,12 @@ def test_a_failed_action_is_shown_and_the_session_goes_on(caplog: pytest.LogCapt
 
 def test_a_flight_starts_here_ends_there_and_is_smooth(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [50.0]
-    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=lambda s: now.__setitem__(0, now[0] + s))
+
+    def sleep(seconds: float) -> None:
+        now[0] += seconds
+        assert now[0] < 60.0, "it never arrives"
+
+    clock = SimpleNamespace(monotonic=lambda: now[0], sleep=sleep)
     monkeypatch.setattr(browser_camera, "time", clock)
     x, z = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
     seen: list[tuple[float, float]] = []
