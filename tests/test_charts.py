@@ -83,6 +83,7 @@ def test_the_caption_tells_the_median_length() -> None:
     assert "lengths: 5 px, the median" in told((3, 4), (0, 1), (30, 40))
     assert "angles: 90° between two, on average" in told((10, 0), (0, 10))
     assert f"below {charts.MIN_VECTOR_PX}" in told((0, 0.9 * charts.MIN_VECTOR_PX))
+    assert f"lengths: {charts.MIN_VECTOR_PX:.3g} px" in told((0, charts.MIN_VECTOR_PX))
     assert "no vector is long enough" in told((0, 0.9 * charts.MIN_VECTOR_PX))
     nothing: Any = SimpleNamespace(inlier=np.ones(1, bool), vectors_px=np.full((1, 2), np.nan))
     assert "No match is in view" in charts.vectors_html(nothing)
@@ -130,6 +131,33 @@ def test_more_than_one_and_a_half_decades_are_drawn_logarithmically(largest: flo
     # From 1 to 100, or from 0 to the largest.
     expected = [90 - 41 * np.log10(v) if logarithmic else 90 - 82 * v / largest for v in (1.0, 10.0, largest)]
     assert heights == pytest.approx(expected, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("values", "logarithmic", "ticks"),
+    [((0.02, 0.5, 2.0), True, [0.01, 0.1, 1, 10]), ((-4.0, 1.0, 4.0), False, [-4, -2, 0, 2, 4]),
+     ((0.1, 1.0, 2.9), False, [0, 1, 2])],
+)  # fmt: skip
+def test_values_lie_among_the_lines_of_their_axis(
+    values: tuple[float, ...], logarithmic: bool, ticks: list[float]
+) -> None:
+    svg = chart(charts.curves_html([record(k, loss=value) for k, value in enumerate(values)], None, 0), "loss")
+    labels = [(float(text.text or ""), *numbers(text, "x", "y")) for text in svg.iter("text")][: len(ticks)]
+    assert [value for value, *_ in labels] == pytest.approx(ticks)
+    # Each has a line across, three above the text's base.
+    lines = [re.fullmatch(r"M46 ([\d.]+)H386", path.attrib["d"]) for path in svg.iter("path")]
+    heights = [float(line[1]) for line in lines if line]
+    assert heights == pytest.approx([y - 3 for *_, y in labels], abs=0.06)
+    scale = np.log10 if logarithmic else np.float64
+    expected = np.interp(scale(values), scale(ticks), heights) if ticks[-1] >= values[-1] else None
+    if expected is not None:
+        assert [y for _, y in dots(svg)] == pytest.approx(expected, abs=0.11)
+
+
+def test_a_loss_of_one_stage_has_the_stages_colour() -> None:
+    records = [record(k, "refine", loss=value) for k, value in enumerate((1.0, 2.0))]
+    (line,) = [p for p in chart(charts.curves_html(records, None, 0), "loss").iter("path") if p.get("fill") == "none"]
+    assert line.attrib["stroke"] == charts.stage_colours(records)["refine"]
 
 
 def test_losses_have_a_curve_a_stage_and_lengths_are_in_metres_where_the_scale_is_known() -> None:

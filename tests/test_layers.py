@@ -14,6 +14,7 @@ import pytest
 import viser
 from fake_service import PHOTO, orbit, records
 
+from service.geometry import moved
 from service.results import Candidates
 from service.types import Camera, Pose
 from viewer.camera_views import SceneExtent, view_from_behind, view_through
@@ -457,3 +458,19 @@ def test_a_dozen_splats_between_occlude_a_camera(between: int, far: bool) -> Non
     assert np.linalg.norm(chosen.position) <= np.linalg.norm(free.position)
     # From the nearest place, too, the whole frustum is in front.
     assert (np.array([0, 0, 1.0]) - chosen.position)[2] > 2
+
+
+@pytest.mark.parametrize(("aside", "occluded"), [(0.45, True), (0.55, False)])
+def test_what_is_within_half_a_frustum_of_the_line_of_sight_occludes(aside: float, occluded: bool) -> None:
+    """Of a small scene far from the origin: all is relative to the camera, in depths of its frustum."""
+    pose, depth = Pose(moved(Pose(np.eye(4)), np.array([0, 0, 0, 30.0, -20.0, 10.0])).world_from_camera), 0.2
+    extent = SceneExtent(pose.position_in_world, 2.5, np.array([0.0, -1.0, 0.0]), frustum_depth=depth)
+    free = view_from_behind(pose, extent, np.zeros((0, 3), np.float32))
+    # It looks along the camera's axis, and at something in front of the frustum, within the scene.
+    ahead = (free.look_at - pose.position_in_world) / depth
+    np.testing.assert_allclose(ahead[:2], 0, atol=1e-9)
+    assert 2 < ahead[2] < extent.radius / depth
+    sight = pose.position_in_world + 0.95 * (free.position - pose.position_in_world)
+    splats = np.tile(sight + np.array([aside * depth, 0, 0]), (40, 1)).astype(np.float32)
+    chosen = view_from_behind(pose, extent, splats)
+    assert bool(np.allclose(chosen.position, free.position)) is not occluded

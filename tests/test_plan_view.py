@@ -19,7 +19,7 @@ from service.results import Reason, Status
 from service.scene_manager.status import CoverageStatus
 from service.types import Camera, Intrinsics
 from service.web.schemas.coverage import coverage_status_out
-from viewer.camera_views import scene_extent, view_from_above
+from viewer.camera_views import SceneExtent, scene_extent, view_from_above
 from viewer.colours import BLIND_COLOUR, COVERAGE_LEVELS, STATUS_COLOURS, coverage_colour
 from viewer.layers.anchor_layer import AnchorLayer
 from viewer.layers.coverage_layer import CoverageLayer
@@ -122,6 +122,24 @@ def test_from_above_all_cameras_are_in_view_and_x_is_right(aspect: float) -> Non
     assert right[1, 0] > right[0, 0]
     assert right[1, 1] == pytest.approx(right[0, 1], abs=1e-6)
     assert right[2, 1] < right[0, 1]
+
+
+def test_from_above_is_along_the_scenes_upright_wherever_that_points() -> None:
+    up = np.array([0.6, 0.48, 0.64])
+    scene = SceneExtent(np.array([10.0, 20.0, 30.0]), 2.0, up, 0.2)
+    points = (scene.centre + np.random.default_rng(0).normal(size=(300, 3))).astype(np.float32)
+    view = view_from_above(scene, [], points, 1.5)
+    down = view.look_at - view.position
+    np.testing.assert_allclose(down / np.linalg.norm(down), -up, atol=1e-9)
+    assert view.up @ up == pytest.approx(0, abs=1e-9)
+    # What is right is the y axis, the nearest to a horizontal one, as far as it is horizontal.
+    right = np.cross(down, view.up)
+    np.testing.assert_allclose(
+        right / np.linalg.norm(right), (np.eye(3)[1] - 0.48 * up) / np.sqrt(1 - 0.48**2), atol=1e-9
+    )
+    # It looks at the middle of the points, at the height of the scene's centre.
+    assert np.linalg.norm(view.look_at - scene.centre) < 0.5
+    assert (view.look_at - scene.centre) @ up == pytest.approx(0, abs=1e-6)
 
 
 def display(client: Client) -> Any:

@@ -22,7 +22,7 @@ from service.client import Client, Event, EventParser, ServiceError, parse_recor
 from service.geometry import look_at, project, transformed
 from service.results import IterationRecord, MatchVectors, Reason, Status
 from service.scene_manager.splat_sample import importance, packed_splats
-from service.types import Camera, Intrinsics
+from service.types import Camera, Intrinsics, Pose
 from service.web.schemas.conversion import record_out
 from viewer import camera_views, charts, colours, frusta, job_stream, match_geometry, service_lists
 from viewer import comparison_images as images
@@ -169,6 +169,7 @@ def test_looking_through_a_camera_shows_its_whole_image(aspect: float, roll: flo
     # The browser's camera: y towards up, made orthogonal to the viewing direction. Its roll is the photo's.
     up = view.up - (view.up @ forward) * forward
     np.testing.assert_allclose(up / np.linalg.norm(up), -pose.world_from_camera[:3, 1], atol=1e-6)
+    assert np.linalg.norm(view.up) == pytest.approx(1)
     # In units of the viewport's half height the image's corners lie within it, and touch it on one side.
     reach = np.tan(view.fov_rad / 2)
     x, y = 0.5 * PHOTO.width / PHOTO.fx / reach / aspect, 0.5 * PHOTO.height / PHOTO.fy / reach
@@ -211,6 +212,40 @@ def test_up_comes_from_the_scene_else_from_its_cameras() -> None:
     nothing = np.zeros((0, 3), np.float32)
     np.testing.assert_allclose(camera_views.scene_extent(nothing, cameras, None).up, [0, 0, 1], atol=1e-9)
     np.testing.assert_allclose(camera_views.scene_extent(nothing, cameras, (0.0, -2.0, 0.0)).up, [0, -1, 0], atol=1e-9)
+
+
+def test_two_cameras_or_more_are_the_size_of_a_scene() -> None:
+    centres = np.full((50, 3), np.float32(7.0))
+    for count, middle, radius in ((2, [5, 0, 0], 1.0), (3, [6, 0, 0], 2.0)):
+        places = np.array([[4.0, 0, 0], [6.0, 0, 0], [8.0, 0, 0]])[:count]
+        cameras = [Camera(PHOTO, Pose(np.block([[np.eye(3), at[:, None]], [np.zeros(3), 1.0]]))) for at in places]
+        found = camera_views.scene_extent(centres, cameras, None)
+        np.testing.assert_allclose(found.centre, middle)
+        assert found.radius == pytest.approx(radius)
+        assert found.frustum_depth == pytest.approx(0.08 * found.radius)
+    # One alone has no size.
+    np.testing.assert_allclose(camera_views.scene_extent(centres, cameras[:1], None).centre, [7, 7, 7])
+
+
+@pytest.mark.parametrize(("leans", "about_scenes"), [(0.06, True), (0.04, False)])
+def test_a_camera_that_looks_straight_down_is_orbited_about_its_own_upright(leans: float, about_scenes: bool) -> None:
+    """Where the scene's upright is within some 3 degrees of the viewing direction, it would be of no use."""
+    scene = camera_views.SceneExtent(np.zeros(3), 2.0, np.array([0.0, 0.0, 1.0]), 0.1)
+    sine = np.sqrt(1 - leans**2)
+    pose = look_at(np.zeros(3), np.array([leans, 0, -sine]), scene.up)
+    found = camera_views.view_through(Camera(PHOTO, pose), scene, 1.5)
+    assert found.up == pytest.approx([0, 0, 1] if about_scenes else [sine, 0, leans], abs=1e-9)
+
+
+def test_a_flight_is_a_smooth_step_between_two_views() -> None:
+    x, y, z = np.eye(3)
+    a, b = camera_views.Viewpoint(2 * x, 3 * y, z, 1.0), camera_views.Viewpoint(6 * x, y + 4 * z, y, 0.5)
+    for share, s in ((0.0, 0.0), (0.25, 5 / 32), (0.5, 0.5), (1.0, 1.0)):  # 3 s^2 - 2 s^3
+        found = camera_views.interpolate_views(a, b, share)
+        assert found.position == pytest.approx((2 + 4 * s) * x)
+        assert found.look_at == pytest.approx((3 - 2 * s) * y + 4 * s * z)
+        assert found.up == pytest.approx((1 - s) * z + s * y)
+        assert found.fov_rad == pytest.approx(1 - 0.5 * s)
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8)])

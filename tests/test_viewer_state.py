@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import itertools
 import re
+import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -11,12 +14,13 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from fake_service import PHOTO, jpeg, orbit, records
+from fake_service import PHOTO, jpeg, orbit, records, threads, until
 
+from service.geometry import moved
 from service.types import Camera
-from viewer import charts, job_display
+from viewer import background_render, charts, job_display
 from viewer.action_queue import ActionQueue
-from viewer.background_render import BackgroundRender, _same_view
+from viewer.background_render import BackgroundRender, Overlay, _same_view
 from viewer.controls import NEXT, PLAY, PREVIOUS, Controls
 from viewer.job_display import FOLLOW_AFTER_OPEN_S, JobDisplay
 from viewer.job_selection import JobSelection
@@ -341,6 +345,28 @@ def test_actions_run_in_order_and_the_last_of_a_key_wins() -> None:
     assert queue.take(None) is None
 
 
+@pytest.mark.parametrize(("wake", "taken"), [("post", 1), ("close", None)])
+def test_who_waits_for_actions_is_woken(wake: str, taken: int | None) -> None:
+    queue = ActionQueue()
+    found: list[Any] = []
+    thread = threading.Thread(target=lambda: found.append(queue.take(None)), daemon=True)
+    thread.start()
+    until(lambda: queue._changed._waiters, "waiting")  # type: ignore[attr-defined]
+    queue.post(lambda: None) if wake == "post" else queue.close()
+    thread.join(5)
+    assert [None if actions is None else len(actions) for actions in found] == [taken]
+
+
+def test_actions_are_waited_for_until_the_timeout_and_taken_at_once_where_there_are_some() -> None:
+    queue = ActionQueue()
+    began = time.monotonic()
+    assert queue.take(0.05) == []
+    assert 0.04 < time.monotonic() - began < 2
+    queue.post(lambda: None)
+    assert len(queue.take(60) or []) == 1
+    assert time.monotonic() - began < 10
+
+
 # ------------------------------------------------------------------ the service's render behind the view
 
 
@@ -419,9 +445,11 @@ def test_nothing_is_rendered_or_shown_that_is_not_wanted() -> None:
 def test_a_render_is_no_larger_than_the_browsers_view(
     size: tuple[int, int], limit: int, expected: tuple[int, int]
 ) -> None:
-    lens = background(width=size[0], height=size[1])[0]._camera(limit).intrinsics
+    found = background(width=size[0], height=size[1])[0]
+    found._client.camera.fov = 0.7
+    lens = found._camera(limit).intrinsics
     assert (lens.width, lens.height) == expected
-    assert 2 * np.arctan(0.5 * lens.height / lens.fy) == pytest.approx(1.0)
+    assert 2 * np.arctan(0.5 * lens.height / lens.fy) == pytest.approx(0.7)
     assert (lens.cx, lens.cy) == (lens.width / 2, lens.height / 2)
 
 
@@ -437,8 +465,54 @@ def test_views_are_the_same_up_to_rounding() -> None:
         found._client.camera.fov = fov
         assert _same_view(now, found._camera()) is same
     found._client.camera.fov = 1.0
+    for factor, same in ((1 + 0.9e-4, True), (1 - 0.9e-4, True), (1 + 1.1e-4, False), (1 - 1.1e-4, False)):
+        lens = replace(now.intrinsics, fy=factor * now.intrinsics.fy)
+        assert _same_view(replace(now, intrinsics=lens), now) is same
     found._client.camera.image_width = 1500
     assert not _same_view(now, found._camera())
+
+
+def test_the_photo_is_over_renders_from_its_own_place_alone() -> None:
+    found, shown, _ = background(width=96, height=64)
+    view = found._camera()
+    found._overlay = Overlay(np.full((64, 96, 3), 255, np.uint8), view)
+    found._opacity = 1.0
+    image = np.zeros((64, 96, 3), np.uint8)
+    assert found._with_overlay(image, view)[32, 48].tolist() == [255, 255, 255]
+    aside = replace(view, pose=moved(view.pose, np.array([0, 0, 0, 0.01, 0, 0])))
+    assert found._with_overlay(image, aside) is image
+    # Up to 60 degrees beside its axis something of it may be in view.
+    for degrees, fits in ((59, True), (61, False)):
+        turned = replace(view, pose=moved(view.pose, np.array([0, np.radians(degrees), 0, 0, 0, 0])))
+        assert found._overlay.fits(turned) is fits
+    # Its opacity is changed at once where a render is shown.
+    found._rendered = image, view
+    found.set_opacity(0.5)
+    assert shown == []
+    found._showing = True
+    found.set_opacity(0.0)
+    (seen,) = shown
+    assert seen[32, 48].tolist() == [0, 0, 0]
+
+
+def test_the_view_is_rendered_once_it_rests_and_again_after_each_movement(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(background_render, "_REST_S", 0.01)
+    found, shown, service = background()
+    reports: list[Any] = []
+    found._client.camera.on_update = reports.append
+    found._without_splats = False
+    found.start()
+    (report,) = reports
+    for count in (1, 2):
+        found._client.camera.position = np.array([float(count), 0, 0])
+        asyncio.run(report(None))
+        until(lambda count=count: service.render.call_count == count and len(shown) == 2 * count - 1, "a render")
+        assert shown[-1] is not None
+        asyncio.run(report(None))  # a view that was set from here comes back
+        assert len(shown) == 2 * count - 1
+    found.close()
+    until(lambda: not threads("background-1"), "the thread's end")
+    assert service.render.call_count == 2
 
 
 # ------------------------------------------------------------------ charts
@@ -487,6 +561,8 @@ def test_the_strip_of_stages_names_each_and_marks_the_step() -> None:
         ([-1.0, 1.0], False, (-1, 1), [-1, -0.5, 0, 0.5, 1]),
         ([0.0], False, (0, 1), [0, 0.2, 0.4, 0.6, 0.8, 1]),
         ([80.0], False, (0, 80), [0, 20, 40, 60, 80]),
+        ([5.0], False, (0, 5), [0, 2, 4]),
+        ([-4.0, 4.0], False, (-4, 4), [-4, -2, 0, 2, 4]),
         ([0.02, 3.0], True, (0.01, 10), [0.01, 0.1, 1, 10]),
         ([1e-6, 3.0], True, (1e-6, 10), [1e-6, 1e-4, 1e-2, 1]),
     ],
