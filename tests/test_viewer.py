@@ -343,6 +343,107 @@ def test_overlays_compare_pixel_by_pixel() -> None:
     assert [images.decode(base64.b64decode(data))[5, 5, 0] for data in both] == [100, 180]
 
 
+def extent_of(picture: np.ndarray, colour: tuple[int, int, int]) -> tuple[int, int, int, int]:
+    """Left, top, and width and height of what has a colour."""
+    rows, columns = np.nonzero((picture == colour).all(2))
+    return int(columns.min()), int(rows.min()), int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1
+
+
+@pytest.mark.parametrize(
+    ("photo", "render", "places"),
+    [
+        # (height, width), and left, top, width, height in a picture of 800 pixels and at most 1160: 8 lie between.
+        ((60, 90), (60, 90), [(0, 0, 800, 533), (0, 541, 800, 533)]),
+        ((100, 95), (40, 80), [(126, 0, 547, 576), (0, 584, 800, 400)]),
+        ((100, 90), (100, 90), [(141, 0, 518, 576), (141, 584, 518, 576)]),
+        ((100, 80), (100, 80), [(0, 0, 396, 495), (404, 0, 396, 495)]),
+        ((100, 20), (90, 30), [(86, 0, 232, 1160), (326, 0, 387, 1160)]),
+    ],
+)
+def test_photo_and_render_are_as_large_as_fits_with_a_gap_between(
+    photo: tuple[int, int], render: tuple[int, int], places: list[tuple[int, int, int, int]]
+) -> None:
+    red, blue = (200, 20, 20), (20, 20, 200)
+    pair = images.side_by_side(np.full((*photo, 3), red, np.uint8), np.full((*render, 3), blue, np.uint8))
+    assert [extent_of(pair, colour) for colour in (red, blue)] == [pytest.approx(place, abs=1) for place in places]
+    assert pair.shape == (max(top + height for _, top, _, height in places), 800, 3)
+
+
+def test_a_composed_image_is_in_the_middle() -> None:
+    photo = np.full((100, 30, 3), (200, 20, 20), np.uint8)
+    left, top, width, height = extent_of(images.overlay("blend", photo, photo), (200, 20, 20))
+    assert (left, top, width, height) == (226, 0, 348, 1160)
+    assert extent_of(images.overlay("blend", photo[:20], photo[:20]), (200, 20, 20)) == (0, 0, 800, 533)
+
+
+def test_a_photo_over_a_render_is_mixed_by_its_opacity() -> None:
+    camera = Camera(PHOTO, orbit(0))
+    dark, light = (np.full((PHOTO.height, PHOTO.width, 3), value, np.uint8) for value in (40, 200))
+    for opacity, mixed in ((0.0, 40), (0.25, 80), (1.0, 200)):
+        assert images.with_photo(dark, camera, light, camera, opacity)[32, 48].tolist() == [mixed] * 3
+
+
+@pytest.mark.parametrize(
+    ("render_px", "drawn"),
+    [((0, 0), True), ((0.5, 0.5), True), ((89.5, 59.5), True), ((90, 30), False), ((45, 60), False),
+     ((-0.1, 30), False), ((45, -0.1), False), ((np.nan, np.nan), False)],
+)  # fmt: skip
+def test_a_match_outside_of_the_render_has_no_line(render_px: tuple[float, float], drawn: bool) -> None:
+    camera = Camera(Intrinsics(90, 60, 80.0, 80.0, 45.0, 30.0), orbit(0))
+    view = match_view(np.float32([[45, 30]]), np.float32([[45, 30]]), camera)
+    view = replace(view, render_px=np.array([render_px], np.float64))
+    grey = np.full((60, 90, 3), 90, np.uint8)
+    white = np.full((1, 3), 255, np.uint8)
+    bare = images.side_by_side(grey, grey)
+    assert bool((images.side_by_side(grey, grey, view, white) != bare).any()) is drawn
+    assert np.array_equal(images.side_by_side(grey, grey, view, None), bare)
+    assert np.array_equal(images.side_by_side(grey, grey, None, white), bare)
+
+
+@pytest.mark.parametrize(("count", "opacity"), [(1, 0.692), (50, 0.5), (300, 0.357)])
+def test_lines_are_the_more_translucent_the_more_there_are_and_end_in_dots(count: int, opacity: float) -> None:
+    """All the same: 0.3, and 0.4 more for a single one, half of that with fifty."""
+    black, white = np.zeros((100, 200, 3), np.uint8), np.full((count, 3), 255, np.uint8)
+    segments = np.tile(np.array([[20.5, 50.5], [180.5, 50.5]]), (count, 1, 1))
+    drawn = images._draw_lines(black, segments, white)
+    assert drawn[50, 100].tolist() == [pytest.approx(255 * opacity, abs=3)] * 3
+    # Centred on the pixels that the ends lie in: two wide there, nothing three rows away.
+    assert drawn[[47, 53], 100].max() == 0
+    dots = np.argwhere((drawn == 255).all(2))
+    for middle in ((50, 20), (50, 180)):
+        offsets = dots[np.abs(dots - middle).max(1) < 10] - middle
+        assert np.array_equal(offsets.min(0), [-3, -3])
+        assert np.array_equal(offsets.max(0), [3, 3])
+        assert [0, 0] in offsets.tolist()
+        assert [3, 3] not in offsets.tolist()
+    assert not black.any()
+
+
+def test_dots_at_the_edge_are_cut() -> None:
+    image = np.zeros((20, 30, 3), np.uint8)
+    images._draw_dots(image, np.array([[0.2, 0.2], [29.8, 19.8], [-40.0, 5.0]]), np.full((3, 3), 9, np.uint8))
+    expected = images._DOT_OFFSETS
+    corner = {(int(r), int(c)) for r, c in expected if r >= 0 and c >= 0}
+    assert set(map(tuple, np.argwhere(image[:10, :15, 0]).tolist())) == corner
+    other = {(int(r) + 19, int(c) + 29) for r, c in expected if r <= 0 and c <= 0}
+    assert {(r + 10, c + 15) for r, c in map(tuple, np.argwhere(image[10:, 15:, 0]).tolist())} == other
+    assert int((image[..., 0] > 0).sum()) == len(corner) + len(other)
+
+
+@pytest.mark.parametrize(("length", "arrow"), [(1.4, False), (1.6, True), (2.9, True), (3900, True), (4100, False)])
+def test_vectors_too_short_or_endless_are_dots(length: float, arrow: bool) -> None:
+    """At twice the photo's pixels: arrows are longer than 3 and shorter than 8000."""
+    camera = Camera(Intrinsics(400, 300, 300.0, 300.0, 200.0, 150.0), orbit(0))
+    at = np.array([[200.0, 150.0]])
+    view = replace(match_view(np.float32(at), np.float32(at), camera), vectors_px=np.array([[length, 0.0]]))
+    ink = np.array([(250, 10, 10)], np.uint8)
+    black = np.zeros((300, 400, 3), np.uint8)
+    picture = images.match_vectors_image(black, view, ink)[..., 0].astype(int)
+    alone = images.match_vectors_image(black, replace(view, vectors_px=np.array([[0.0, 0.0]])), ink)[..., 0].astype(int)
+    assert 20 < (alone > 200).sum() < 60  # a dot of 3 pixels' radius
+    assert bool((picture != alone).any()) is arrow
+
+
 def test_arrows_go_from_the_renders_point_to_the_photos() -> None:
     camera = Camera(Intrinsics(400, 300, 300, 300, 200, 150), orbit(0))
     view = match_view(np.float32([[300, 100]]), np.float32([[100, 200]]), camera)

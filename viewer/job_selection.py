@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from viewer.controls import NO_JOB, NO_SCENE, Controls
+from viewer.controls import NO_SCENE, Controls
 from viewer.job_display import JobDisplay
 from viewer.panel_html import headline_html, job_label
 from viewer.requested_page import RequestedPage
@@ -61,7 +61,7 @@ class JobSelection:
     def choose_job(self, label: str) -> None:
         """Show the job with this line in the list of jobs."""
         chosen = self._named.get(label)
-        if label != NO_JOB and chosen is not None:
+        if chosen is not None:
             self._chosen, self._follows_newest = chosen, False
             self._controls.newest.value = False
             self.sync()
