@@ -16,7 +16,7 @@ from fake_service import PHOTO, orbit, records
 
 from service.geometry import moved
 from service.results import Candidates
-from service.types import Camera, Pose
+from service.types import Camera, Intrinsics, Pose
 from viewer.camera_views import SceneExtent, view_from_behind, view_through
 from viewer.frusta import viser_frustum
 from viewer.layers.anchor_layer import AnchorLayer
@@ -441,6 +441,16 @@ def test_a_picked_point_is_drawn_larger_than_anchors(canvas: Canvas) -> None:
     depth = EXTENT.frustum_depth
     assert 0.05 * depth < anchor.point_size < picked.point_size < 0.5 * depth
     assert not np.array_equal(anchor.colors, picked.colors)
+
+
+@pytest.mark.parametrize(("width", "height", "fx", "fy"), [(300, 200, 90.0, 120.0), (100, 500, 400.0, 800.0)])
+def test_visers_frustum_has_the_photos_angles_and_depth(width: int, height: int, fx: float, fy: float) -> None:
+    """As viser's page draws it: a pyramid of depth 1, divided by the cube root of x y z / 3, times `scale`."""
+    fov, aspect, scale = viser_frustum(Intrinsics(width, height, fx, fy, 10.0, 20.0), 0.25)
+    y = np.tan(fov / 2)
+    x = y * aspect
+    assert (x, y) == pytest.approx((width / 2 / fx, height / 2 / fy))
+    assert scale / np.cbrt(x * y * 1.0 / 3) == pytest.approx(0.25)
 
 
 # ------------------------------------------------------------------ where the view goes

@@ -585,6 +585,11 @@ def test_a_click_takes_the_nearest_frustum_on_its_ray() -> None:
     assert frusta.hit_frustum(eye, np.array([1.0, 0, 0]), poses, 0.3) is None  # behind
     assert frusta.hit_frustum(eye, np.array([0.0, 1, 0]), poses, 0.3) is None
     assert frusta.hit_frustum(eye, np.array([-2.0, 0, 0]), poses[:0], 0.3) is None
+    # However near it is, within six tenths of its depth of the ray.
+    pose = orbit(0.0)
+    for aside, expected in ((0.17, 0), (0.19, None)):
+        beside = pose.position_in_world - 0.5 * pose.axis_in_world + aside * pose.world_from_camera[:3, 0]
+        assert frusta.hit_frustum(beside, pose.axis_in_world, poses[:1], 0.3) == expected
 
 
 # ---------------------------------------------------------------- following jobs
@@ -625,7 +630,20 @@ def test_a_stream_follows_a_job_to_its_end() -> None:
     until(lambda: not threads("job-a"), "the thread's end")
 
 
+def test_a_job_without_records_is_told_of_as_soon_as_it_is_known() -> None:
+    fake = FakeService()
+    job = fake.job("e")
+    stream = JobStream(Client("http://fake", transport=fake.transport), "e")
+    heard: list[bool] = []
+    stream.listeners.add(lambda: heard.append(stream.job is not None and not stream.records))
+    stream.start()
+    until(lambda: heard == [True], "the job")
+    stream.stop()
+    job.add(records(1)[0])
+
+
 def test_a_broken_stream_is_taken_up_again_without_repeats(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_stream, "_RETRY_S", 0.05)
     fake = FakeService()
     job = fake.job("b", 4)
     whole, breaks = job.events, iter([True, False])
@@ -728,7 +746,9 @@ def test_pictures_and_scenes_are_fetched_once() -> None:
         # JPEG: 2 seen.
         assert np.abs(image.reshape(-1, 3).mean(0) - render_rgb(1, matched=is_matched)).max() < 4
     assert stream.render(1, matched=False) is pose
-    assert stream.photo() is stream.photo()
+    photo = stream.photo()
+    assert photo is not None
+    assert stream.photo() is photo
     assert len(fake.asked) == len(set(fake.asked)) + 1  # the two renders have the same path
 
 

@@ -94,7 +94,7 @@ def test_the_view_is_followed_for_two_seconds(clock: Clock) -> None:
     job._scene_display.show.return_value = True
     job.sync()
     job._scene_display.show.return_value = False
-    for seconds, follows in ((1.9, True), (2.1, False)):
+    for seconds, follows in ((1.75, True), (2.0, False), (2.25, False)):
         job._scene.reset_mock()
         clock.now = 100.0 + seconds
         job.sync()
@@ -189,6 +189,7 @@ def test_another_job_begins_anew(clock: Clock) -> None:
     assert job._streams.leave.call_args.args == (before, job._on_change)
     assert job.stream is job._streams.follow.return_value
     assert job.step.clear.called
+    job._scene_display.show_photo.assert_called_once_with(None)  # it belongs to the other job
     assert job._on_change.called  # its records may be there already
     job.leave()
     assert job.stream is None
@@ -316,6 +317,11 @@ def test_a_chosen_job_or_scene_ends_following() -> None:
     found._lists.jobs = listed("c", "b")
     found.sync()
     assert found._job.stream.id == "b"
+    found._job.leave()
+    found.sync()  # the choice is kept
+    assert found._job.open.call_args.args == ("b",)
+    assert found._job.stream.id == "b"
+    found._job.leave.reset_mock()
     found.choose_scene("ball")  # the one that is shown
     assert not found._job.leave.called
     found.choose_scene("copy")
@@ -325,6 +331,23 @@ def test_a_chosen_job_or_scene_ends_following() -> None:
     found.sync()
     assert found._job.stream is None
     assert found._controls.newest.value is False
+
+
+def test_a_job_that_is_not_listed_any_more_has_a_line_above_the_others() -> None:
+    found = selection(listed("c", "b"), asked="old", shown="old", scene="ball")
+    found.sync()
+    assert found._controls.jobs.options == ("job c", "job b")  # nothing is known of it yet
+    found._job.stream.job = Mock(listed=lambda: Mock(id="old"))
+    found.sync()
+    assert found._controls.jobs.options == ("job old", "job c", "job b")
+    assert found._controls.jobs.value == "job old"
+    found._job.show_awaited_scene.assert_called_with(("ball", "copy"))
+    # One that is listed has no second line.
+    found._job.stream.job, found._job.stream.id = Mock(listed=lambda: Mock(id="b")), "b"
+    found._chosen = "b"
+    found.sync()
+    assert found._controls.jobs.options == ("job c", "job b")
+    assert found._controls.jobs.value == "job b"
 
 
 # ------------------------------------------------------------------ actions

@@ -187,6 +187,10 @@ def test_a_photo_is_shown_as_a_pinhole_with_the_steps_intrinsics_would_have_take
     assert bent.shape == RED.shape
     # Barrel distortion: what a pinhole would show in its corners is not all in the photo, its middle is.
     assert np.array_equal(bent[PHOTO.height // 2, PHOTO.width // 2], RED[0, 0])
+    assert np.array_equal(photo_of(Stream(), RECORD), RED)  # type: ignore[arg-type]
+    pinched = photo_of(stream, replace(RECORD, correction=IntrinsicsCorrection(k1=0.3)))
+    assert pinched is not None
+    assert np.array_equal(pinched[0, 0], [0, 0, 0])  # beside the photo
 
 
 def test_match_vectors_are_drawn_over_the_photo_where_there_are_matches() -> None:
