@@ -85,6 +85,35 @@ def test_a_crowded_scene_gets_a_copy_beside_and_a_burst_does_not():
     assert [run_job(table, "x", keep=True).replica for _ in range(8)] == ["b"] * 8  # until both have as many
 
 
+@pytest.mark.parametrize(("megabytes", "jobs"), [(0, 40), (100, 60), (300, 100)])
+def test_a_copy_costs_two_seconds_and_reading_twice_and_a_job_a_tenth_of_one(megabytes, jobs):
+    table = Placement(PlacementConfig())
+    for name in "ab":
+        table.add_replica(name)
+    table.expect("x", megabytes * MB)
+    run_job(table, "x")
+    # The last of these jobs finds as many before it as would take the time of a copy.
+    choices = [run_job(table, "x", keep=True) for _ in range(jobs + 2)]
+    assert [bool(choice.load) for choice in choices] == [False] * (jobs + 1) + [True]
+
+
+def test_a_scene_is_crowded_beyond_five_jobs_in_a_mean_of_some_ten():
+    """Ten jobs before each from now on: the mean is 10 (1 - 0.9^n), which is beyond 5 at the seventh."""
+    table = Placement(PlacementConfig())
+    for name in "ab":
+        table.add_replica(name)
+    run_job(table, "x")
+    for _ in range(11):
+        run_job(table, "x", keep=True)
+    table._queues.clear()
+    extra = []
+    for _ in range(7):
+        table.release("a", ("x",))
+        run_job(table, "x", keep=True)
+        extra.append(table.extra_copy("x") is not None)
+    assert extra == [False] * 6 + [True]
+
+
 def test_what_was_used_longest_ago_makes_room():
     table = placement(250, "a", w=100, x=100, y=100, z=100)
     run_job(table, "w")

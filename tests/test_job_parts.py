@@ -1,0 +1,277 @@
+"""Parts of jobs by themselves: the answer to a sequence, jobs that wait for scenes, photos on a full disk."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from memory_stores import MemoryJobStore
+from test_store_contracts import new_job, record, result
+
+from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound, SceneTooLarge, StorageFailed
+from service.jobs import photo_store, service, trajectory
+from service.jobs.live_job import LiveJob
+from service.jobs.model import Batch, Ending
+from service.jobs.photo_store import FolderPhotoStore
+from service.jobs.scene_wait import SceneWait
+from service.jobs.service import Jobs
+from service.jobs.trajectory import Trajectory
+from service.results import StageTiming, Status
+
+# ------------------------------------------------------------------ the answer to several photos
+
+
+def answer(status: Status, *, stage: str = "match", exhausted: bool = False, warnings: tuple[str, ...] = ()) -> Any:
+    """One photo's answer, whose stage takes 1 s of which half is computing."""
+    estimate = result(status).estimate
+    steps = (replace(estimate.records[0], stage=stage),)
+    timings = (StageTiming("match", 1.0, 0.5), StageTiming(stage + "!", 0.25, 0.125))
+    estimate = replace(estimate, records=steps, timings=timings, warnings=warnings, renders=3)
+    return SimpleNamespace(estimate=estimate, photo=SimpleNamespace(name="p.jpg", time_s=2.5), exhausted=exhausted)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Any:
+    made = SimpleNamespace(wall_s=0.0, cpu_s=0.0)
+    monkeypatch.setattr(trajectory, "Clock", lambda: made)
+    return made
+
+
+def test_the_last_localized_photo_is_shown_and_all_are_counted(clock):
+    found = Trajectory()
+    answers = [
+        answer(Status.UNCERTAIN, warnings=("a",)),
+        answer(Status.LOCALIZED, stage="track", warnings=("b", "a")),
+        answer(Status.NOT_LOCALIZED),
+        answer(Status.LOCALIZED),
+        answer(Status.UNCERTAIN),
+    ]
+    shown = []
+    for number, one in enumerate(answers):
+        clock.wall_s, clock.cpu_s = 2.0 * number, number
+        record = found.add(one)
+        assert (record.step.index, record.step.elapsed_s, record.step.cpu_s) == (number, 2.0 * number, number)
+        assert record.frame is not None
+        assert (record.frame.index, record.frame.name, record.frame.time_s) == (number, "p.jpg", 2.5)
+        assert record.step.stage == ("track" if number == 1 else "localize")
+        assert record.frame.tracked is (number == 1)
+        shown.append(next(i for i, each in enumerate(answers) if each.estimate is found.shown))
+    assert shown == [0, 1, 1, 3, 3]
+    clock.wall_s, clock.cpu_s = 10.0, 4.0
+    whole = found.result(None)
+    spent = {timing.stage: (timing.wall_s, timing.cpu_s) for timing in whole.estimate.timings}
+    assert spent == {"match": (5.0, 2.5), "match!": (1.0, 0.5), "track!": (0.25, 0.125)}
+    assert whole.decode == StageTiming("decode", 3.75, 0.875)  # what no stage took
+    assert whole.estimate.renders == 15
+    assert whole.estimate.warnings == ("a", "b", "3 of 5 photos were not localized.")
+    assert not whole.estimate.budget_exhausted
+    assert len(whole.frames) == 5
+
+
+def test_a_sequence_tells_that_its_budget_ended(clock):
+    found = Trajectory()
+    found.add(answer(Status.LOCALIZED))
+    found.add(answer(Status.LOCALIZED, exhausted=True))
+    whole = found.result(None)
+    assert whole.estimate.budget_exhausted
+    assert whole.estimate.warnings == ("The budget ended after 2 photos.",)
+
+
+# ------------------------------------------------------------------ jobs that wait for scenes
+
+
+class Waiting:
+    """A scene wait whose engine answers when it is told."""
+
+    def __init__(self) -> None:
+        self.took: list[tuple[Any, Any]] = []
+        self.queued: list[tuple[str, bool]] = []
+        self.released: list[str] = []
+        self.given_back: list[int] = []
+        self.cleaned: list[str] = []
+        self.store = MemoryJobStore()
+        engine: Any = SimpleNamespace(
+            hold_later=lambda asked, take: self.took.append((asked, take)), release=self.released.append
+        )
+        queue: Any = SimpleNamespace(
+            submit=lambda live, reserved: self.queued.append((live.id, reserved)),
+            release=lambda: self.given_back.append(1),
+        )
+        worker: Any = SimpleNamespace(photo_until=lambda: 5.0, clean_up=lambda live: self.cleaned.append(live.id))
+        self.wait = SceneWait(engine, queue, self.store, worker)
+
+
+@pytest.mark.parametrize("reserved", [True, False])
+def test_a_job_is_queued_once_its_scenes_are_there_or_refused(reserved):
+    waiting, held = Waiting(), SimpleNamespace(token="token")
+    for found in (held, SceneTooLarge("too large.", where="scene")):
+        live = LiveJob("j", "s")
+        waiting.wait.submit(live, ["s"], reserved=reserved)
+        assert waiting.queued == []
+        asked, take = waiting.took.pop()
+        assert asked == ["s"]
+        take(found)
+        assert (live.held, live.refused) == ((held, None) if found is held else (None, found))
+        assert waiting.queued == [("j", reserved)]
+        waiting.queued.clear()
+    assert (waiting.released, waiting.given_back) == ([], [])
+
+
+@pytest.mark.parametrize("reserved", [True, False])
+def test_of_a_job_that_was_cancelled_meanwhile_nothing_is_left(reserved):
+    waiting = Waiting()
+    for found in (SimpleNamespace(token="token"), SceneTooLarge("too large.", where="scene")):
+        live = LiveJob("j", "s")
+        waiting.wait.submit(live, None, reserved=reserved)
+        live.end()
+        waiting.took.pop()[1](found)
+    assert waiting.queued == []
+    assert waiting.released == ["token"]
+    assert len(waiting.given_back) == 2 * reserved
+
+
+def test_a_deadline_ends_the_wait(monkeypatch):
+    waiting, now = Waiting(), time.time()
+    for name, deadline in (("late", now - 1), ("early", now + 60), ("never", None)):
+        waiting.store.accept(new_job(name, deadline=deadline))
+        waiting.wait.submit(LiveJob(name, "s"), None, reserved=False)
+    waiting.wait.expire()
+    late = waiting.store.get("late")
+    assert (late.state, late.failure and late.failure.code, late.photo_until) == ("failed", "deadline_exceeded", 5.0)
+    assert waiting.cleaned == ["late"]
+    assert waiting.store.get("early").state == waiting.store.get("never").state == "queued"
+    for _, take in waiting.took:
+        take(SceneTooLarge("too large.", where="scene"))
+    waiting.queued.clear()
+    waiting.wait.expire()  # nobody waits any more
+    assert waiting.cleaned == ["late"]
+
+
+# ------------------------------------------------------------------ photos
+
+
+def test_what_can_not_be_written_leaves_no_photo(tmp_path, monkeypatch):
+    photos = FolderPhotoStore(tmp_path / "photos")
+    photos.accept("kept", b"photo")
+
+    def full(path, data):
+        path.write_bytes(data[:2])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(photo_store, "write_durably", full)
+    with pytest.raises(StorageFailed, match="No space left"):
+        photos.accept("new", b"photo")
+    photos.discard_original("kept", b"jpeg")
+    assert photos.ids() == set()
+    assert list((tmp_path / "photos").iterdir()) == []
+
+
+# ------------------------------------------------------------------ a service's jobs, without a worker
+
+
+@pytest.fixture
+def jobs() -> Any:
+    made: Any = Jobs.__new__(Jobs)
+    made._store, made._live, made._shared = MemoryJobStore(), {}, None
+    made._queue = SimpleNamespace(full=lambda: False, waiting=lambda: 7, stuck=lambda: 0)
+    made._worker = SimpleNamespace(storage_error="")
+    return made
+
+
+def test_records_are_those_of_the_newest_attempt(jobs):
+    job = jobs._store.accept(new_job("j"))
+    jobs._store.claim(job, 9e9)
+    jobs._store.append("j", 1, Batch(0, (record("stored"), record("stored", 1))))
+    job = jobs._store.get("j")
+    live = jobs._live["j"] = LiveJob("j", "s")
+    for attempt, stages in ((0, ["stored", "stored"]), (1, ["here"] * 3), (2, ["here"] * 3)):
+        live.begin(attempt)
+        for number in range(3):
+            live.add(record("here", number))
+        assert [each.step.stage for each in jobs.records(job)] == stages
+        assert len(jobs.records(job, 1)) == len(stages) - 1
+    assert (jobs.get("j").records, jobs.get("j").stage) == (3, "here")
+    live.begin(0)
+    assert (jobs.get("j").records, jobs.get("j").stage) == (2, "stored")
+    del jobs._live["j"]
+    assert jobs.get("j").records == 2
+    assert [jobs.record(job, index).step.index for index in (0, 1, None)] == [0, 1, 1]
+    with pytest.raises(JobNotReady, match="has 2 records and is running"):
+        jobs.record(job, 2)
+    jobs._store.finish("j", 1, Batch(2, ()), Ending("cancelled"), None)
+    with pytest.raises(RecordNotFound):
+        jobs.record(jobs._store.get("j"), 2)
+    with pytest.raises(JobNotReady, match="is cancelled"):
+        jobs.result(jobs._store.get("j"))
+    with pytest.raises(JobNotFound):
+        jobs.result(SimpleNamespace(state="succeeded", id="j"))
+
+
+def test_a_share_of_the_queue_counts_the_clients_own_jobs_that_wait(jobs):
+    for number in range(3):
+        jobs._store.accept(new_job(f"j{number}", client="a", idempotency_key=f"k{number}"))
+    jobs.require_queue_capacity("a", 4, None)
+    jobs.require_queue_capacity("a", None, None)
+    jobs.require_queue_capacity("b", 1, None)
+    with pytest.raises(QueueFull, match="3 jobs of this key"):
+        jobs.require_queue_capacity("a", 3, None)
+    jobs.require_queue_capacity("a", 3, "k1")  # a repeated request
+    jobs._queue.full = lambda: True
+    jobs.require_queue_capacity("a", 3, "k1")
+    with pytest.raises(QueueFull, match="full: 7 jobs"):
+        jobs.require_queue_capacity("b", None, "k1")
+
+
+def test_two_stuck_workers_are_a_problem_and_a_full_disk_is(jobs):
+    assert jobs.problems() == []
+    jobs._queue.stuck = lambda: 1
+    assert jobs.problems() == []
+    jobs._queue.stuck = lambda: 2
+    assert jobs.problems() == ["2 workers are stuck: restart the service."]
+    jobs._worker.storage_error = "The disk is full."
+    assert [problem[:17] for problem in jobs.problems()] == ["2 workers are stu", "The disk is full."]
+
+
+def test_who_asks_for_a_job_that_another_front_has_follows_it(jobs):
+    job = jobs._store.accept(new_job("j"))
+    assert jobs.live(job) is None
+    followed = LiveJob("j", "s")
+    jobs._shared = SimpleNamespace(follow=lambda job: followed)
+    assert jobs.live(job) is followed
+    own = jobs._live["j"] = LiveJob("j", "s")
+    assert jobs.live(job) is own
+    del jobs._live["j"]
+    jobs._store.end_queued(job, Ending("cancelled"), None)
+    assert jobs.live(jobs._store.get("j")) is None
+
+
+def test_only_an_ended_job_is_deleted_with_its_photo(jobs):
+    deleted: list[str] = []
+    jobs._photos = SimpleNamespace(delete=deleted.append)
+    job = jobs._store.accept(new_job("j"))
+    with pytest.raises(JobNotReady, match="is queued"):
+        jobs.delete(job)
+    assert deleted == []
+    jobs._store.end_queued(job, Ending("cancelled"), None)
+    jobs.delete(job)
+    jobs.delete(job)  # somebody else was quicker
+    assert deleted == ["j", "j"]
+
+
+def test_leases_are_renewed_three_times_before_they_end(jobs, monkeypatch):
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(service, "time", clock)
+    renewed: list[tuple[Any, float]] = []
+    jobs._store = SimpleNamespace(renew=lambda running, until: renewed.append((running, until)), now=lambda: 1000.0)
+    jobs._config, jobs._renew_at = SimpleNamespace(lease_s=30.0), 0.0
+    jobs._worker.running = set()
+    jobs._renew()
+    jobs._worker.running = {("j", 1)}
+    for now, count in ((109.9, 0), (110.0, 1), (119.9, 1), (120.1, 2)):
+        clock.now = now
+        jobs._renew()
+        assert len(renewed) == count
+    assert renewed[0] == ((("j", 1),), 1030.0)
