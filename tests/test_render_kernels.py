@@ -6,6 +6,7 @@ test_rasterizers.py compares the compiled ones, on scenes so large that a few pi
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,6 @@ from test_rasterizers import lens, make_camera, make_scene, numeric_generator, r
 
 from service.render import cpu, pack
 from service.render.cpu import CpuRasterizer, dilation_for
-from service.types import Camera, GaussianScene
 
 project = plain("service.render.project")
 blend = plain("service.render.blend")
@@ -80,3 +80,65 @@ def test_every_gradient_equals_autograd(degree: int, antialiased: bool) -> None:
         full[ours.index] = getattr(ours, name)
         assert relative(full, leaf.grad) < 1e-4, name
     assert relative(renderer.pose_gradient(camera, d_rgb, d_depth, d_alpha), twist.grad) < 1e-4
+
+
+# ------------------------------------------------------------------ what is left out
+
+
+def test_spheres_are_in_view_if_they_reach_into_the_enlarged_frustum() -> None:
+    """By the planes' unit normals; left and right, top and bottom differ, and the camera is turned and moved."""
+    rng = np.random.default_rng(1)
+    view = make_camera(seed=4).pose.camera_from_world[:3].ravel()
+    low_x, high_x, low_y, high_y, near = 0.9, 0.5, 0.3, 0.7, 0.2
+    normals = np.array([[1, 0, -high_x], [-1, 0, -low_x], [0, 1, -high_y], [0, -1, -low_y]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    counts = [0, 0]
+    for centre, radius in zip(rng.uniform(-3, 3, (400, 3)), rng.uniform(0.05, 1.0, 400), strict=True):
+        local = view.reshape(3, 4) @ np.append(centre, 1)
+        right = bool(local[2] + radius >= near and np.all(normals @ local < radius))
+        assert project.in_view(np.append(centre, radius), view, low_x, high_x, low_y, high_y, near) == right
+        counts[right] += 1
+    assert min(counts) > 50
+    straight = np.eye(4)[:3].ravel()
+    assert project.in_view([0, 0, 0.1, 0.1], straight, 1, 1, 1, 1, 0.2)  # it ends at the near plane
+    assert not project.in_view([0, 0, 0.1, 0.099], straight, 1, 1, 1, 1, 0.2)
+    slopes = (0.75, 0.75, 0.75, 0.75)
+    for x, y in ((2.0, 0), (-2.0, 0), (0, 2.0), (0, -2.0)):  # 2 - 0.75 = 1.25: touches a side plane from outside
+        assert not project.in_view([x, y, 1.0, 1.0], straight, *slopes, 0.0)
+        assert project.in_view([x, y, 1.0, 1.001], straight, *slopes, 0.0)
+
+
+def test_a_block_is_hidden_behind_all_tiles_that_its_box_may_reach_and_one_more() -> None:
+    view, pinhole = np.eye(4)[:3].ravel(), (100.0, 80.0, 20.0, 30.0)
+    sphere = [2.5, -0.5, 5.0, 1.0]
+    # x 1.5 to 3.5 of depth 4 to 6: 45 to 107.5 px, tiles 2.8 to 6.7; y -1.5 to 0.5: 0 to 40 px, tiles 0 to 2.5.
+    columns, rows = range(1, 8), range(0, 4)
+    open_tiles = set()
+    for tile in range(10 * 6):
+        depths = np.full(60, 3.9)
+        depths[tile] = 4.0
+        if not project.block_hidden(sphere, view, pinhole, 0.01, 10, 6, depths):
+            open_tiles.add((tile % 10, tile // 10))
+    assert open_tiles == {(x, y) for x in columns for y in rows}
+    assert project.block_hidden(sphere, view, pinhole, 3.99, 10, 6, np.full(60, 3.9))
+    assert not project.block_hidden(sphere, view, pinhole, 4.0, 10, 6, np.full(60, 3.9))  # it reaches the near plane
+    turned = make_camera(seed=4).pose.camera_from_world
+    centre = np.linalg.inv(turned) @ [2.5, -0.5, 5.0, 1.0]
+    for tile, is_hidden in (((7, 3), False), ((8, 3), True), ((7, 4), True), ((1, 0), False), ((0, 0), True)):
+        depths = np.full(60, 3.9)
+        depths[tile[0] + 10 * tile[1]] = 4.1
+        found = project.block_hidden([*centre[:3], 1.0], turned[:3].ravel(), pinhole, 0.01, 10, 6, depths)
+        assert found == is_hidden
+
+
+def test_a_far_block_takes_no_part_and_a_hidden_gaussian_none_either() -> None:
+    """In front of a wall beyond which nothing shows, what is nearer is drawn as without the wall."""
+    scene, camera = make_scene(70), make_camera(21, 18)
+    z = scene.means @ camera.pose.camera_from_world[2, :3] + camera.pose.camera_from_world[2, 3]
+    depth = float(np.median(z[z > 0.1]))
+    fewer = {n: getattr(scene, n)[z <= depth] for n in PARAMETERS}
+    wall = np.full((2, 2), depth, np.float32)
+    frame = CpuRasterizer(scene).render([camera], occlusion_depths=[wall])[0]
+    truth = render_reference(replace(scene, **fewer), camera)
+    assert worst(frame.rgb, truth.rgb) < 1e-5
+    assert worst(frame.rgb, render_reference(scene, camera).rgb) > 0.01
