@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plain_kernels import plain
 
-from service.geometry import se3_exp, so3_exp
+from service.geometry import so3_exp
 
 p3p = plain("service.pose.absolute_pose.p3p")
 ransac = plain("service.pose.absolute_pose.ransac")
@@ -140,7 +140,7 @@ def test_a_pose_from_distances_along_rays(seed: int) -> None:
 
 
 def distances_by_grunert(rays: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """All distances of three points (Grunert 1841, as in Haralick et al., IJCV 1994, equation 9): roots of a quartic."""
+    """All distances of three points, by roots of a quartic (Grunert 1841, as in Haralick et al., IJCV 1994)."""
     a, b, c = (np.linalg.norm(points[i] - points[j]) ** 2 for i, j in ((1, 2), (0, 2), (0, 1)))
     cosa, cosb, cosg = (rays[i] @ rays[j] for i, j in ((1, 2), (0, 2), (0, 1)))
     q, s = (a - c) / b, (a + c) / b
