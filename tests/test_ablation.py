@@ -23,6 +23,7 @@ from service.localize import Request, localize
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.match_stages import MATCHING, solve_matches_near
+from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.render import cpu
 from service.results import PoseEstimate
 from service.types import Camera, Intrinsics, Pose, Query, SceneInfo
@@ -32,6 +33,8 @@ LENS = Intrinsics(512, 384, 500.0, 500.0, 256.0, 192.0)
 
 def test_each_part_is_removed_by_another_value() -> None:
     parts = removals()
+    floors = parts["local colour correlation"].config.verification.model.floors
+    assert set(SHIPPED_MODEL.floors) - set(floors) == {"local_colour_correlation"}
     assert parts.pop("nothing") == Removal()
     assert all(removal != Removal() for removal in parts.values())
     assert len({repr(removal) for removal in parts.values()}) == len(parts)
@@ -113,6 +116,7 @@ def test_the_table_has_a_line_a_part_and_counts_what_is_false() -> None:
     ]  # fmt: skip
     lines = table(rows).splitlines()
     assert len(lines) == 4
+    assert len({line.count("|") for line in lines}) == 1  # else it is no table
     assert lines[3] == "| alignment |" + " 3 / 2 |" * len(CONDITIONS) + " 1 | 99 |"
 
 
@@ -151,29 +155,41 @@ def planted(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
     return seen
 
 
-def test_every_part_answers_every_condition_of_every_scene(planted: SimpleNamespace) -> None:
+def test_every_part_answers_every_condition_of_every_scene(
+    planted: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     parts = ["nothing", "render and rematch", "estimation of the focal length", "scaled dilation"]
-    folders = [Path("a"), Path("b")]
+    folders = [Path("a"), Path("b"), Path("c")]
+    now = [0.0]
+
+    def later() -> float:
+        now[0] += 1.0
+        return now[0]
+
+    # Each localization takes a second of processor time.
+    monkeypatch.setattr(ablation, "time", SimpleNamespace(perf_counter=lambda: 0.0, process_time=later))
     rows = run(folders, parts=parts, progress=lambda *now: planted.progress.append(now))
     assert [(row["part"], row["condition"]) for row in rows] == [(part, each) for part in parts for each in CONDITIONS]
-    assert all(row["photos"] == 4 for row in rows)
+    assert all(row["photos"] == 6 for row in rows)
     for row in rows:
         # Half a normalized unit a scene unit: 0.02 units are right, but not within 0.01.
-        right = 2 if row["part"] == "render and rematch" else 4
+        right = 3 if row["part"] == "render and rematch" else 6
         assert (row["success_5deg_0p05"], row["success_1deg_0p01"]) == (right, 0)
-        assert row["false_localized"] == 4 - right
-        assert 0 <= row["cpu_ms_p50"] < 1000
+        assert row["false_localized"] == 6 - right
+        assert row["cpu_ms_p50"] == 1000
     count = len(CONDITIONS)
-    assert planted.progress == [(done, 2 * count) for done in range(1, 2 * count + 1)]
+    assert planted.progress == [(done, 3 * count) for done in range(1, 3 * count + 1)]
     # The next scene's photos hide those of each, and those of the first hide the last one's.
-    assert [occluders for occluders, _, _ in planted.occluders] == ["b"] * count + ["a"] * count
+    assert [occluders for occluders, _, _ in planted.occluders] == [*"b" * count, *"c" * count, *"a" * count]
+    # Before the photos, and so without its time in theirs.
+    assert set(planted.prepared) == {(name, cameras) for name in "abc" for cameras in ("given", "ignored")}
     assert [modify for _, modify, _ in planted.occluders[:count]] == list(CONDITIONS.values())
-    assert [cameras for _, _, cameras in planted.occluders] == [*["given"] * (count - 1), "ignored"] * 2
+    assert [cameras for _, _, cameras in planted.occluders] == [*["given"] * (count - 1), "ignored"] * 3
     # The focal length is approximate in its own condition, but for the part that takes it as exact.
     approximate = [i for i, (_, trust, _) in enumerate(planted.asked) if trust == "approximate"]
     first = list(CONDITIONS).index("focal 5 % off") * len(parts) * 2
     assert approximate[:6] == [first, first + 1, first + 2, first + 3, first + 6, first + 7]
-    assert len(approximate) == 12
+    assert len(approximate) == 18
     # Without scaled dilation a render of a fifth of the size has the training photos'.
     assert len(set(planted.scaled[:6])) == 1
     assert set(planted.scaled[6:8]) == {cpu.DEFAULTS.dilation_px2} != set(planted.scaled[:6])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,7 @@ from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, folder_of, poses
 from service.bench import field, field_queries
 from service.bench import localize as bench
 from service.bench.bench_photos import BenchPhoto
-from service.bench.field_queries import FieldQuery, Sent, decoded, send
+from service.bench.field_queries import LONG_SIDE, FieldQuery, Sent, decoded, send
 from service.bench.field_random import random_row
 from service.bench.field_rows import TOLD, Row, all_rows, chosen_rows
 from service.bench.field_table import chi_square_6, outcome_of, summary, table
@@ -378,6 +379,22 @@ class TestWhatIsSent:
         assert centred is not None
         assert (centred.cx, centred.cy) == (truth.width / 2, truth.height / 2)
 
+    @pytest.mark.parametrize(
+        ("long_side", "expected"),
+        [(LONG_SIDE - 2, LONG_SIDE - 2), (LONG_SIDE, LONG_SIDE), (LONG_SIDE + 400, LONG_SIDE)],
+    )
+    def test_a_photo_is_decoded_at_the_size_that_is_sent(self, tmp_path, long_side, expected):
+        pixels = np.full((60, long_side, 3), 51, np.uint8)
+        Image.fromarray(pixels).save(tmp_path / "a.png")
+        lens = Intrinsics(long_side, 60, 900.0, 900.0, long_side / 2, 30.0)
+        photo = decoded(BenchPhoto("a.png", tmp_path / "a.png", Camera(lens, poses()[1])), (0, 0, 0))
+        assert photo.rgb.shape[1] == photo.intrinsics.width == expected
+        assert photo.intrinsics.fx == pytest.approx(900 * expected / long_side)
+        # 0 to 1, and not resampled where it is small enough.
+        assert np.abs(photo.rgb - 0.2).max() < 1e-6
+        if long_side == expected:
+            assert photo.intrinsics == lens
+
     def test_a_distorted_photo_stays_as_it_is(self, tmp_path):
         plain = photo_file(tmp_path / "a.png")
         lens = Intrinsics(240, 180, 200.0, 200.0, 120.0, 90.0, "SIMPLE_RADIAL", (-0.08,))
@@ -494,16 +511,55 @@ class TestRun:
         assert field.read_results(self.spec(tmp_path)) == whole
 
     def test_each_modified_scene_is_loaded_once(self, tmp_path, answers, monkeypatch):
-        loaded = []
+        loaded, prepared = [], []
+
+        class Loaded(FakeLoaded):
+            def prepare(self, estimator):
+                prepared.append((self.scene.info.sha256, estimator))
 
         def load(scene, **_):
             loaded.append(scene.info.sha256)
-            return FakeLoaded(scene, FakeRasterizer(), FakeMatcher())
+            return Loaded(scene, FakeRasterizer(), FakeMatcher())
 
         monkeypatch.setattr(bench.LoadedScene, "of", load)
         field.run(self.spec(tmp_path, "scene/dark=0.5", "scene/warm=1", "lens/told"))
         assert len(loaded) == len(set(loaded)) == 3
         assert [sha.partition("-")[2] for sha in loaded] == ["", "dark=0.5-0", "warm=1-0"]
+        assert prepared == [(sha, "view_index") for sha in loaded]
+
+    def test_a_line_is_on_the_disk_before_the_next_query(self, tmp_path, answers, monkeypatch):
+        """A run takes days: neither its own end nor the machine's loses what is done."""
+        file = tmp_path / "out" / "s.jsonl"
+        seen, synced = [], []
+        own = field.answer
+
+        def answer(*query):
+            seen.append(len(file.read_text().splitlines()) if file.exists() else 0)
+            return own(*query)
+
+        monkeypatch.setattr(field, "answer", answer)
+        monkeypatch.setattr(field.os, "fsync", lambda number: synced.append(len(file.read_text().splitlines())))
+        field.run(self.spec(tmp_path, "lens/told"))
+        assert seen == [0, 0, 1]  # the first one is answered twice
+        assert synced == [1, 2]
+
+    @pytest.mark.parametrize(("count", "names"), [(1, "0"), (2, "04"), (3, "025"), (7, "0123456"), (8, "01234567"),
+                                                  (None, "01234567")])  # fmt: skip
+    def test_fewer_photos_are_spread_evenly(self, tmp_path, count, names):
+        photos = tuple(BenchPhoto(str(k), tmp_path, Camera(LENS, poses()[0])) for k in range(8))
+        spec = field.FieldSpec({}, chosen_rows(["lens/told"]), tmp_path, photos=count)
+        found = list(field.queries("s", SimpleNamespace(photos=photos), spec))
+        assert "".join(query.photo.name for query in found) == names
+
+    def test_random_combinations_hide_parts_only_where_there_is_something_to_hide_them_with(self, tmp_path):
+        photos = tuple(BenchPhoto(str(k), tmp_path, Camera(LENS, poses()[0])) for k in range(8))
+        spec = field.FieldSpec({}, (), tmp_path, random=60)
+        without = list(field.queries("s", SimpleNamespace(photos=photos), spec))
+        with_others = list(field.queries("s", SimpleNamespace(photos=photos), replace(spec, occluders=tmp_path)))
+        assert [query.number for query in with_others] == list(range(60))
+        hidden = {query.number for query in with_others if query.row.needs_occluders}
+        assert 0 < len(hidden) < 60
+        assert [query.number for query in without] == [number for number in range(60) if number not in hidden]
 
     def test_random_combinations_come_after_the_rows(self, tmp_path, answers):
         more = replace(self.spec(tmp_path, "lens/told"), random=6, occluders=tmp_path / "s" / "images")
@@ -579,3 +635,58 @@ class TestAnswerable:
     def test_a_wrong_answer_is_wrong_though_nobody_could_answer(self, monkeypatch, tmp_path):
         found, starts, _ = self.answered(monkeypatch, tmp_path, Status.LOCALIZED, 1.0, None)
         assert (len(starts), outcome_of(found)) == (1, "wrong")
+
+    @pytest.mark.parametrize(("off", "stays"), [(0.04, True), (0.06, False)])
+    def test_near_means_within_the_bounds_of_a_success(self, monkeypatch, tmp_path, off, stays):
+        units = bench.load_bench_scene(folder_of(tmp_path / "t", "nerfstudio")).units.units_per_scene_unit
+        found, *_ = self.answered(monkeypatch, tmp_path, Status.UNCERTAIN, 1.0, off / units)
+        assert found["home"]["stays"] is stays
+        assert found["home"]["translation_units"] == pytest.approx(off)
+        monkeypatch.setattr(self, "OFF", np.array([0, 0, np.radians(100 * off), 0, 0, 0]))  # 4 and 6 degrees
+        found, *_ = self.answered(monkeypatch, tmp_path / "t", Status.UNCERTAIN, 1.0, 1.0)
+        assert found["home"]["stays"] is stays
+
+    def test_a_line_has_times_and_uncertainties_in_their_units(self, monkeypatch):
+        """Planted: a clock whose wall time is twice the processor's, and a covariance of known deviations."""
+        sigma = np.array([0.01, 0.02, 0.02, 0.3, 0.6, 0.6])
+        verdict = Verdict(Status.UNCERTAIN, Reason.FEW_INLIERS, 0.3, 10, 0.5, 1.0, np.diag(sigma**2))
+        truth = Camera(replace(LENS, model="SIMPLE_RADIAL", distortion=(-0.05,), fy=LENS.fx), poses()[1])
+        lens = replace(truth.intrinsics, fx=210.0, fy=210.0, distortion=(-0.08,))
+        answer = PoseEstimate(truth.pose, verdict, lens, "given", "s", "0", "f", "f", "f", 0, False, 0, (), (), ())
+        now = [0.0]
+
+        def later(read, loaded, request):
+            now[0] += 3.0
+            return answer
+
+        clock = SimpleNamespace(perf_counter=lambda: 2 * now[0], process_time=lambda: now[0])
+        monkeypatch.setattr(field_queries, "time", clock)
+        monkeypatch.setattr(field_queries, "localize", later)
+        monkeypatch.setattr(field_queries, "send", lambda *_: Sent(b"", None, truth))
+        monkeypatch.setattr(field_queries, "read_query", lambda *_, **__: now.__setitem__(0, now[0] + 1.0))
+        one = SimpleNamespace(background_rgb=(0, 0, 0), loaded=None, units=Units(np.zeros(3), 0.5, False))
+        query = FieldQuery(Row("lens/x", "told"), SimpleNamespace(name="a"))
+        monkeypatch.setattr(field_queries, "home", lambda one, sent, exact: exact)
+
+        def line():
+            return field_queries.answer(one, None, query, 0, bench.Request())
+
+        found = line()
+        # Decoding counts.
+        assert (found["latency_ms"], found["cpu_ms"]) == (8000.0, 4000.0)
+        assert found["sigma_deg"] == pytest.approx(np.degrees(0.03))
+        assert found["sigma_units"] == pytest.approx(0.45)
+        assert found["focal_error"] == pytest.approx(0.05)
+        assert found["true_k1"] == -0.05
+        assert found["k1_error"] == pytest.approx(-0.03)
+        assert found["home"] is False
+        # Without a covariance, and of a fisheye, whose coefficients are others.
+        fisheye = replace(lens, model="OPENCV_FISHEYE", distortion=(0.1, 0.0, 0.0, 0.0))
+        answer = replace(answer, verdict=replace(verdict, covariance=None), intrinsics=fisheye)
+        found = line()
+        assert found["sigma_deg"] is found["sigma_units"] is found["k1_error"] is found["nees"] is None
+        assert found["true_k1"] == -0.05
+        answer = replace(answer, intrinsics=replace(LENS))
+        assert line()["k1_error"] == pytest.approx(0.05)  # a pinhole has none
+        truth = replace(truth, intrinsics=fisheye)
+        assert line()["k1_error"] is line()["true_k1"] is None
