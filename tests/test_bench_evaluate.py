@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from service.bench.evaluate import evaluated, photo_errors
+from service.bench.evaluate import PhotoError, evaluated, photo_errors, summary
 from service.bench.pose_files import PhotoPose, read_names, read_pose_file
 from service.cli.app import app
 from service.errors import CorruptScene, InvalidRequest
-from service.geometry import quat_from_rotation, so3_exp
+from service.geometry import moved, quat_from_rotation, so3_exp
 from service.types import Pose
 
 FILES = Path(__file__).parent / "data" / "hloc"
@@ -57,6 +57,27 @@ def test_metres_and_units_scale_the_bounds(tmp_path: Path) -> None:
     within = [e["answered"] and e["translation_m"] < 0.25 and e["rotation_deg"] < 5 for e in scaled["per_photo"]]
     assert coarse == {"units": 0.05, "deg": 5.0, "share": np.mean(within)}
     assert 0 < fine["share"] < coarse["share"]
+
+
+def test_a_photo_is_within_bounds_if_both_errors_are_smaller() -> None:
+    """Of 5 m and 10 degrees, hloc's coarsest bounds; translations are in units of half a metre."""
+    errors = [(9.9, 9.9), (10.0, 9.9), (9.9, 10.0), (10.1, 1.0), (1.0, 10.1)]
+    found = summary([PhotoError(str(k), *error, True) for k, error in enumerate(errors)], 0.5, None)
+    assert found["recall"][-1] == {"m": 5.0, "deg": 10.0, "share": 1 / 5}
+    assert [row["m"] for row in found["recall"]] == [0.01, 0.02, 0.03, 0.05, 0.25, 0.5, 5.0]
+    assert [row["deg"] for row in found["recall"]] == [1, 2, 3, 5, 2, 5, 10]
+    assert found["median_translation_m"] == pytest.approx(4.95)
+
+
+def test_without_a_list_beside_it_all_of_the_truth_counts(tmp_path: Path) -> None:
+    (tmp_path / "truth").mkdir()
+    known = poses()
+    there = written("7scenes", known, tmp_path / "truth")
+    found = evaluated(written("truth", known[:2], tmp_path), there, metres_per_unit=4.0)
+    assert (found["photos"], found["answered"], found["photos_of"]) == (len(known), 2, there.name)
+    shifted = [replace(one, pose=moved(one.pose, np.array([0, 0, 0, 0.5, 0, 0]))) for one in known]
+    found = evaluated(written("truth", shifted, tmp_path), there, metres_per_unit=4.0)
+    assert [row["translation_m"] for row in found["per_photo"]] == pytest.approx([2.0] * len(known))
 
 
 def written(kind: str, known: list[PhotoPose], folder: Path) -> Path:
@@ -141,9 +162,13 @@ def test_names_with_other_folders_and_suffixes_are_found_if_only_one_fits() -> N
 
 def test_trajectories_are_compared_by_time() -> None:
     known = [replace(one, name="") for one in poses(3)]
-    moved = [replace(one, time_s=one.time_s + 0.005) for one in known if one.time_s]
-    assert [e.translation for e in photo_errors(moved, known)] == [0, 0, 0]
-    late = [replace(one, time_s=one.time_s + 9.0) for one in moved if one.time_s]
+    shifted = [replace(one, time_s=one.time_s + 0.005) for one in known if one.time_s]
+    assert [e.translation for e in photo_errors(shifted, known)] == [0, 0, 0]
+    # As TUM's tools: up to 20 ms.
+    for seconds, near in ((0.019, True), (-0.019, True), (0.021, False)):
+        beside = [replace(known[0], time_s=known[0].time_s + seconds), *known[1:]]  # type: ignore[operator]
+        assert [e.answered for e in photo_errors(beside, known)] == [near, True, True]
+    late = [replace(one, time_s=one.time_s + 9.0) for one in shifted if one.time_s]
     with pytest.raises(InvalidRequest, match=r"no two times.*109.005 and 100.000"):
         photo_errors(late, known)
     with pytest.raises(InvalidRequest, match="names and the other one times"):

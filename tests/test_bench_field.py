@@ -13,7 +13,7 @@ import pytest
 from PIL import ExifTags, Image
 from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, folder_of, poses
 
-from service.bench import field, field_queries
+from service.bench import capture_modifications, field, field_queries
 from service.bench import localize as bench
 from service.bench.bench_photos import BenchPhoto
 from service.bench.field_queries import LONG_SIDE, FieldQuery, Sent, decoded, send
@@ -161,6 +161,7 @@ class TestCapture:
         assert light[60, 80] == pytest.approx(1.0, abs=0.01)
         # half of the radius: a quarter of the loss
         assert light[30, 40] == pytest.approx(0.85, abs=0.01)
+        assert np.abs(light - light[::-1, ::-1]).max() < 1e-6  # about the image's middle
 
     def test_local_light_has_smooth_regions_and_one_hard_edge(self):
         light = np.log(linear(modify(grey(value=0.3), ["local_light=0.6"], np.random.default_rng(1))))
@@ -171,6 +172,57 @@ class TestCapture:
         assert steps.max() > 0.4
         assert np.median(steps) < 0.02
         assert 0 < (steps > 0.4).any(1).mean() <= 1
+
+    def test_each_light_and_the_shadow_are_where_and_what_they_are_drawn_to_be(self):
+        """All that is random is planted: one region a quarter of the long side right of the middle, others far away."""
+        away = [np.array([50.0, 50.0]), 0.15, np.zeros(3)]
+        region = [np.array([0.25, -0.1]), 0.2, np.array([1.0, 0.0, -1.0])]
+
+        def light_of(drawn: list, long_side: int) -> np.ndarray:
+            rng = SimpleNamespace(uniform=lambda *bounds: drawn.pop(0))
+            photo = grey(long_side * 3 // 4, long_side, 0.4)
+            return np.log(linear(capture_modifications.local_light(photo, 0.2, rng)) / linear(photo))  # type: ignore[arg-type]
+
+        no_shadow = [0.0, 9.0]
+        for long_side in (160, 320):
+            light = light_of([*region, *away, *away, *away, *no_shadow], long_side)
+            column, row, step = round(0.75 * long_side), round((0.375 - 0.1) * long_side), round(0.2 * long_side)
+            # One and the other end of the colours' range; at one radius exp(-1 / 2) of it is left.
+            assert light[row, column] == pytest.approx([0.26, 0.2, 0.14], rel=0.01)
+            for at in ((row, column - step), (row + step, column)):
+                assert light[at] == pytest.approx(np.array([0.26, 0.2, 0.14]) * np.exp(-0.5), rel=0.03)
+            # The second and the fourth one are darker.
+            for order in ([away, region, away, away], [away, away, away, region]):
+                darker = light_of([*(value for each in order for value in each), *no_shadow], long_side)
+                assert np.abs(darker + light).max() < 1e-4
+        # A shadow in a direction 30 degrees below x, from a tenth of the long side on: bluish.
+        light = light_of([*away, *away, *away, *away, np.radians(30), 0.1], 160)
+        y, x = (np.mgrid[:120, :160] + 0.5 - np.array([60, 80])[:, None, None]) / 160
+        beyond = np.cos(np.radians(30)) * x + 0.5 * y - 0.1
+        assert light[beyond > 0.01] == pytest.approx(
+            np.tile([-0.22, -0.2, -0.18], ((beyond > 0.01).sum(), 1)), abs=1e-4
+        )
+        assert np.abs(light[beyond < -0.01]).max() < 1e-6
+
+    def test_shadows_fall_in_all_directions(self):
+        drawn = []
+        real = np.random.default_rng(0)
+
+        def uniform(low, high, size=None):
+            drawn.append((low, high))
+            return real.uniform(low, high, size)
+
+        capture_modifications.local_light(grey(), 0.2, SimpleNamespace(uniform=uniform))  # type: ignore[arg-type]
+        assert drawn[-2] == (0, pytest.approx(2 * np.pi))
+
+    def test_motion_is_in_the_direction_that_is_drawn(self):
+        dot = grey(value=0.0)
+        dot.rgb[60, 80] = 1.0
+        rng = SimpleNamespace(uniform=lambda *bounds: np.radians(30))
+        smeared = capture_modifications.motion_blur(dot, 80.0, rng).rgb[..., 0]  # type: ignore[arg-type]
+        rows, columns = np.nonzero(smeared > 1e-4)
+        covariance = np.cov(columns, rows, aweights=smeared[rows, columns])
+        assert np.degrees(np.arctan2(*np.linalg.eigh(covariance)[1][::-1, 1]) % np.pi) == pytest.approx(30, abs=3)
 
     def test_a_cast_keeps_the_mean_of_the_logarithms(self):
         logs = np.log(linear(modify(grey(), ["colour_cast=0.3"], RNG)) / linear(grey()))[0, 0]

@@ -167,6 +167,28 @@ def test_photos_of_the_size_that_is_used_in_training(tmp_path: Path) -> None:
     assert photo.camera.intrinsics.fx == pytest.approx(900)
 
 
+@pytest.mark.parametrize(("widths", "chosen"), [((800, 799), 800), ((799, 700), 799), ((2000, 801, 300), 801)])
+def test_a_size_of_800_pixels_is_enough(widths: tuple[int, ...], chosen: int, tmp_path: Path) -> None:
+    np.save(tmp_path / "poses_bounds.npy", np.load(llff(tmp_path / "other") / "poses_bounds.npy"))
+    for width in widths:
+        pictures(tmp_path / f"images_{width}", [f"{i:03d}.png" for i in range(COUNT)], width, width * 3 // 4)
+    # More photos than poses, or none, belong to something else.
+    pictures(tmp_path / "images_more", [f"{i:03d}.png" for i in range(COUNT + 1)], 810, 600)
+    (tmp_path / "images_none").mkdir()
+    photo = read_data_set(tmp_path).test[1]
+    assert photo.path.parent.name == f"images_{chosen}"
+    lens = photo.camera.intrinsics
+    # The principal point is the image's middle.
+    assert (lens.cx, lens.cy) == (pytest.approx(lens.width / 2), pytest.approx(lens.height / 2, abs=0.5))
+
+
+@pytest.mark.parametrize("marker", ["truth.json", "scene.json"])
+def test_a_scene_is_known_by_either_of_its_files(marker: str, tmp_path: Path) -> None:
+    llff(tmp_path)
+    (tmp_path / marker).write_text("{}")
+    assert detect_layout(tmp_path) == "scene"
+
+
 def test_nerfstudio_without_lists_trains_on_nine_tenths(tmp_path: Path) -> None:
     folder = nerfstudio(tmp_path)
     file = json.loads((folder / "transforms.json").read_text())
