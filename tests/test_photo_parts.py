@@ -267,6 +267,8 @@ def test_a_photo_is_converted_band_by_band(monkeypatch):
     assert found.valid_mask is not None
     assert found.valid_mask.sum() == 60 * 80
     assert found.warnings[0] == "Transparent parts of the photo are ignored."
+    for plain in (read_query(stream.getvalue()), open_photo(stream.getvalue()).query()):
+        assert plain.rgb[60, 0].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize(("scans", "read"), [(24, True), (25, False)])
