@@ -20,6 +20,7 @@ from service.bench.datasets import LAYOUTS
 from service.bench.field_queries import FieldQuery, decoded, send
 from service.bench.field_random import random_row
 from service.bench.field_rows import TOLD, Row
+from service.bench.fleet_simulation import FLEETS
 from service.bench.gpu import LIMIT_S, PARTS
 from service.bench.gpu_shared import FULL
 from service.bench.modifications import MODIFICATIONS, require_modifications
@@ -192,6 +193,19 @@ def test_the_gpu_bench_measures_what_its_table_says() -> None:
 
 
 # ------------------------------------------------------------------ the service
+
+
+def test_the_simulated_fleets_are_those_of_the_table() -> None:
+    found = [(each.replicas, each.scenes, each.failures_per_hour) for each in FLEETS]
+    assert found == [
+        tuple(float(cell.replace(",", "")) for cell in row[:3]) for row in rows_of("scale.md", "replicas | scenes |")
+    ]
+    # The text above it; a hundred replicas are simulated for less time, since that takes longer.
+    small, *others = FLEETS
+    assert (small.scenes_in_memory, {each.scenes_in_memory for each in others}) == (4, {20})
+    assert {(each.utilization, each.service_s, each.load_s, each.zipf) for each in FLEETS} == {(0.6, 0.11, 4.0, 1.0)}
+    seconds = [each.jobs * each.service_s / each.replicas / each.utilization for each in FLEETS if each.replicas == 100]
+    assert {round(each) for each in seconds} == {37}
 
 
 def test_priors_of_a_lens_are_as_wide_as_the_api_says() -> None:

@@ -6,6 +6,7 @@ import colorsys
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from fake_service import FakeService
@@ -13,6 +14,7 @@ from pydantic import ValidationError
 
 from service import multi_scene
 from service.client import Client
+from service.coverage import plan_drawing
 from service.geometry import look_at, moved
 from service.interfaces import Features
 from service.lenses.lens_estimate import LensEstimate, LensMeasurement, Viewpoint, updated
@@ -321,7 +323,8 @@ def test_each_colour_has_the_hue_that_its_meaning_suggests() -> None:
     named += [(colours.INLIER_COLOUR, 120), (colours.OUTLIER_COLOUR, 0), (colours.TRAINING_COLOUR, 217)]
     for colour, hue in named:
         assert abs((_hue_and_saturation(colour)[0] - hue + 180) % 360 - 180) <= 20, (colour, hue)
-        assert _hue_and_saturation(colour)[1] > 0.5
+        # Vivid but for training cameras, which are many.
+        assert _hue_and_saturation(colour)[1] > (0.5 if colour == colours.TRAINING_COLOUR else 0.66)
     for grey in (colours.INITIAL_COLOUR, colours.UNKNOWN_COLOUR, colours.TRUTH_COLOUR):
         assert _hue_and_saturation(grey)[1] == 0
         assert 100 <= min(grey) <= max(grey) <= 255
@@ -331,6 +334,36 @@ def test_each_colour_has_the_hue_that_its_meaning_suggests() -> None:
     everything = [*colours.STATUS_COLOURS.values(), *(colour for colour, _ in named), *greys]
     assert all(0 <= part <= 255 for colour in everything for part in colour)
     assert set(colours.STATUS_COLOURS) >= {status.value for status in Status}
+
+
+def test_the_map_in_the_viewer_has_the_colours_of_its_drawing() -> None:
+    """But for the lowest one, which would hardly be seen before a dark background: lighter, of the same hue."""
+    ours, drawn = ([colour for _, colour, _ in levels] for levels in (colours.COVERAGE_LEVELS, plan_drawing.LEVELS))
+    assert ours[:3] == drawn[:3]
+    assert _hue_and_saturation(ours[3]) == pytest.approx(_hue_and_saturation(drawn[3]), abs=2)
+    assert max(ours[3]) > max(drawn[3])
+    assert max(ours[3]) <= 255
+    grey = colours.BLIND_COLOUR
+    assert len(set(grey)) == 1
+    assert max(grey) < min(max(colour) for colour in ours)
+
+
+def test_scores_and_residuals_go_evenly_from_one_colour_to_another() -> None:
+    scale = colours.score_colours(np.linspace(0, 1, 5))
+    lightness = cv2.cvtColor(scale[None], cv2.COLOR_RGB2LAB)[0, :, 0].astype(int)
+    assert all(30 <= step <= 36 for step in np.diff(lightness))
+    hues, saturations = zip(*(_hue_and_saturation(tuple(map(int, colour))) for colour in scale), strict=True)
+    # From blue to yellow, past green.
+    assert 220 < hues[0] < 240
+    assert 45 < hues[-1] < 60
+    assert sorted(hues, reverse=True) == list(hues)
+    assert min(saturations) > 0.5
+    assert saturations[-1] > 0.7
+    view = SimpleNamespace(residual_px=np.sqrt([0.5 * 50.0]))
+    yellow = colours.match_colours(view, "residual")[0]  # type: ignore[arg-type]
+    hue, saturation = _hue_and_saturation(tuple(map(int, yellow)))
+    assert abs(hue - 60) < 5
+    assert saturation > 0.6
 
 
 def _hue_and_saturation(colour: tuple[int, int, int]) -> tuple[float, float]:
