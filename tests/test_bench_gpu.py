@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +20,7 @@ import small_room
 import torch
 from typer.testing import CliRunner
 
-from service.bench import gpu, gpu_equality, gpu_memory, gpu_speed
+from service.bench import gpu, gpu_equality, gpu_memory, gpu_runner, gpu_speed
 from service.bench.gpu_equality import image_differences
 from service.bench.gpu_runner import Part, run_parts
 from service.bench.gpu_shared import SMALL, Shared, machine
@@ -553,3 +555,30 @@ def test_the_memory_of_the_device_is_limited():
         gsplat_cuda.limit_device_memory(None)
     assert gsplat_cuda.device_memory()["peak_bytes"] >= 0
     assert gsplat_cuda.device_facts()["memory_bytes"] > 2**30
+
+
+def test_parts_run_in_turn_on_what_the_first_one_made() -> None:
+    """As in the process of its own, whose lines no other test can see."""
+    ours, theirs = multiprocessing.Pipe()
+    worker = threading.Thread(target=gpu_runner._work, args=(theirs, ("bench_parts:Shared", ("s",))))
+    worker.start()
+    said = []
+    for name in ("good", "failing", "good", "unwritable", "missing"):
+        ours.send(f"bench_parts:{name}")
+        while True:
+            assert ours.poll(20)
+            said.append(ours.recv())
+            if said[-1][0] != "row":
+                break
+    ours.close()
+    worker.join(20)
+    assert not worker.is_alive()
+    assert [state for state, _ in said] == [
+        "row", "row", gpu_runner.DONE, "row", gpu_runner.FAILED, "row", "row", gpu_runner.DONE, "row",
+        gpu_runner.FAILED, gpu_runner.FAILED,
+    ]  # fmt: skip
+    assert said[0][1]["name"] == "s"
+    assert (said[1][1], said[6][1]) == ({"parts": 1}, {"parts": 2})
+    assert said[4][1]["error"] == "ArithmeticError: no result"
+    assert "bench_parts.py" in said[4][1]["traceback"]
+    assert said[9][1]["error"].startswith("ValueError")

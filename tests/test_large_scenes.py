@@ -80,7 +80,16 @@ def test_the_most_contributing_gaussians_are_kept(room: GaussianScene) -> None:
 
 @pytest.mark.parametrize("compressed", [False, True])
 def test_a_written_folder_is_the_scene(room: GaussianScene, tmp_path: Path, compressed: bool) -> None:
-    file = large_scenes.write_folder(room, tmp_path / "out", tmp_path, cameras=not compressed, compressed=compressed)
+    source = tmp_path / "source"
+    (source / "photos" / "day").mkdir(parents=True)
+    (source / "photos" / "day" / "a.jpg").write_bytes(b"a photo")
+    (source / "truth.json").write_text("[7]")
+    (source / "other.txt").write_text("stays")
+    file = large_scenes.write_folder(room, tmp_path / "out", source, cameras=not compressed, compressed=compressed)
+    # It has the same test photos.
+    assert (tmp_path / "out" / "photos" / "day" / "a.jpg").read_bytes() == b"a photo"
+    assert (tmp_path / "out" / "truth.json").read_text() == "[7]"
+    assert not (tmp_path / "out" / "other.txt").exists()
     scene = load_scene(tmp_path / "out")
     assert scene.count == COUNT
     assert len(scene.cameras) == (0 if compressed else 6)

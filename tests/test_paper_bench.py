@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import importlib
 import io
 import json
 import os
@@ -11,9 +12,10 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 from html import escape
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,10 +24,11 @@ from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, estimate, folder
 
 from service.bench import localize as bench
 from service.bench.paper import claims, plan, report, runs, tables
-from service.bench.pose_metrics import COARSE, Outcome
+from service.bench.pose_metrics import COARSE, Outcome, Units
 from service.errors import InvalidRequest, UnknownName
-from service.geometry import moved
-from service.results import Status
+from service.geometry import moved, pose_distance
+from service.results import IterationRecord, MatchVectors, Status
+from service.types import Camera, Intrinsics, Pose
 
 ROOT = Path(__file__).parents[1]
 
@@ -401,6 +404,153 @@ def test_the_share_below_the_bound_by_step():
 
     curves = [[(0, 30, 1), (3, 4, 0.01), (9, 0.1, 0.001)], [(0, 30, 1), (5, 6, 0.01)], [(0, 1, 0.04), (2, 9, 1)]]
     assert _share_curve(curves) == ([0, 2, 3, 5, 9], pytest.approx([1 / 3, 0, 1 / 3, 1 / 3, 1 / 3]))
+
+
+# ------------------------------------------------------------------ what the figures are made of
+
+UNITS = Units(np.array([1.0, 2.0, 3.0]), 0.5, False)
+"""A scene unit is half a normalized one."""
+
+
+def records_at(positions: list[np.ndarray], matches: list[MatchVectors | None]) -> tuple[IterationRecord, ...]:
+    return tuple(
+        IterationRecord("match", moved(Pose(np.eye(4)), np.r_[0, 0, 0, at]), index=k, matches=found)
+        for k, (at, found) in enumerate(zip(positions, matches, strict=True))
+    )
+
+
+def test_a_start_is_turned_about_the_focus_then_shifted():
+    from service.bench.paper.illustrations import _moved
+
+    one = SimpleNamespace(units=UNITS)
+    beside = moved(Pose(np.eye(4)), np.array([0, 0, 0, 2.0, 2.0, 3.0]))  # one to the right of the focus
+    turned = _moved(one, beside, np.radians([0.0, 0.0, 90.0]), np.zeros(3))
+    assert turned.position_in_world == pytest.approx([1, 3, 3])
+    assert turned.world_from_camera[:3, 0] == pytest.approx([0, 1, 0])
+    # About x first: y goes to z, then z to x.
+    both = _moved(one, beside, np.radians([90.0, 90.0, 0.0]), np.zeros(3))
+    assert both.world_from_camera[:3, 1] == pytest.approx([1, 0, 0])
+    shifted = _moved(one, beside, np.zeros(3), np.array([0.5, 0.0, -1.0]))
+    assert shifted.position_in_world == pytest.approx([3, 2, 1])
+    assert shifted.world_from_camera[:3, :3] == pytest.approx(np.eye(3))
+
+
+def test_match_vectors_are_shown_of_steps_that_have_some_most_of_the_first_ones(monkeypatch):
+    from service.bench.paper import illustrations
+
+    photo = np.zeros((60, 80, 3), np.uint8)
+    monkeypatch.setattr(illustrations, "_query", lambda one, trial: SimpleNamespace(rgb=photo))
+    render = Camera(Intrinsics(40, 20, 30.0, 30.0, 20.0, 10.0), Pose(np.eye(4)))
+    agree = np.array([True, False, True])
+    px = np.array([[8.0, 6.0], [1.0, 1.0], [40.0, 30.0]], np.float32)
+    some = [MatchVectors(px, px / 2, agree if k else np.zeros(3, bool), render) for k in range(8)]
+    given: list[MatchVectors | None] = [None, *some, None]
+    records = records_at([np.zeros(3)] * 10, given)
+    found = illustrations._shown("(b) joint", None, None, records, 4)
+    # Of steps 1 to 8 the first, second, fourth and last.
+    assert [each.title for each in found] == [f"(b) joint, step {k}" for k in (1, 2, 4, 8)]
+    # In the photo's pixels: the render is half as wide and a third as high.
+    assert found[1].rendered_px == pytest.approx(np.array([[8.0, 9.0], [40.0, 45.0]]))
+    assert found[1].photo_px == pytest.approx(px[agree])
+    # Where none agree all are drawn.
+    assert len(found[0].photo_px) == 3
+    assert all(each.photo is photo for each in found)
+    (only,) = illustrations._shown("(a)", None, None, records, 1)
+    assert only.title == "(a)"
+    assert illustrations._shown("", None, None, records_at([np.zeros(3)], [None]), 4) == []
+
+
+def test_a_path_is_in_normalized_units_and_its_errors_have_no_zero():
+    from service.bench.paper.illustrations import _path
+
+    turn = moved(Pose(np.eye(4)), np.array([0, 0, np.radians(3), 0, 0, 0]))
+    places = [np.array([4.0, 0, 0]), np.array([0, 2.0, 0])]
+    found = _path("a", SimpleNamespace(records=records_at(places, [None, None])), turn, SimpleNamespace(units=UNITS))
+    assert found.positions == pytest.approx(np.array([[2.0, 0, 0], [0, 1.0, 0]]))
+    assert found.rotation_deg == pytest.approx([3, 3])
+    exact = _path("a", SimpleNamespace(records=records_at(places, [None, None])), Pose(np.eye(4)),
+                  SimpleNamespace(units=UNITS))  # fmt: skip
+    assert exact.rotation_deg == pytest.approx([1e-3, 1e-3])
+
+
+def test_figure_1_starts_where_it_says(monkeypatch):
+    """20 degrees about the centre, 0.35 units sidewards, and both with more; the truth in normalized units."""
+    from service.bench.paper import illustrations
+
+    there = moved(Pose(np.eye(4)), np.array([0, 0, 0, 4.0, 2.0, 3.0]))
+    truth = moved(there, np.array([0, 0, np.radians(90), 0, 0, 0]))
+    trial = SimpleNamespace(truth=SimpleNamespace(pose=truth))
+    one = SimpleNamespace(units=UNITS)
+    starts, drawn = [], {}
+    monkeypatch.setattr(illustrations, "make_trials", lambda *_: iter([trial]))
+
+    def run(one, trial, start, estimator, changed):
+        starts.append((start, estimator, dict(changed)))
+        return SimpleNamespace(records=records_at([np.zeros(3)], [None]))
+
+    def vectors_and_paths(rows, paths, position):
+        drawn.update(rows=rows, paths=[path.name for path in paths], position=position)
+        return b"png"
+
+    monkeypatch.setattr(illustrations, "_run", run)
+    monkeypatch.setattr(illustrations, "_shown", lambda title, *_: [title])
+    monkeypatch.setattr(illustrations.figures, "vectors_and_paths", vectors_and_paths)
+    assert illustrations.figure_1(one) == b"png"
+    assert drawn["rows"] == [
+        ["(a) turned about the centre, 20 deg", "(a) shifted, 0.35 units"], ["(b) not decoupled"], ["(b) decoupled"],
+    ]  # fmt: skip
+    assert drawn["position"] == pytest.approx([2.0, 1.0, 1.5])
+    turned, shifted, decoupled, joint = (start for start, *_ in starts)
+    degrees, _ = pose_distance(turned, truth)
+    assert degrees == pytest.approx(20)
+    arms = [np.linalg.norm(pose.position_in_world - UNITS.focus_in_world) for pose in (turned, truth)]
+    assert arms[0] == pytest.approx(arms[1])
+    assert pose_distance(shifted, truth) == (pytest.approx(0, abs=1e-6), pytest.approx(0.7))
+    assert np.abs((shifted.position_in_world - truth.position_in_world) @ truth.world_from_camera[:3, 0]) == (
+        pytest.approx(0.7)
+    )
+    assert decoupled is joint
+    # One iteration shows the start's vectors; a tenth is the paper's.
+    assert [(name, changed["iterations"]) for _, name, changed in starts if name == "mc_do"] == [
+        ("mc_do", 1), ("mc_do", 1), ("mc_do", 10),
+    ]  # fmt: skip
+    assert starts[-1][1] == "icomma"
+
+
+@pytest.mark.parametrize(
+    ("points", "kept"),
+    [(20, [*range(10)]), (10, [*range(10)]), (5, [0, 2, 4, 6, 8, 9]), (4, [0, 3, 6, 9]), (1, [0, 9])],
+)
+def test_a_curve_has_evenly_spread_steps_and_the_answer(points, kept):
+    own = importlib.import_module("service.bench.paper.runs")._curve
+    truth = SimpleNamespace(pose=Pose(np.eye(4)))
+    places = [np.array([2.0 * k, 0, 0]) for k in range(10)]
+    answer = SimpleNamespace(records=records_at(places, [None] * 10))
+    found = own(answer, SimpleNamespace(truth=truth), SimpleNamespace(units=UNITS), points)
+    assert found == [(k, 0.0, float(k)) for k in kept]
+
+
+def test_photos_of_a_small_cell_are_spread_over_the_sequence():
+    bench_scene = make_dataclass("Scene", ["photos"])(tuple("abcdefgh"))
+    for count, names in ((3, "acf"), (2, "ae"), (7, "abcdefg"), (8, "abcdefgh"), (9, "abcdefgh"), (None, "abcdefgh")):
+        assert "".join(runs._photos_of_cell(bench_scene, SimpleNamespace(photos=count)).photos) == names
+
+
+def test_the_first_query_is_answered_untimed(scene, monkeypatch):
+    asked = []
+    monkeypatch.setattr(runs, "localize_trial", lambda one, trial, request: asked.append(trial))
+    monkeypatch.setattr(runs, "make_trials", lambda one, start, count, seed: iter(["first"] * count))
+    runs._warm(None)
+    assert asked == ["first"]
+
+
+def test_lines_of_several_versions_are_told_apart():
+    scene = {"gaussians": 1000, "test_photos": 2, "layout": "scene"}
+    config = {"scenes": {"s": scene}, "general": {"seed": 0, "matcher": "xfeat"}}
+    lines = [{"code": "aaa"}] * 3 + [{"code": "bbb"}]
+    text = " ".join(report._facts(lines, config))
+    assert "2 versions of the code (digest, lines): aaa 3, bbb 1" in text
+    assert "versions of the code" not in " ".join(report._facts(lines[:3], config))
 
 
 # ------------------------------------------------------------------ what the figures show
