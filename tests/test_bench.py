@@ -4,6 +4,7 @@ import io
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from service.bench import localize as bench
 from service.bench import modifications
 from service.bench import render as render_bench
 from service.bench.bench_photos import find_photos, prepare_photo
-from service.bench.miss_images import save_miss_images
+from service.bench.miss_images import miss_image, save_miss_images
 from service.bench.modifications import MODIFICATIONS, modify
 from service.bench.modified_photo import Photo
 from service.bench.pose_metrics import Units, nees, units_of
@@ -104,6 +105,20 @@ class TestPhotos:
             assert one.path.is_file()
             assert one.camera.intrinsics == LENS
             assert np.allclose(one.camera.pose.world_from_camera, poses()[index].world_from_camera, atol=1e-12)
+
+    def test_every_eighth_photo_of_colmaps_model(self, tmp_path):
+        """Beside a scene file alone; photos lie in `images`."""
+        scene_ply(tmp_path / "scene.ply")
+        model = tmp_path / "sparse" / "0"
+        model.mkdir(parents=True)
+        (model / "cameras.txt").write_text("1 PINHOLE 64 48 60 61 33 23\n")
+        lines = [f"{k + 1} 1 0 0 0 {k} 0 0 1 day/{k:02d}.jpg\n\n" for k in range(17)]
+        (model / "images.txt").write_text("".join(lines))
+        found = find_photos(tmp_path)
+        assert [one.path for one in found] == [tmp_path / "images" / "day" / f"{k:02d}.jpg" for k in (0, 8, 16)]
+        # As the model names it, so that its camera is held back.
+        assert [one.names[0] for one in found] == [f"day/{k:02d}.jpg" for k in (0, 8, 16)]
+        assert found[1].camera.pose.position_in_world == pytest.approx([-8, 0, 0])
 
     def test_truth_moves_with_the_scene(self, tmp_path):
         folder = folder_of(tmp_path / "s", "nerfstudio")
@@ -236,6 +251,31 @@ class TestRun:
         assert "picture" not in right
         assert [p.name for p in (tmp_path / "misses").iterdir()] == [wrong["picture"]] == ["s-images_5.png-0.jpg"]
         assert wrong["residual_at_answer"] < 0.003 < 0.05 < wrong["residual_at_truth"]  # 8 bits; seen: 0.001, 0.13
+
+    def test_what_is_no_photo_counts_for_no_residual(self, monkeypatch):
+        """The left half of the photo is transparent; there the render is anything."""
+        rgba = np.full((48, 64, 4), 100, np.uint8)
+        rgba[:, 32:, 3] = 255
+        rgba[:, :32, 3] = 0
+        rgba[::2, 32:, 0] = 200
+        buffer = io.BytesIO()
+        Image.fromarray(rgba).save(buffer, "PNG")
+        render = rgba[:, :, :3].astype(np.float32) / 255
+        render[:, :30] = np.random.default_rng(0).uniform(size=(48, 30, 3))
+
+        def rendered(cameras):
+            flat = np.ones((48, 64), np.float32)
+            return [Frame(render, flat, flat, flat) for _ in cameras]
+
+        loaded = SimpleNamespace(rasterizer=SimpleNamespace(render=rendered))
+        one = SimpleNamespace(background_rgb=(0.0, 0.0, 0.0), loaded=loaded)
+        trial = SimpleNamespace(data=buffer.getvalue(), intrinsics=LENS, truth=Camera(LENS, poses()[0]))
+        image, here, there = miss_image(one, trial, estimate(poses()[0]))
+        assert here == there < 0.002
+        # The differences, too, are black there.
+        drawn = read_query(image).rgb
+        assert drawn.shape[:2] == (48, 5 * 64)
+        assert drawn[:, 2 * 64 + 2 : 2 * 64 + 28].max() < 12
 
     def test_trials_have_starts_of_their_own_the_same_every_time(self, tmp_path, runs):
         folder = folder_of(tmp_path / "s", "nerfstudio")
@@ -602,7 +642,9 @@ class TestRoom:
         monkeypatch.setattr(render_bench.os, "cpu_count", lambda: 2)
         clock = iter(np.arange(0, 1e4, 0.5))  # every call takes half a second
         monkeypatch.setattr(render_bench.time, "perf_counter", lambda: next(clock))
-        rows = render_bench.run(repeats=2, cases=((50, 16),))
+        shown = []
+        rows = render_bench.run(repeats=2, cases=((50, 16),), progress=lambda *now: shown.append(now))
+        assert shown == [(1, 1)]
         assert [(r["stage"], r["threads"]) for r in rows] == [
             ("forward", 1),
             ("pose_gradient", 1),

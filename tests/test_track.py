@@ -225,7 +225,9 @@ class TestBench:
             assert nearest[1] < bench.SEQUENCE.step_units
 
     def test_the_outcome_counts_what_happened(self, folder):
-        outcome = bench.run(folder, frames=8, seed=3)
+        shown = []
+        outcome = bench.run(folder, frames=8, seed=3, progress=lambda *now: shown.append(now))
+        assert shown == [(k, 8) for k in range(1, 9)]
         assert (outcome["frames"], outcome["followed"], outcome["false_localized"]) == (8, 7, 0)
         assert outcome["success_1deg_0p01"] == 1.0
         assert 0 < outcome["rotation_deg_p50"] <= outcome["rotation_deg_p100"] < 0.2
