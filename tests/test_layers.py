@@ -20,9 +20,11 @@ from service.types import Camera, Intrinsics, Pose
 from viewer.camera_views import SceneExtent, view_from_behind, view_through
 from viewer.frusta import viser_frustum
 from viewer.layers.anchor_layer import AnchorLayer
+from viewer.layers.axes_layer import AxesLayer
 from viewer.layers.candidate_layer import CandidateLayer
 from viewer.layers.layer import Layer, linear_colours, quaternion_wxyz
 from viewer.layers.match_layer import MatchLayer
+from viewer.layers.measure_layer import MeasureLayer
 from viewer.layers.splat_layer import SplatLayer
 from viewer.layers.training_camera_layer import TrainingCameraLayer
 from viewer.layers.trajectory_layer import TrajectoryLayer
@@ -429,6 +431,65 @@ def test_views_of_a_scene_and_its_floor_plan(canvas: Canvas) -> None:
     assert any(path.startswith("/measured distance") for path in canvas.nodes)
     scene.show_scene(shown, None)
     assert not any(path.startswith(("/measured distance", "/anchors")) for path in canvas.nodes)
+
+
+@pytest.mark.parametrize(("metres_per_unit", "told"), [(None, "5 units"), (2.5, "12.5 m")])
+def test_two_points_have_a_distance_and_a_third_begins_another(
+    canvas: Canvas, metres_per_unit: float | None, told: str
+) -> None:
+    bare, here = MeasureLayer(canvas), on(canvas, MeasureLayer)
+    bare.add(np.zeros(3), None)
+    assert canvas.nodes == {}  # of no scene
+    path = "/measured distance/"
+    for _ in range(2):
+        here.add(np.array([1.0, 2.0, 3.0]), metres_per_unit)
+        assert set(canvas.nodes) == {path + "points"}
+        here.add(np.array([1.0, 5.0, 7.0]), metres_per_unit)
+        assert set(canvas.nodes) == {path + "points", path + "line", path + "length"}
+    assert canvas.nodes[path + "length"].text == told
+    np.testing.assert_array_equal(canvas.nodes[path + "length"].position, [1, 3.5, 5])
+    np.testing.assert_array_equal(canvas.nodes[path + "line"].points, [[[1, 2, 3], [1, 5, 7]]])
+    points = canvas.nodes[path + "points"]
+    assert 0.05 < points.point_size / EXTENT.frustum_depth < 0.5
+    assert points.colors.tolist() == [list(canvas.nodes[path + "line"].colors)] * 2
+    here.clear()
+    assert canvas.nodes == {}
+    here.add(np.zeros(3), metres_per_unit)
+    assert set(canvas.nodes) == {path + "points"}
+
+
+@pytest.mark.parametrize(
+    ("centre", "metres_per_unit", "label", "length", "origin"),
+    [
+        ((0, 0, 0), None, "x, 2 units", 2.0, (0, 0, 0)),  # 0.4 radii of 5
+        ((0, 0, 0), 4.0, "x, 5 m", 1.25, (0, 0, 0)),
+        ((9.9, 0, 0), None, "x, 2 units", 2.0, (0, 0, 0)),
+        ((10.1, 0, 0), None, "x, 2 units", 2.0, (10.1, 0, 0)),  # in map coordinates
+    ],
+)
+def test_axes_have_a_round_length_and_stand_where_they_can_be_seen(
+    canvas: Canvas, centre: tuple, metres_per_unit: float | None, label: str, length: float, origin: tuple
+) -> None:
+    bare = AxesLayer(canvas)
+    bare.show(None)
+    assert canvas.nodes == {}
+    layer = on(canvas, AxesLayer)
+    up = np.array([0.0, 0.6, 0.8])
+    layer.extent = replace(EXTENT, centre=np.array(centre, float), up=up)
+    layer.show(metres_per_unit)
+    lines = canvas.nodes["/axes and scale/lines"]
+    np.testing.assert_allclose(lines.points[:, 0], np.tile(origin, (4, 1)), rtol=1e-6)
+    ends = origin + length * np.vstack([np.eye(3), up])
+    np.testing.assert_allclose(lines.points[:, 1], ends, rtol=1e-6)
+    # Red, green, blue for x, y, z, as everywhere; up is white.
+    for k in range(3):
+        assert np.argmax(lines.colors[k, 0]) == k
+        assert np.array_equal(lines.colors[k, 0], lines.colors[k, 1])
+    assert len(set(lines.colors[3, 0].tolist())) == 1
+    for name, end in zip("xyz", ends, strict=False):
+        np.testing.assert_allclose(canvas.nodes[f"/axes and scale/{name}"].position, end)
+    assert canvas.nodes["/axes and scale/x"].text == label
+    assert canvas.nodes["/axes and scale/up"].text == "up"
 
 
 def test_a_picked_point_is_drawn_larger_than_anchors(canvas: Canvas) -> None:

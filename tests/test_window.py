@@ -16,7 +16,7 @@ from fake_service import PHOTO, orbit, records
 from service.client import ServiceError
 from service.results import MatchVectors
 from service.types import Camera, IntrinsicsCorrection
-from viewer import browser_camera
+from viewer import browser_camera, step_display
 from viewer.browser_camera import BrowserCamera
 from viewer.browser_session import BrowserSession
 from viewer.camera_views import Viewpoint
@@ -25,6 +25,7 @@ from viewer.comparison_images import match_vectors_image
 from viewer.comparison_panel import ComparisonPanel, photo_of
 from viewer.match_geometry import MatchView, backproject_matches, matches_at_pose
 from viewer.scene_display import SceneDisplay
+from viewer.step_display import StepDisplay
 
 RED, BLUE, GREEN = (np.full((PHOTO.height, PHOTO.width, 3), colour, np.uint8) for colour in (
     (200, 20, 20), (20, 20, 200), (20, 200, 20)
@@ -202,6 +203,146 @@ def test_match_vectors_are_drawn_over_the_photo_where_there_are_matches() -> Non
     assert controls.vectors_image.visible is True
     assert np.array_equal(controls.vectors_image.image, match_vectors_image(RED, view(), INLIERS_ONE_OF_TWO))
     assert "1 agree" in controls.vectors.content
+
+
+# ------------------------------------------------------------------ steps
+
+
+def steps(count: int = 4, **job: Any) -> tuple[StepDisplay, Any, Any]:
+    """A display of steps with stand-ins for images and scene, and a job with so many records."""
+    controls, scene = Mock(), Mock(metres_per_unit=None)
+    found = StepDisplay(controls, scene)
+    found._images = Mock(colour_by="inlier")
+    stream: Any = Stream()
+    stream.attempt, stream.records = 1, records(count)
+    camera = lambda record: Camera(PHOTO, record.pose)  # noqa: E731
+    stream.job = SimpleNamespace(**{"photo_step": None, "photo": PHOTO, "truth": None, "camera": camera} | job)
+    stream.matches = lambda index: None
+    return found, stream, SimpleNamespace(controls=controls, scene=scene, images=found._images)
+
+
+def test_a_step_has_its_numbers_at_once_then_images_3d_and_its_neighbours(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=50.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(step_display, "time", clock)
+    found, stream, parts = steps()
+    assert found.empty
+    assert found.due_in_s is None
+    found.show(stream, 1)
+    assert not found.empty
+    assert parts.controls.step.value == 1
+    assert ">101<" in parts.controls.numbers.content
+    assert parts.controls.stages.content
+    assert parts.controls.flush.call_count == 1  # before anything that takes long
+    parts.images.show_comparison.assert_not_called()
+    assert found.due_in_s == 0.0
+    found.run_next()
+    parts.images.show_comparison.assert_called_once_with(stream, stream.records[1], None)
+    parts.images.show_match_vectors.assert_called_once_with(stream, stream.records[1], None)
+    assert "by step" in parts.controls.curves.content
+    assert parts.controls.flush.call_count == 3
+    # In a message of its own: viser sends together what is set within a sixtieth of a second.
+    parts.scene.trajectory.show_current.assert_not_called()
+    assert found.due_in_s is not None
+    assert 1 / 60 < found.due_in_s < 0.1
+    clock.now += 1.0
+    assert found.due_in_s == 0.0
+    found.run_next()
+    assert parts.scene.trajectory.show_current.call_args.args[0].pose == stream.records[1].pose
+    parts.images.prepare.assert_not_called()
+    found.run_next()
+    found.run_next()
+    assert [call.args[1].index for call in parts.images.prepare.call_args_list] == [0, 2]
+    assert found.due_in_s is None
+
+
+@pytest.mark.parametrize(("index", "neighbours"), [(0, [1]), (1, [0, 2]), (3, [2])])
+def test_the_steps_beside_are_prepared(index: int, neighbours: list[int]) -> None:
+    found, stream, parts = steps()
+    found.show(stream, index)
+    parts.images.prepare.side_effect = ServiceError("unreachable", "told when the step is shown")
+    while found.due_in_s is not None:
+        found.run_next()
+    assert [call.args[1].index for call in parts.images.prepare.call_args_list] == neighbours
+
+
+def test_a_step_is_drawn_once_and_again_in_another_attempt() -> None:
+    found, stream, _ = steps()
+    found.show(stream, 2)
+    found._queue.clear()
+    found.show(stream, 2)
+    assert found.due_in_s is None
+    stream.attempt = 2
+    found.show(stream, 2)
+    assert len(found._queue) == 3
+    # What remains of one step is dropped for the next one.
+    found.show(stream, 3)
+    assert len(found._queue) == 2
+    stream.records = stream.records[:1]  # the job has begun anew
+    found.run_next()
+    found._images.show_comparison.assert_not_called()  # type: ignore[attr-defined]
+    found.clear()
+    assert found.empty
+    assert found.due_in_s is None
+    found._images.clear.assert_called_once_with()  # type: ignore[attr-defined]
+    found._scene.clear_job.assert_called_once_with()  # type: ignore[attr-defined]
+    stream.job = None
+    found.show(stream, 0)
+    assert found.empty
+
+
+def test_a_step_without_an_image_says_so_and_has_its_curves() -> None:
+    found, stream, parts = steps()
+    parts.images.show_comparison.side_effect = ServiceError("not_ready", "The scene is loading.")
+    found.show(stream, 1)
+    found.run_next()
+    assert "no image: " in parts.controls.caption.content
+    assert "The scene is loading." in parts.controls.caption.content
+    assert "by step" in parts.controls.curves.content
+    found.run_next()
+    assert parts.scene.trajectory.show_current.called
+
+
+def frustum_images(found: StepDisplay, stream: Any, *indices: int) -> list[Any]:
+    """Draw steps in 3D; return the colour of each image that their frustum gets."""
+    shown: list[Any] = []
+    for index in indices:
+        found._draw_3d(stream, stream.records[index], None)
+        image = found._scene.trajectory.show_current.call_args.args[1]  # type: ignore[attr-defined]
+        shown.append(None if image is None else image[0, 0].tolist())
+    return shown
+
+
+def test_the_frustums_image_is_sent_once_for_all_steps_of_one_photo() -> None:
+    red, blue = RED[0, 0].tolist(), BLUE[0, 0].tolist()
+    found, stream, _ = steps()
+    assert frustum_images(found, stream, 0, 1, 1) == [red, None, None]
+    found.clear()
+    assert frustum_images(found, stream, 1) == [red]
+    # Of a sequence each step has its own photo, of which one is kept; the others show their render.
+    found, stream, _ = steps(photo_step=2)
+    assert frustum_images(found, stream, 1, 2, 2, 3) == [blue, red, None, blue]
+    assert stream.rendered == [(1, False), (3, False)]
+    # Without its photo a single one has none.
+    found, stream, _ = steps()
+    stream._photo = None
+    assert frustum_images(found, stream, 0) == [None]
+    stream.job = None
+    found._scene.reset_mock()  # type: ignore[attr-defined]
+    found._draw_3d(stream, stream.records[0], None)
+    assert not found._scene.method_calls  # type: ignore[attr-defined]
+
+
+def test_candidates_are_those_of_the_last_step_that_has_some_and_matches_have_colours() -> None:
+    found, stream, parts = steps()
+    stream.records = [replace(r, candidates="some" if k == 1 else None) for k, r in enumerate(stream.records)]
+    for index, shown in ((0, None), (1, "some"), (3, "some")):
+        found._draw_3d(stream, stream.records[index], None)
+        assert parts.scene.candidates.show.call_args.args == (shown, PHOTO)
+        assert parts.scene.matches.show.call_args.args == (None, None)
+    found._draw_3d(stream, stream.records[3], view())
+    seen, inks = parts.scene.matches.show.call_args.args
+    assert len(seen.inlier) == 2
+    assert np.array_equal(inks, INLIERS_ONE_OF_TWO)
 
 
 # ------------------------------------------------------------------ scenes
