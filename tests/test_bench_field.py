@@ -517,6 +517,21 @@ class TestTable:
         assert many[2].split(" | ")[7] == "97.5 %"
         assert table([line(True, True), line(True, True, scene="t")], by_scene=True).count("\n") == 3
 
+    @pytest.mark.parametrize(("count", "share", "ellipsoids"), [(39, "39 of 39", "–"), (40, "100.0 %", "100, 100")])
+    def test_forty_are_enough_for_shares(self, count, share, ellipsoids):
+        cells = [cell.strip() for cell in table([line(True, True, nees=0.1)] * count).splitlines()[2].split("|")]
+        assert (cells.count(share), cells.count(ellipsoids)) == (1, 1)
+
+    def test_medians_have_their_units_and_what_is_unknown_a_dash(self):
+        cells = table([line(True, True, rotation_deg=0.25, translation_units=0.0125)] * 2).splitlines()
+        # A pool of a single row has no line of its own beside that of its group.
+        assert len(cells) == 2 + 2
+        found = [cell.strip() for cell in cells[2].strip("| ").split("|")]
+        assert "0.250°, 0.0125" in found
+        assert "1.00 %, 0.0200" in found
+        assert table([line(False, False)]).splitlines()[2].count(" – ") == 3
+        assert "1.00 % |" in table([line(True, True, k1_error=None)]).splitlines()[2]
+
 
 @pytest.fixture
 def fake_scene(monkeypatch):
