@@ -121,13 +121,13 @@ def _by_photos(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config: 
         c for found, c in alike if found.score >= most - (config.same if c.is_normalization else config.simple)
     )
     fine = next(found for found, c in finer if c is chosen)
-    is_clear = not chosen.name or fine.score >= config.clear_correlation
+    is_clear = not chosen.name or chosen.is_measured or fine.score >= config.clear_correlation
     if is_clear and trial.is_peak(chosen, fine, config.fine, config.tie):
         return trial.fit(chosen, fine, verified=True)
     first = finer[0][0]
     if first.geometry >= config.plausible and first.score >= best - config.alike:
         return trial.fit(finer[0][1], first, verified=False)
-    return trial.none("their photos")
+    return trial.none("their photos", _ALIGN)
 
 
 def _by_geometry(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config: FitConfig) -> CameraFit:
@@ -206,8 +206,8 @@ class _Trial:
             placed, matrix, f"{candidate.name or 'as the camera file has them'}, by {by}", verified, said, not verified
         )
 
-    def none(self, by: str) -> CameraFit:
-        return CameraFit((), np.eye(4), f"nothing fits, by {by}", False, (_LEFT_OUT.format(by),))
+    def none(self, by: str, hint: str = "") -> CameraFit:
+        return CameraFit((), np.eye(4), f"nothing fits, by {by}", False, (_LEFT_OUT.format(by) + hint,))
 
 
 def _disturbances(config: FitConfig) -> Iterator[tuple[Float64[np.ndarray, "3 3"], float]]:
@@ -233,4 +233,8 @@ _CORRECTED = "the training cameras don't fit the scene as their file has them, b
 _LEFT_OUT = (
     "the training cameras fit the scene in no known frame or convention, by {}: they are left out, and views are "
     "placed by the scene itself."
+)
+_ALIGN = (
+    " Another rotation, shift and scale is found by localizing the photos: a service does it by itself once the scene "
+    "is loaded, `splatfix scenes align` without one."
 )

@@ -48,6 +48,8 @@ class Stated:
     file_from_cameras: Float64[np.ndarray, "4 4"]
     is_model_frame: bool = False
     """It was written by the trainer of this very scene (`dataparser_transforms.json`)."""
+    is_measured: bool = False
+    """It was found by localizing the photos of the cameras in the scene."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,7 @@ class Candidate:
     file_from_cameras: Float64[np.ndarray, "4 4"] | None = None
     """None: the camera file has the scene file's frame."""
     is_model_frame: bool = False
+    is_measured: bool = False
     is_normalization: bool = False
     """It follows from the cameras; several that hardly differ from each other, or from no change, do."""
 
@@ -132,7 +135,13 @@ def candidates(file: CameraFile) -> Iterator[Candidate]:
     yield Candidate("")
     for axes in ("given", "flipped"):
         for stated in file.stated:
-            yield Candidate(_both(PLAIN[axes], stated.name), axes, stated.file_from_cameras, stated.is_model_frame)
+            yield Candidate(
+                _both(PLAIN[axes], stated.name),
+                axes,
+                stated.file_from_cameras,
+                stated.is_model_frame,
+                stated.is_measured,
+            )
     for axes, text in PLAIN.items():
         if axes != "given":
             yield Candidate(text, axes)

@@ -7,7 +7,7 @@ The first one that is there is read: `transforms*.json`, COLMAP's `sparse/0` (of
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -28,6 +28,8 @@ from service.scene_formats.nerfstudio import DATAPARSER, TransformsFile, transfo
 from service.scene_formats.normalizations import COLMAP_TO_Z_UP
 from service.types import NamedCamera
 
+CAMERA_FRAME = "camera-frame.json"
+"""Where the camera file's frame was found to be, in the scene's folder: `service/scene_manager/camera_frame.py`."""
 _ELSEWHERE = (".", "sparse", "sparse/*", "colmap/sparse/*", "dense/sparse", "dense/sparse/*", "distorted/sparse/*")
 """Where other programs put COLMAP models."""
 _PHOTO_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".JPG", ".webp")
@@ -46,7 +48,14 @@ class TrainingFiles:
 
 def read_training(folder: Path, manifest: Manifest, without_photos: Collection[str] = ()) -> TrainingFiles:
     """Read the training cameras of a folder. Raises CorruptScene."""
+    found = _read_training(folder, manifest, without_photos)
+    measured = _measured_frame(folder)
+    if measured is None:
+        return found
+    return replace(found, file=replace(found.file, stated=(*found.file.stated, measured)))
 
+
+def _read_training(folder: Path, manifest: Manifest, without_photos: Collection[str]) -> TrainingFiles:
     def keep(name: str) -> bool:
         return not any(same_photo(name, photo) for photo in without_photos)
 
@@ -147,6 +156,20 @@ def _applied(data: dict[str, Any], where: str) -> Float64[np.ndarray, "4 4"]:
     if not scale > 0:
         raise CorruptScene(f"must be positive, is {scale}.", where=f"{where}: applied_scale")
     return np.linalg.inv(np.diag([scale, scale, scale, 1.0]) @ matrix)
+
+
+def _measured_frame(folder: Path) -> Stated | None:
+    """Return what localizing the photos has told, None where that wasn't done. Raises CorruptScene."""
+    path = folder / CAMERA_FRAME
+    if not path.is_file():
+        return None
+    where = f"{path.name}: file_from_cameras"
+    matrix = numbers(read_json(path).get("file_from_cameras"), (4, 4), where)
+    scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
+    turned = matrix[:3, :3] @ matrix[:3, :3].T
+    if not scale > 0 or np.abs(turned / scale**2 - np.eye(3)).max() > 1e-3:
+        raise CorruptScene("must be a similarity.", where=where, hint="Delete the file, and align the scene again.")
+    return Stated("found by localizing their photos", matrix, is_measured=True)
 
 
 def _of_dataparser(folder: Path, *worlds: tuple[str, Float64[np.ndarray, "4 4"]]) -> list[Stated]:

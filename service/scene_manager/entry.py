@@ -32,6 +32,8 @@ class Entry:
     """The service isn't ready before it has been loaded once, or failed to; then it is tried again unasked."""
     uploaded: bool = False
     """It came over HTTP, and may be deleted."""
+    is_outdated: bool = False
+    """Its files have changed: it is loaded again as soon as no job uses it."""
     awaited: bool = True
     """Of a required scene: whether it has neither been loaded nor failed to yet."""
     jobs: int = 0

@@ -29,6 +29,7 @@ from service.errors import (
     SplatfixError,
 )
 from service.loaded_scene import DEFAULT_MATCHER, LoadedScene
+from service.scene_manager.camera_frame_search import CameraFrameSearch
 from service.scene_manager.entry import Entry
 from service.scene_manager.memory_limit import MemoryLimit
 from service.scene_manager.status import AUTO, SceneContents, SceneNote, SceneReadiness
@@ -89,6 +90,7 @@ class Scenes:
         self._waiting: list[_Waiting] = []
         # One thread: scenes that were loaded at once would need their peak memory at once.
         self._thread = threading.Thread(target=self._work, name="scenes", daemon=True)
+        self._camera_frames = CameraFrameSearch(self._reload)
 
     def start(self) -> None:
         """Start the loading thread, and load the scenes that the service needs."""
@@ -100,6 +102,7 @@ class Scenes:
     def close(self) -> None:
         """Stop loading, between two scenes; return then, or soon anyway."""
         self._stop.set()
+        self._camera_frames.close()
         with self._lock:
             self._lock.notify_all()
         if self._thread.is_alive():
@@ -248,7 +251,19 @@ class Scenes:
                     entry.jobs -= 1
                     if entry.state == "unloading" and not entry.jobs:
                         _drop(entry)
+                    self._reload_outdated(entry)
             self._lock.notify_all()
+
+    def _reload(self, entry: Entry) -> None:
+        """Load a scene again whose files have changed, once no job uses it."""
+        with self._lock:
+            entry.is_outdated = entry.loaded is not None
+            self._reload_outdated(entry)
+
+    def _reload_outdated(self, entry: Entry) -> None:
+        if entry.is_outdated and entry.is_idle and entry.wanted:
+            _drop(entry)
+            self._request(entry)
 
     def load(self, entry: Entry) -> None:
         """Load a scene, if it isn't there; also one that failed to load."""
@@ -387,6 +402,7 @@ class Scenes:
             if not entry.wanted:
                 self._unload(entry)  # as was asked for in the meantime
             self._lock.notify_all()
+        self._camera_frames.consider(entry)
 
     def _settle(self) -> None:
         """Give scenes to those who have waited for them, in their order."""
@@ -414,4 +430,4 @@ class Scenes:
 
 
 def _drop(entry: Entry) -> None:
-    entry.loaded, entry.state = None, "unloaded"
+    entry.loaded, entry.state, entry.is_outdated = None, "unloaded", False

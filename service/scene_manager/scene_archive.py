@@ -22,6 +22,7 @@ from service.scene_formats.inria import ARGUMENTS, CAMERAS
 from service.scene_formats.layouts import COLMAP_FOLDER, STEPS
 from service.scene_formats.manifest import MANIFEST
 from service.scene_formats.nerfstudio import DATAPARSER
+from service.scene_formats.training_files import CAMERA_FRAME
 
 _MAX_MEMBERS = 20_000
 _MAX_PHOTOS = 5_000
@@ -31,7 +32,7 @@ _MAX_NAME_BYTES = 255
 """On all usual file systems."""
 _MAX_DEPTH = 4
 _COPY_BYTES = 1 << 20
-_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER, DIGEST_FILE}
+_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER, DIGEST_FILE, CAMERA_FRAME}
 _PHOTOS = (".jpg", ".jpeg", ".png", ".webp")
 _SYSTEM_FOLDER = "__MACOSX"
 
