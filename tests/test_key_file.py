@@ -132,3 +132,61 @@ def test_the_command_adds_lists_and_removes(file: Path, monkeypatch: pytest.Monk
     assert "neither an age nor a date" in run("add", "other", "--expires", "soon")[1]
     assert run("remove", "robot")[0] == 0
     assert run("list") == (0, "")
+
+
+def test_a_whole_queue_is_a_share_and_an_id_is_sixteen_digits(file: Path) -> None:
+    assert KeyLimits(queue_share=1.0).queue_share == 1.0
+    add_key(file, "robot", "localize")
+    (robot,) = read_keys(file)
+    assert robot.id == robot.sha256[:16]
+    assert len(robot.sha256) == 64
+
+
+def test_the_file_is_looked_at_again_after_a_second(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [1000.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    ring = KeyRing(file)
+    assert not ring
+    key = add_key(file, "robot", "localize")
+    now[0] += 0.99
+    assert ring.caller(key) is None
+    now[0] += 0.02
+    assert ring.caller(key)
+    remove_key(file, "robot")
+    now[0] += 1.0
+    assert ring.caller(key) is None
+    # What is changed here holds at once.
+    made = ring.add("other", "read", UNLIMITED)
+    assert ring.caller(made)
+    ring.remove("other")
+    assert ring.caller(made) is None
+
+
+def test_tokens_end_when_their_time_is_over(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [5000.0]
+    monkeypatch.setattr(time, "time", lambda: now[0])
+    ring = KeyRing(file)
+    guest = ring.caller(ring.add("guest", "read", UNLIMITED))
+    assert guest
+    session, link, free = ring.token(guest, 60), ring.share_token("job", 60, guest), ring.share_token("job", 60, None)
+    now[0] += 59.5
+    assert ring.bearer(session) == guest
+    assert ring.shared_job(link) == ring.shared_job(free) == "job"
+    now[0] += 0.5
+    assert ring.bearer(session) is ring.shared_job(link) is ring.shared_job(free) is None
+
+
+def test_a_secret_is_kept_and_one_of_another_length_is_replaced(file: Path, tmp_path: Path) -> None:
+    ring = KeyRing(file)
+    guest = ring.caller(ring.add("guest", "read", UNLIMITED))
+    assert guest
+    again, secret = KeyRing(file), tmp_path / "secret"
+    secret.write_bytes(b"short")
+    ring.keep_sessions(secret)
+    assert len(secret.read_bytes()) == 32
+    token = ring.token(guest, 60)
+    assert again.bearer(token) is None
+    again.keep_sessions(secret)
+    assert again.bearer(token)
+    assert again.bearer(token[:-1] + ("0" if token[-1] != "0" else "1")) is None
+    assert again.viewer_bearer(token) is again.shared_job(token) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.geometry import moved, pose_distance, se3_exp, se3_log
-from service.smoothing import MotionNoise, TimedPose, smoothed, smoothed_states
+from service.smoothing import SMOOTHING, MotionNoise, TimedPose, _stretches, smoothed, smoothed_states
 from service.types import Pose
 
 SIGMA = np.array([0.004] * 3 + [0.03, 0.01, 0.02])
@@ -137,3 +137,26 @@ def test_two_poses_around_a_gap_are_joined():
     assert found[1] is not None
     assert found[1].interpolated
     assert np.allclose(found[1].pose.world_from_camera, moved(a, halfway).world_from_camera)
+
+
+@pytest.mark.parametrize(("gap_s", "stretches"), [(1.0, [(0, 4)]), (1.125, [(0, 2), (3, 4)])])
+def test_a_second_without_a_pose_divides_a_trajectory(gap_s, stretches):
+    pose = walk(1)[0]
+    photos = [TimedPose(0.0, pose), TimedPose(0.5, pose), TimedPose(0.75, None), TimedPose(0.5 + gap_s, pose)]
+    assert _stretches(photos, SMOOTHING.max_gap_s) == stretches
+
+
+def test_without_covariances_those_of_others_are_taken():
+    poses = walk(3)
+    told = [np.eye(6) * 4e-4, None, np.eye(6) * 2e-4]
+    found = smoothed([TimedPose(10.0 * i, pose, c) for i, (pose, c) in enumerate(zip(poses, told, strict=True))])
+    assert [f is not None and float(f.covariance[0, 0]) for f in found] == pytest.approx([4e-4, 3e-4, 2e-4])
+
+
+def test_photos_of_one_time_have_no_infinite_speed():
+    poses = walk(4)
+    found = smoothed([TimedPose(0.0, pose, np.eye(6) * 1e-4) for pose in poses])
+    assert all(f is not None and np.isfinite(f.pose.world_from_camera).all() for f in found)
+    two = smoothed([TimedPose(1.0, poses[0]), TimedPose(1.0, None), TimedPose(1.0, poses[1])])
+    assert two[1] is not None
+    assert np.allclose(two[1].pose.world_from_camera, poses[0].world_from_camera)
