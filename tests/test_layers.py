@@ -210,6 +210,12 @@ def test_the_24_best_candidates_are_frusta_and_all_are_points(canvas: Canvas, co
     apexes = np.unique(segments.points.reshape(frusta, 8, 2, 3)[:, 0, 0].round(4), axis=0)
     best = np.argsort(-shown.scores)[:frusta]
     assert np.allclose(apexes, np.unique(shown.world_from_camera[best, :3, 3].astype(np.float32).round(4), axis=0))
+    # They are smaller than the photo's own frustum.
+    corners = segments.points.reshape(frusta, 8, 2, 3)[:, 0]
+    height = np.sqrt(1 + (48 / 80) ** 2 + (32 / 80) ** 2)  # from the apex to a corner, at a depth of one
+    depths = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1) / height
+    assert depths == pytest.approx(0.7 * EXTENT.frustum_depth, rel=1e-4)
+    assert points.point_size < 0.1 * EXTENT.frustum_depth
     # The frusta have their points' colours, as linear light.
     assert np.array_equal(segments.colors[::8, 0], linear_colours(points.colors[best]))
 

@@ -63,7 +63,13 @@ def test_a_ray_points_where_the_camera_looks_in_the_colour_of_the_legend(canvas:
     assert (np.linalg.norm(node.points[:4, 1] - orbit(0).position_in_world, axis=1) < 0.5 * 0.8).all()
     expected = linear_colours(np.array([coverage_colour(1.0)] * 3 + [BLIND_COLOUR], np.uint8))
     np.testing.assert_array_equal(node.colors[:4, 0], expected)
-    on(canvas, CoverageLayer).show(None)
+    # Each begins beside the middle of its cell, on the side that it points to.
+    begins = node.points[:4, 0] - orbit(0).position_in_world
+    assert (np.einsum("kj,kj->k", begins, rays[:4]) > 0).all()
+    layer = on(canvas, CoverageLayer)
+    layer.show(answer.found)
+    layer.show(None)
+    assert canvas.nodes == {}
 
 
 def test_the_legend_has_the_words_and_bounds_of_the_drawing() -> None:

@@ -236,6 +236,56 @@ def test_depths_of_old_steps_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(stream._backprojected) == 2
 
 
+def test_a_stream_tells_of_each_record_and_forgets_the_images_of_another_attempt(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    heard: list[int] = []
+    stream = JobStream(Mock(), "j")
+    stream.listeners.add(lambda: heard.append(len(stream.records)))
+    monkeypatch.setattr(job_stream, "record_of", lambda said: SimpleNamespace(index=said.index))
+
+    def said(index: int, attempt: int = 1) -> Any:
+        return SimpleNamespace(index=index, attempt=attempt)
+
+    for record in (said(0), said(1), None, said(0), said(1), said(2)):  # a stream that was resumed repeats them
+        stream._append(record)
+    assert heard == [1, 2, 3]
+    stream._renders[0, True], stream._backprojected[0] = Mock(), Mock()
+    stream._append(said(3))
+    assert len(stream._renders) == len(stream._backprojected) == 1
+    stream._append(said(0, attempt=2))
+    assert heard == [1, 2, 3, 4, 1]
+    assert len(stream._renders) == len(stream._backprojected) == 0
+    # At its end a sequence's photo is another step's; a single photo stays the same.
+    monkeypatch.setattr(job_stream, "api", SimpleNamespace(Job=str))
+    for step, again in ((None, False), (3, True)):
+        stream._photo_requested = True
+        monkeypatch.setattr(job_stream, "job_of", lambda said, step=step: SimpleNamespace(photo_step=step))
+        stream._append("the job")  # type: ignore[arg-type]
+        assert stream.complete
+        assert stream._photo_requested is not again
+    assert heard == [1, 2, 3, 4, 1, 1, 1]
+
+
+def test_streams_have_listeners_until_the_last_one_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(JobStream, "start", Mock())
+    streams = job_stream.JobStreams(Mock())
+    one, two = Mock(), Mock()
+    stream = streams.follow("a", one)
+    assert streams.follow("a", two) is stream
+    assert stream.listeners == {one, two}
+    assert JobStream.start.call_count == 1  # type: ignore[attr-defined]
+    streams.leave(stream, one)
+    assert not stream._stop.is_set()
+    assert len(streams) == 1
+    streams.leave(stream, two)
+    assert stream._stop.is_set()
+    assert len(streams) == 0
+    others = [streams.follow(name, one) for name in "ab"]
+    streams.close()
+    assert all(other._stop.is_set() for other in others)
+
+
 def test_an_outage_is_logged_once_and_again_after_it_was_over(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
