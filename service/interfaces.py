@@ -51,6 +51,11 @@ class Rasterizer(Protocol):
         """Bytes of memory held."""
         ...
 
+    @property
+    def cameras_at_once(self) -> int:
+        """Images worth asking for in one call by who needs many. 1: as they are needed, each in its caller's thread."""
+        return 1
+
     def of(self, scene: GaussianScene) -> Rasterizer:
         """Return a rasterizer of the same kind for another scene."""
         ...
@@ -90,6 +95,12 @@ class Rasterizer(Protocol):
         refers to the expected depth.
         """
         ...
+
+    def pose_gradients(
+        self, cameras: Sequence[Camera], d_rgb: Sequence[Float32[np.ndarray, "_ _ 3"]]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """`pose_gradient` of several cameras, from the colours' gradients; one by one unless a renderer does better."""
+        return np.stack([self.pose_gradient(*each) for each in zip(cameras, d_rgb, strict=True)])
 
     def scene_gradients(
         self,

@@ -16,7 +16,7 @@ import service.loaded_scene
 import service.localize
 from service.errors import BackendMissing, EstimatorFault
 from service.geometry import moved
-from service.interfaces import Features, Frame, SceneGradients
+from service.interfaces import Features, Frame, Rasterizer, SceneGradients
 from service.loaded_scene import LoadedScene
 from service.localize import Cancelled, Request, localize
 from service.results import IterationRecord, Reason, Status
@@ -27,7 +27,7 @@ QUERY = Query(np.zeros((64, 64, 3), np.uint8), LENS, "guessed", LENS.resized(128
 POSES = [moved(Pose(np.eye(4)), np.array([0, 0, 0, 0.1 * i, 0, 0])) for i in range(20)]
 
 
-class Nothing:
+class Nothing(Rasterizer):
     """A rasterizer of an empty scene and a matcher without matches."""
 
     name = "nothing"

@@ -248,7 +248,7 @@ def test_only_scenes_of_more_than_half_a_million_gaussians_are_simplified(count:
     renderer: Any = Noting()
     scene = replace(one, **many)
     pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
-    OccludedRenderer(scene, renderer, np.random.default_rng(0)).render(Camera(search_camera(160), pose))
+    OccludedRenderer(scene, renderer, np.random.default_rng(0)).render([Camera(search_camera(160), pose)])
     if simplified:
         assert made == [pytest.approx(200_000, rel=0.01)]
         assert rendered == [(64, False), (160, True)]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.geometry import look_at, moved, pose_distance, project, reprojection_error_px, transformed
-from service.interfaces import Features, Frame, SceneGradients, Tools
+from service.interfaces import Features, Frame, Rasterizer, SceneGradients, Tools
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import PHOTO_PX, scaled_px, sized
 from service.pose.features.query_images import QueryImages
@@ -42,7 +42,7 @@ UP = np.array([0.0, 0.0, 1.0])
 SMALL = ViewpointConfig(render_px=96)
 
 
-class PaintedWalls:
+class PaintedWalls(Rasterizer):
     """A rasterizer that is exact: rays meet a wall at z = 0 and a nearer, smaller board, both smoothly painted."""
 
     name = "painted_walls"

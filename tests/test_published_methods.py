@@ -50,6 +50,8 @@ def stepped(monkeypatch: pytest.MonkeyPatch):
         SEEN.clear()
         monkeypatch.setattr(estimator, "Adam", RecordedAdam, raising=False)
         monkeypatch.setattr(estimator, "loss_and_gradient", lambda *_: (0.5, TWIST), raising=False)
+        losses = lambda _, __, poses, ___: [(0.5, TWIST)] * len(poses)  # noqa: E731
+        monkeypatch.setattr(estimator, "losses_and_gradients", losses, raising=False)
         query = Query(np.full((64, 64, 3), 128, np.uint8), LENS, "given", LENS, prior=PRIOR)
         rng = np.random.default_rng(seed)
         tools = SimpleNamespace(prepared=prepared, rng=rng, rasterizer=None, matcher=None, image_matcher=None)
@@ -98,7 +100,7 @@ def test_icommas_matches_count_four_fifths_until_they_are_close_then_the_rate_fa
 @pytest.mark.parametrize(("kept", "enough"), [(5, True), (4, False)])
 def test_icomma_needs_five_matches(monkeypatch: pytest.MonkeyPatch, kept: int, enough: bool) -> None:
     found = Correspondences(*(np.zeros((8, size), np.float32) for size in (2, 2, 3)))
-    monkeypatch.setattr(icomma, "render_and_match", lambda *_: (found, SimpleNamespace(camera=None)))
+    monkeypatch.setattr(icomma, "render_and_match", lambda *_: iter([(found, SimpleNamespace(camera=None))]))
     monkeypatch.setattr(icomma, "epipolar_inliers", lambda *_: np.arange(8) < kept)
     monkeypatch.setattr(icomma, "match_record", lambda *_: IterationRecord("match", PRIOR))
     images = SimpleNamespace(query=SimpleNamespace(intrinsics=LENS))
@@ -173,14 +175,16 @@ def sampled(monkeypatch: pytest.MonkeyPatch):
             drawn.append((len(parents), degrees, share, count))
             return [PRIOR] * count
 
-        def score(pose, images, tools, options, scored):
-            support = next(left)
-            solved = SimpleNamespace(support=support, pose=Pose(np.diag([1.0, -1, -1, 1]))) if support >= 0 else None
-            scored.append(mc_do._Hypothesis(pose, solved))
-            return IterationRecord("hypothesis", pose)
+        def scores(poses, images, tools, options, scored):
+            turned = Pose(np.diag([1.0, -1, -1, 1]))
+            for pose in poses:
+                support = next(left)
+                solved = SimpleNamespace(support=support, pose=turned) if support >= 0 else None
+                scored.append(mc_do._Hypothesis(pose, solved))
+                yield IterationRecord("hypothesis", pose)
 
         monkeypatch.setattr(mc_do, "around", around)
-        monkeypatch.setattr(mc_do, "_score", score)
+        monkeypatch.setattr(mc_do, "_scores", scores)
         query = Query(np.zeros((64, 64, 3), np.uint8), LENS, "given", LENS, prior=PRIOR if prior else None)
         tools = SimpleNamespace(prepared=mc_do.Prepared(FOCUS, None, (PRIOR,) * 5), rng=None, matcher=None)  # type: ignore[arg-type]
         chosen = mc_do.Options(iterations=0, refinement_steps=0, **options)

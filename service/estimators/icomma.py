@@ -125,7 +125,7 @@ def _rematch(
     camera: Camera, images: QueryImages, tools: Tools[Focus], min_matches: int
 ) -> tuple[Correspondences | None, IterationRecord]:
     """Match the photo with a render; return the epipolar inliers, None where they are too few, and the record."""
-    found, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
+    found, view = next(render_and_match([camera], tools.rasterizer, images, tools.image_matcher))
     kept = epipolar_inliers(found, images.query.intrinsics)
     record = match_record("match", camera.pose, found, kept, view.camera)
     if int(kept.sum()) < min_matches:

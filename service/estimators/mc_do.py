@@ -16,7 +16,7 @@ MC and DO is the best pose so far, not the last.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -184,8 +184,8 @@ def _sample(
         # What the best ones' matches were solved to is scored, too, with a render of its own.
         if number:
             poses = [*parents, *poses]
-        for pose in poses:
-            yield _score(pose, images, tools, options, scored)
+        for record in _scores(poses, images, tools, options, scored):
+            yield record
             # From this support on DO converges: further hypotheses would cost renders for nothing.
             if scored[-1].support > config.enough_support:
                 break
@@ -201,17 +201,18 @@ def _sample(
     return scored[0].pose
 
 
-def _score(
-    pose: Pose, images: QueryImages, tools: Tools[Prepared], options: Options, scored: list[_Hypothesis]
-) -> IterationRecord:
-    """Render a hypothesis from the pruned scene, match, solve, and append it to those scored."""
-    camera = Camera(sized(images.query.intrinsics, options.hypothesis_px), pose)
+def _scores(
+    poses: Sequence[Pose], images: QueryImages, tools: Tools[Prepared], options: Options, scored: list[_Hypothesis]
+) -> Iterator[IterationRecord]:
+    """Render hypotheses from the pruned scene; match and solve one after the other, and append each to those scored."""
+    size = sized(images.query.intrinsics, options.hypothesis_px)
     renderer = Counted(tools.prepared.pruned, tools.tally)
-    matches, view = render_and_match(camera, renderer, images, tools.image_matcher)
-    solved = _solve(matches, pose, images.query, tools, None)
-    scored.append(_Hypothesis(pose, solved))
-    best = max(scored, key=lambda h: h.support)
-    return _record("hypothesis", best.pose, matches, solved, view)
+    found = render_and_match([Camera(size, pose) for pose in poses], renderer, images, tools.image_matcher)
+    for pose, (matches, view) in zip(poses, found, strict=True):
+        solved = _solve(matches, pose, images.query, tools, None)
+        scored.append(_Hypothesis(pose, solved))
+        best = max(scored, key=lambda h: h.support)
+        yield _record("hypothesis", best.pose, matches, solved, view)
 
 
 def _optimize_decoupled(
@@ -221,7 +222,7 @@ def _optimize_decoupled(
     pose, best, most = start, start, -1.0
     for iteration in range(options.iterations):
         camera = Camera(sized(images.query.intrinsics, options.render_px), pose)
-        matches, view = render_and_match(camera, tools.rasterizer, images, tools.image_matcher)
+        matches, view = next(render_and_match([camera], tools.rasterizer, images, tools.image_matcher))
         solved = _solve(matches, pose, images.query, tools, iteration if options.solver == "gradient" else None)
         # Without enough matches the next render would be the same.
         if solved is None:

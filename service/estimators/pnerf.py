@@ -24,7 +24,7 @@ from jaxtyping import Float64
 from service.estimators.inerf import required_prior
 from service.interfaces import Tools
 from service.pose.descent.adam import Adam
-from service.pose.descent.gradient_descent import So3T3, loss_and_gradient, require_within
+from service.pose.descent.gradient_descent import So3T3, losses_and_gradients, require_within
 from service.pose.descent.losses import loss_against, require_loss
 from service.pose.features.image_sizes import sized
 from service.pose.features.query_images import QueryImages
@@ -128,9 +128,10 @@ def run(
         # Per number: three of the rotation, three of the translation.
         rates = decay * np.repeat([options.turn_rate, options.shift_rate], 3)
         best, least = start, np.inf
-        for hypothesis in hypotheses:
-            pose = hypothesis.pose
-            hypothesis.update(*loss_and_gradient(tools.rasterizer, intrinsics, pose, loss), rates)
+        poses = [hypothesis.pose for hypothesis in hypotheses]
+        found = losses_and_gradients(tools.rasterizer, intrinsics, poses, loss)
+        for hypothesis, pose, (value, by_twist) in zip(hypotheses, poses, found, strict=True):
+            hypothesis.update(value, by_twist, rates)
             if hypothesis.loss < least:
                 best, least = pose, hypothesis.loss
         # All hypotheses of every step would fill the trace.

@@ -25,6 +25,7 @@ from service.estimators.search_state import (
     only_colours_doubt,
     refine_ambiguous,
     refined_in_other_light,
+    rendered_ahead,
     seen_from,
 )
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
@@ -52,7 +53,7 @@ def check_rivals(state: SearchState) -> Generator[IterationRecord, None, bool]:
         if found is not None and _fits_as_well(mirrored, found, limit):
             return False
     seen = seen_from(state, answer)
-    for rival in _rivals(state, answer, seen):
+    for rival in rendered_ahead(state, _rivals(state, answer, seen), answer):
         found = yield from refine_ambiguous(state, rival, answer)
         if found is None or not seen.differs_from(found.pose, config.ambiguity):
             continue

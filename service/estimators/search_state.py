@@ -6,7 +6,7 @@ doubt an answer that was found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
-from service.pose.features.rendered_views import VIEWS, ViewRenderer
+from service.pose.features.rendered_views import VIEWS, ViewRenderer, camera_of, in_batches
 from service.pose.matching.match_stages import match_candidates
 from service.pose.refinement.refine_stage import (
     RefinedPose,
@@ -343,7 +343,7 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
     images = state.images.corrected(answer.refined.correction)
     seen = seen_from(state, answer)
     answers = [answer]
-    for other in hypotheses_of_photo(state, images, seen, whole):
+    for other in rendered_ahead(state, hypotheses_of_photo(state, images, seen, whole), answer):
         found = yield from refine_ambiguous(state, other, answer)
         ambiguity = state.config.ambiguity
         if found is None or not all(
@@ -382,6 +382,17 @@ def hypotheses_of_photo(
         config.min_inliers_if_explained if whole else config.min_inliers,
         config,
     )
+
+
+def rendered_ahead(
+    state: SearchState, hypotheses: Iterable[AbsolutePose], answer: VerifiedPose
+) -> Iterator[AbsolutePose]:
+    """Yield the hypotheses; the first renders of their refinements are made together if the renderer prefers that."""
+    query = state.images.query.corrected(answer.refined.correction)
+    for some in in_batches(hypotheses, state.tools.rasterizer.cameras_at_once):
+        first_px = state.config.refinement.first_render_px
+        state.renderer.render_ahead([camera_of(query, hypothesis.pose, first_px) for hypothesis in some])
+        yield from some
 
 
 def refine_ambiguous(

@@ -45,7 +45,7 @@ from service.interfaces import Answer, Tools
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
 from service.pose.features.image_sizes import PHOTO_PX, sized
-from service.pose.features.rendered_views import View, view_from
+from service.pose.features.rendered_views import View, views_from
 from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.matching.match_stages import match_candidates, record_of, render_and_rematch, solve_matches
 from service.pose.matching.render_and_match import render_and_match
@@ -212,9 +212,9 @@ def _search_free_views(
     yield IterationRecord("retrieve_free_views", cameras[0].pose, candidates=candidates)
 
     def views() -> Iterator[View]:
-        for camera in cameras:
+        for view in views_from(cameras, tools.rasterizer, tools.matcher):
             untried.popleft()
-            yield view_from(camera, tools.rasterizer, tools.matcher)
+            yield view
 
     # The last views there are: of few matches, too, a render at the pose tells whether they are chance.
     return (yield from _match_and_refine(views(), variant, state, min_share=0.0))
@@ -267,8 +267,7 @@ def _sample_poses(variant: ImageVariant, state: SearchState) -> StageResult:
     size = sized(images.query.intrinsics, config.sample_render_px)
     error_px = MATCH_ERROR_PX * PHOTO_PX / config.sample_render_px
     best: AbsolutePose | None = None
-    for pose in poses:
-        matches, view = render_and_match(Camera(size, pose), tools.rasterizer, images)
+    for matches, view in render_and_match([Camera(size, pose) for pose in poses], tools.rasterizer, images):
         found = solve_matches(matches, images.query, error_px, config.matching.view_trials)
         if found and (best is None or found.num_inliers > best.num_inliers):
             best = found

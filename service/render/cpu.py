@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from service.interfaces import Frame, SceneGradients
+from service.interfaces import Frame, Rasterizer, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
 from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, blend
 from service.render.pack import LANES, Packed, aligned, fill, pack
@@ -66,7 +66,7 @@ def dilation_for(camera: Camera, info: SceneInfo) -> float:
     return DEFAULTS.dilation_px2 * ratio * ratio
 
 
-class CpuRasterizer:
+class CpuRasterizer(Rasterizer):
     """`Rasterizer` on the CPU. Scratch memory is kept per thread and grows to the largest image so far.
 
     The gradients use the tile lists of the thread's last image if it was of the same camera object; else they

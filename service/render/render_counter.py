@@ -12,7 +12,7 @@ from service.interfaces import Frame, Rasterizer, RenderTally, SceneGradients
 from service.types import Camera, GaussianScene
 
 
-class Counted:
+class Counted(Rasterizer):
     """`Rasterizer` that delegates to another one and counts images and gradients; one for each job."""
 
     def __init__(self, inner: Rasterizer, tally: RenderTally) -> None:
@@ -23,6 +23,11 @@ class Counted:
     def nbytes(self) -> int:
         """As the inner rasterizer."""
         return self.inner.nbytes
+
+    @property
+    def cameras_at_once(self) -> int:
+        """As the inner rasterizer."""
+        return self.inner.cameras_at_once
 
     def of(self, scene: GaussianScene) -> Counted:
         """As the inner rasterizer; the new one adds to the same tally."""
@@ -47,6 +52,11 @@ class Counted:
         """Return the gradient; it counts as one render."""
         self.tally.count += 1
         return self.inner.pose_gradient(camera, d_rgb, d_depth, d_alpha)
+
+    def pose_gradients(self, cameras: Sequence[Camera], d_rgb: Sequence[Any]) -> Float64[np.ndarray, "n 6"]:
+        """Return the gradients; each counts as one render."""
+        self.tally.count += len(cameras)
+        return self.inner.pose_gradients(cameras, d_rgb)
 
     def scene_gradients(self, camera: Camera, d_rgb: Any, d_depth: Any = None, d_alpha: Any = None) -> SceneGradients:
         """Return the gradients; they count as one render."""

@@ -13,7 +13,7 @@ have the meaning that they have in the sources.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +25,7 @@ from service.interfaces import Rasterizer
 from service.pose.absolute_pose.decoupled import rotate_about, translate_in_camera
 from service.pose.descent.adam import Adam
 from service.pose.descent.losses import Loss
+from service.pose.features.rendered_views import in_batches
 from service.pose.features.scene_focus import Focus
 from service.types import Camera, Intrinsics, Pose
 
@@ -66,6 +67,17 @@ def loss_and_gradient(
     (frame,) = rasterizer.render([camera])
     value, d_rgb = loss(frame.rgb)
     return value, rasterizer.pose_gradient(camera, d_rgb)
+
+
+def losses_and_gradients(
+    rasterizer: Rasterizer, intrinsics: Intrinsics, poses: Sequence[Pose], loss: Loss
+) -> Iterator[tuple[float, Float64[np.ndarray, "6"]]]:
+    """Yield `loss_and_gradient` of each pose; as many as the renderer prefers are rendered in one call."""
+    for some in in_batches(poses, rasterizer.cameras_at_once):
+        cameras = [Camera(intrinsics, pose) for pose in some]
+        found = [loss(frame.rgb) for frame in rasterizer.render(cameras)]
+        gradients = rasterizer.pose_gradients(cameras, [d_rgb for _, d_rgb in found])
+        yield from zip((value for value, _ in found), gradients, strict=True)
 
 
 def descend(

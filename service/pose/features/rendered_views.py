@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -32,6 +35,7 @@ class ViewConfig:
 
 
 VIEWS = ViewConfig()
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,15 +58,14 @@ class RenderedView:
     def view(self, matcher: Matcher) -> View:
         """Return the render's features with their scene points, extracted once."""
         if self._view is None:
-            found = matcher.extract(to_uint8(self.frame.rgb), VIEWS.max_features)
-            self._view = backprojected(found, self.frame, self.camera)
+            (self._view,) = views_of([self.frame], [self.camera], matcher)
         return self._view
 
     def shows_the_same_as(self, camera: Camera, tolerance_px: float) -> bool:
         """Return whether nine in ten of the surface points seen here are within this distance in `camera`'s image."""
         own, size = self.camera, camera.intrinsics
         # The common case: nothing moved at all.
-        if np.array_equal(camera.pose.world_from_camera, own.pose.world_from_camera) and size == own.intrinsics:
+        if _is_same(camera, own):
             return True
         height, width = self.frame.alpha.shape
         if (width, height) != (size.width, size.height):
@@ -79,17 +82,28 @@ class RenderedView:
         return bool((error < tolerance_px).mean() > VIEWS.min_unmoved_share)
 
 
+def _is_same(a: Camera, b: Camera) -> bool:
+    return a.intrinsics == b.intrinsics and np.array_equal(a.pose.world_from_camera, b.pose.world_from_camera)
+
+
 @dataclass(slots=True)
 class ViewRenderer:
     """Renders the scene as a query's camera sees it; its latest render is used again where the camera hardly moved."""
 
     rasterizer: Rasterizer
     latest: RenderedView | None = None
+    _ahead: list[RenderedView] = field(default_factory=list, repr=False)
 
     def render(self, camera: Camera) -> RenderedView:
-        """Return a new render of the scene at full detail from this camera, and keep it as the latest."""
-        self.latest = RenderedView(self.rasterizer.render([camera])[0], camera)
+        """Return a render of the scene at full detail from this camera, and keep it as the latest."""
+        same = [rendered for rendered in self._ahead if _is_same(rendered.camera, camera)]
+        self.latest = same[0] if same else RenderedView(self.rasterizer.render([camera])[0], camera)
         return self.latest
+
+    def render_ahead(self, cameras: Sequence[Camera]) -> None:
+        """Render in one call, if the renderer prefers that, what `render` is going to be asked for; forget the last."""
+        if self.rasterizer.cameras_at_once > 1:
+            self._ahead = list(map(RenderedView, self.rasterizer.render(cameras), cameras))
 
     def at(self, query: Query, pose: Pose) -> RenderedView:
         """Return a render with the query's intrinsics, within a pixel of what the pose shows (`near`)."""
@@ -107,10 +121,23 @@ def camera_of(query: Query, pose: Pose, long_side: int | None = None) -> Camera:
     return Camera(sized(query.intrinsics, long_side or RENDER_PX), pose)
 
 
-def view_from(camera: Camera, rasterizer: Rasterizer, matcher: Matcher) -> View:
-    """Render, extract features at the render's own size, and backproject them."""
-    (frame,) = rasterizer.render([camera])
-    return backprojected(matcher.extract(to_uint8(frame.rgb), VIEWS.max_features), frame, camera)
+def in_batches(items: Iterable[Item], size: int) -> Iterator[list[Item]]:
+    """Yield the items in lists of this size, the last one shorter; no item is asked for before its list is."""
+    left = iter(items)
+    while batch := list(islice(left, size)):
+        yield batch
+
+
+def views_from(cameras: Iterable[Camera], rasterizer: Rasterizer, matcher: Matcher) -> Iterator[View]:
+    """Yield a view from each camera, rendered when it is asked for, with as many others as the renderer prefers."""
+    for some in in_batches(cameras, rasterizer.cameras_at_once):
+        yield from views_of(rasterizer.render(some), some, matcher)
+
+
+def views_of(frames: Sequence[Frame], cameras: Sequence[Camera], matcher: Matcher) -> list[View]:
+    """Extract features of renders, at their own size, and backproject them."""
+    found = [matcher.extract(to_uint8(frame.rgb), VIEWS.max_features) for frame in frames]
+    return [backprojected(*each) for each in zip(found, frames, cameras, strict=True)]
 
 
 def backprojected(features: Features, frame: Frame, camera: Camera) -> View:

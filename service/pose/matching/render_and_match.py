@@ -6,30 +6,37 @@ renders with the 512-px photo found 10 and 18 right matches in the median, with 
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
 from service.interfaces import Features, Frame, ImageMatcher, Rasterizer
 from service.pose.features.query_images import QueryImages
-from service.pose.features.rendered_views import View, backprojected, to_uint8, view_from
+from service.pose.features.rendered_views import View, backprojected, in_batches, to_uint8, views_of
 from service.pose.matching.correspondences import Correspondences, correspondences
 from service.results import IterationRecord, MatchVectors
 from service.types import NO_CORRECTION, Camera, Intrinsics, IntrinsicsCorrection, Pose, Query
 
 
 def render_and_match(
-    camera: Camera, rasterizer: Rasterizer, images: QueryImages, image_matcher: ImageMatcher | None = None
-) -> tuple[Correspondences, View]:
-    """Render, match with the photo, and backproject; `camera` has the photo's intrinsics at any size.
+    cameras: Sequence[Camera], rasterizer: Rasterizer, images: QueryImages, image_matcher: ImageMatcher | None = None
+) -> Iterator[tuple[Correspondences, View]]:
+    """Render, match with the photo, and backproject; yield what each camera, with the photo's intrinsics, gives.
 
-    With an image matcher the two images are matched as they are, without features of each.
+    Each is rendered when it is asked for, with as many others as the renderer prefers. With an image matcher the two
+    images are matched as they are, without features of each.
     """
-    if image_matcher:
-        (frame,) = rasterizer.render([camera])
-        return _matched_images(frame, camera, image_matcher, images)
-    view = view_from(camera, rasterizer, images.matcher)
-    return correspondences(images.features(camera.intrinsics.long_side), view, images.matcher), view
+    for some in in_batches(cameras, rasterizer.cameras_at_once):
+        frames = rasterizer.render(some)
+        if image_matcher:
+            pairs = zip(frames, some, strict=True)
+            yield from (_matched_images(frame, camera, image_matcher, images) for frame, camera in pairs)
+            continue
+        for view in views_of(frames, some, images.matcher):
+            features = images.features(view.camera.intrinsics.long_side)
+            yield correspondences(features, view, images.matcher), view
 
 
 def _matched_images(

@@ -21,15 +21,16 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from service.geometry import look_at, transformed, unproject
-from service.interfaces import Features, Matcher, Rasterizer
+from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.pose.features.image_sizes import sized
-from service.pose.features.rendered_views import View, view_from
+from service.pose.features.rendered_views import View, in_batches, views_of
 from service.pose.retrieval.lod_proxy import lod_proxy
 from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.view_files import read_views, write_views
@@ -101,9 +102,12 @@ class FreeViews:
 def _rendered(
     scene: GaussianScene, rasterizer: Rasterizer, matcher: Matcher, index: Sequence[View]
 ) -> tuple[View, ...]:
+    def seen(some: list[Camera]) -> list[View]:
+        return [_strongest(view) for view in views_of(rasterizer.render(some), some, matcher)]
+
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="free-views") as pool:
         cameras = free_view_cameras(scene, rasterizer, index, lambda f, items: list(pool.map(f, items)))
-        return tuple(pool.map(lambda camera: _strongest(view_from(camera, rasterizer, matcher)), cameras))
+        return tuple(chain.from_iterable(pool.map(seen, in_batches(cameras, rasterizer.cameras_at_once))))
 
 
 def _strongest(view: View) -> View:
@@ -130,7 +134,8 @@ def free_view_cameras(
     limit = min(config.max_views, config.views_per_index_view * len(index))
     poses = _candidates(seeing, rng, config.candidates_per_view * limit, config)
     nearest = config.min_distance * float(np.median([_distance(view) for view in seeing]))
-    cells = mapped(lambda pose: _solid_cells(Camera(lens, pose), search, nearest, config), poses)
+    batches = list(in_batches([Camera(lens, pose) for pose in poses], search.cameras_at_once))
+    cells = list(chain.from_iterable(mapped(lambda some: _solid_cells(some, search, nearest, config), batches)))
     solid = [i for i, own in enumerate(cells) if own is not None]
     known = [_cells(view.points_in_world.astype(np.float64), view.camera.pose, config) for view in seeing]
     chosen = _choice([cells[i] for i in solid], np.unique(np.concatenate(known)), limit, config)
@@ -161,10 +166,14 @@ def _unit(vector: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3"]:
 
 
 def _solid_cells(
-    camera: Camera, search: Rasterizer, nearest: float, config: FreeViewConfig
-) -> Int64[np.ndarray, "k"] | None:
-    """Return what a candidate sees (`_cells`); None if too little of its image is a single surface."""
-    (frame,) = search.render([camera], approximate=True)
+    cameras: Sequence[Camera], search: Rasterizer, nearest: float, config: FreeViewConfig
+) -> list[Int64[np.ndarray, "_"] | None]:
+    """Render candidates; return what each sees (`_cells`), None if too little of its image is a single surface."""
+    frames = search.render(cameras, approximate=True)
+    return [_cells_seen(*each, nearest, config) for each in zip(frames, cameras, strict=True)]
+
+
+def _cells_seen(frame: Frame, camera: Camera, nearest: float, config: FreeViewConfig) -> Int64[np.ndarray, "k"] | None:
     height, width = frame.alpha.shape
     row, column = (grid.ravel() for grid in np.mgrid[2:height:4, 2:width:4])
     kept = shows_single_surface(frame, nearest)[row, column]

@@ -12,13 +12,14 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from service.interfaces import Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
-from service.pose.features.rendered_views import VIEWS, View, backprojected, to_uint8
+from service.pose.features.rendered_views import VIEWS, View, in_batches, to_uint8, views_of
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
 from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_space import SPACE
@@ -64,7 +65,7 @@ def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: Viewp
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = LOD) -> ViewIndex:
-    """Render the views and extract their features, one camera a core, then compute the scene's symmetries.
+    """Render the views and extract their features, one batch a core, then compute the scene's symmetries.
 
     The threads end with the building, and with them their working memory, which grows with the scene.
     """
@@ -73,14 +74,18 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
         every = -(-len(cameras) * CORNERS.of_view // CORNERS.of_all_views)
         renderer = OccludedRenderer(tools.scene, tools.rasterizer, tools.rng, lod)
 
-        def seen(number: int) -> tuple[View, Corners | None]:
-            frame = renderer.render(cameras[number])
-            rgb = to_uint8(frame.rgb)
-            view = backprojected(tools.matcher.extract(rgb, VIEWS.max_features), frame, cameras[number])
-            return view, detect_corners(rgb, CORNERS.of_view) if number % every == 0 else None
+        def seen(numbers: list[int]) -> list[tuple[View, Corners | None]]:
+            some = [cameras[number] for number in numbers]
+            frames = renderer.render(some)
+            corners = [
+                detect_corners(to_uint8(frame.rgb), CORNERS.of_view) if number % every == 0 else None
+                for number, frame in zip(numbers, frames, strict=True)
+            ]
+            return list(zip(views_of(frames, some, tools.matcher), corners, strict=True))
 
         # In order: the index is the same whatever thread is first.
-        found = list(pool.map(seen, range(len(cameras))))
+        batches = in_batches(range(len(cameras)), tools.rasterizer.cameras_at_once)
+        found = list(chain.from_iterable(pool.map(seen, batches)))
         views = tuple(view for view, _ in found)
         mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
         repeated = repeats_itself(views, tools.matcher, pool)

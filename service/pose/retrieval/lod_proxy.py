@@ -4,6 +4,7 @@ that everything is occluded.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -86,11 +87,11 @@ class OccludedRenderer:
         self._rasterizer, self._config = rasterizer, config
         self._proxy = lod_proxy(scene, rasterizer, rng, config) if scene.count > config.min_gaussians else None
 
-    def render(self, camera: Camera) -> Frame:
-        """Return an approximate render from this camera; of a large scene, without what is occluded."""
+    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+        """Return approximate renders; of a large scene, without what is occluded."""
         depths = None
         if self._proxy:
-            small = Camera(camera.intrinsics.with_long_side(self._config.render_px), camera.pose)
-            coarse = self._proxy.render([small], approximate=True)
+            small = [Camera(c.intrinsics.with_long_side(self._config.render_px), c.pose) for c in cameras]
+            coarse = self._proxy.render(small, approximate=True)
             depths = [occlusion_depths(frame, self._config) for frame in coarse]
-        return self._rasterizer.render([camera], approximate=True, occlusion_depths=depths)[0]
+        return self._rasterizer.render(cameras, approximate=True, occlusion_depths=depths)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.interfaces import Matcher, Rasterizer
+from service.interfaces import Frame, Matcher, Rasterizer
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_intrinsics
@@ -82,15 +82,13 @@ def like_its_mirror_image(
         return False
     # Spread over the index, whose views are spread over the scene.
     probes = np.unique(np.linspace(0, len(views) - 1, config.mirror_probes).astype(int))
-    inliers = pool.map(lambda i: _mirrored_inliers(views[i], views, rasterizer, matcher, config), probes)
+    frames = rasterizer.render([views[i].camera for i in probes])
+    inliers = pool.map(lambda i, frame: _mirrored_inliers(views[i], frame, views, matcher, config), probes, frames)
     return float(np.median(list(inliers))) >= config.min_mirror_inliers
 
 
-def _mirrored_inliers(
-    view: View, views: Sequence[View], rasterizer: Rasterizer, matcher: Matcher, config: SymmetryConfig
-) -> int:
+def _mirrored_inliers(view: View, frame: Frame, views: Sequence[View], matcher: Matcher, config: SymmetryConfig) -> int:
     """Return how many matches of a mirrored view with one of the others agree on a pose, at most."""
-    (frame,) = rasterizer.render([view.camera])
     intrinsics = mirrored_intrinsics(view.camera.intrinsics)
     # Mirroring the image changes its features, so they can't be taken from the index.
     features = matcher.extract(np.ascontiguousarray(to_uint8(frame.rgb)[:, ::-1]), VIEWS.max_features)
