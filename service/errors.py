@@ -22,6 +22,7 @@
       |-- QueueFull, RateLimited  too much work is waiting, or too much of it is yours; try again later
       |-- Unauthorized, Forbidden, NoKeys
       |-- BackendMissing     a package or device that a plug-in needs is not here
+      |-- DeviceMemoryFull   the GPU has too little memory left for a render
       `-- EstimatorFault     an estimator broke its contract (our mistake)
 
 "Not localized" is a result, never an exception. Each class has a stable `code`, which is part of the API.
@@ -202,6 +203,10 @@ class NoKeys(SplatfixError):
 
 class BackendMissing(SplatfixError):
     code = "backend_missing"
+
+
+class DeviceMemoryFull(SplatfixError):
+    code = "device_memory_full"
 
 
 class EstimatorFault(SplatfixError):

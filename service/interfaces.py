@@ -24,6 +24,8 @@ class Frame:
     """Expected z-depth: weighted mean over the ray; 0 where alpha is 0. Averages translucent surfaces."""
     median_depth: Float32[np.ndarray, "h w"]
     """z-depth of the Gaussian at which transmittance falls below one half; 0 where it never does."""
+    device_rgb: Any = None
+    """`rgb` in 8 bits where the renderer made it: a tensor (h, w, 3) on its `tensor_device`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,11 @@ class Rasterizer(Protocol):
     def cameras_at_once(self) -> int:
         """Images worth asking for in one call by who needs many. 1: as they are needed, each in its caller's thread."""
         return 1
+
+    @property
+    def tensor_device(self) -> str:
+        """PyTorch's name of the device on which its images are, too (`Frame.device_rgb`); empty: nowhere but here."""
+        return ""
 
     def of(self, scene: GaussianScene) -> Rasterizer:
         """Return a rasterizer of the same kind for another scene."""
@@ -137,6 +144,15 @@ class Matcher(Protocol):
 
     def match(self, a: Features, b: Features) -> Int32[np.ndarray, "m 2"]:
         """Return pairs of indices into `a` and `b`, the surest first; each index at most once."""
+        ...
+
+
+@runtime_checkable
+class RenderMatcher(Protocol):
+    """A `Matcher` that also finds the features of renders on the renderer's own device."""
+
+    def extract_rendered(self, frames: Sequence[Frame], limit: int) -> list[Features]:
+        """Return `extract` of each render in 8 bits, all of one size, from its `device_rgb`."""
         ...
 
 

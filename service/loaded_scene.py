@@ -93,15 +93,16 @@ class LoadedScene:
         matcher: str = DEFAULT_MATCHER,
     ) -> LoadedScene:
         """Bind tools to a scene in memory. Raises UnknownName, and BackendMissing as `load`."""
-        features = images = MATCHERS.load(matcher).create()
+        MATCHERS.load(matcher)  # an unknown one is told before the scene is packed
+        searched = without_floaters(scene)
+        renderer, skipped_rasterizers, warnings = _renderer(searched, rasterizer)
+        features = images = _matcher(matcher, renderer)
         if isinstance(images, ImageMatcher):
             # Views are retrieved by features of single images, which a matcher of pairs does not have.
-            features = MATCHERS.load(DEFAULT_MATCHER).create()
+            features = _matcher(DEFAULT_MATCHER, renderer)
         else:
             # It extracts features, which every method can use.
             images = None
-        searched = without_floaters(scene)
-        renderer, skipped_rasterizers, warnings = _renderer(searched, rasterizer)
         part = None if searched is scene else searched
         return cls(scene, renderer, features, images, cache_dir, skipped_rasterizers, warnings, part)
 
@@ -207,6 +208,13 @@ def choose_rasterizer() -> tuple[str, str]:
             return name, "; ".join(reasons)
         reasons.append(f"{name}: {reason}")
     raise BackendMissing("; ".join(reasons), where="render")
+
+
+def _matcher(name: str, renderer: Rasterizer) -> Any:
+    """Return the matcher, on the renderer's device where it can be there."""
+    module = MATCHERS.load(name)
+    create_on = getattr(module, "create_on", None)
+    return create_on(renderer.tensor_device) if create_on else module.create()
 
 
 def _renderer(scene: GaussianScene, name: str | None) -> tuple[Rasterizer, str, tuple[str, ...]]:

@@ -25,7 +25,7 @@ FLOORS = {
             *("client", "live_client"),
             *("disk_cache", "operating_system"),
         },
-        {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin"},
+        {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
         {"localize", "loaded_scene"},
@@ -89,7 +89,9 @@ WRAPPED = {
     "torch": {
         "service/matchers/xfeat.py",
         "service/matchers/networks.py",
+        "service/matchers/xfeat_on_gpu.py",
         "service/render/gsplat_cuda.py",
+        "service/render/gsplat_median_depth.py",
         "service/scene_formats/checkpoint_process.py",
     },
     "gsplat": {"service/render/gsplat_cuda.py"},

@@ -163,7 +163,7 @@ def test_it_runs_to_its_end_with_the_stand_in(room, tmp_path, monkeypatch):
     assert rows["sizes"][0]["bytes"] < rows["sizes"][1]["bytes"]
     scene, image, after = (row["happens"] for row in rows["out of memory"])
     assert scene.startswith("BackendMissing: render: the GPU has no memory left")
-    assert image.startswith("OutOfMemoryError")
+    assert image.startswith("DeviceMemoryFull: render: the GPU has too little memory left")
     assert after == "the same image"
     assert rows["many jobs"][-1]["jobs"] == 4
     # What was printed is the table of the file.

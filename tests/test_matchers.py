@@ -12,9 +12,14 @@ from service.interfaces import Matcher
 from service.matchers import MATCHERS
 from service.matchers.mutual import mutual_nearest
 
+ON_GPU = "xfeat_on_gpu"
+"""The matcher on the renderer's device, here the CPU: its own part of the contract is tested everywhere."""
 
-@pytest.fixture(scope="module", params=MATCHERS.names())
+
+@pytest.fixture(scope="module", params=[*MATCHERS.names(), ON_GPU])
 def matcher(request: pytest.FixtureRequest) -> Matcher:
+    if request.param == ON_GPU:
+        return MATCHERS.load("xfeat").create_on("cpu")
     reason = MATCHERS.missing(request.param)
     if reason:
         pytest.skip(reason)
@@ -130,6 +135,19 @@ def test_xfeat_agrees_with_the_package_that_it_replaces(capsys: pytest.CaptureFi
     i, j = np.array(common).T
     cosine = (ours.descriptors[i] * theirs["descriptors"].numpy()[j]).sum(1)
     assert np.quantile(cosine, 0.05) > 0.97  # bilinear against bicubic, half a pixel apart at the border
+
+
+@pytest.mark.parametrize("size", [(256, 320), (100, 37)])
+def test_xfeat_on_the_gpu_is_xfeat(size: tuple[int, int]) -> None:
+    image, xfeat = textured(*size), MATCHERS.load("xfeat")
+    ours, theirs = xfeat.create_on("cpu").extract(image, 200), xfeat.create().extract(image, 200)
+    assert len(theirs.scores) > 20
+    assert np.abs(ours.points_px - theirs.points_px).max() < 1e-4
+    assert np.abs(ours.scores - theirs.scores).max() < 1e-5
+    assert np.abs(ours.descriptors - theirs.descriptors).max() < 1e-5
+    other = xfeat.create().extract(textured(*size, seed=1), 200)
+    for a, b in ((ours, theirs), (ours, other)):
+        assert np.array_equal(xfeat.create_on("cpu").match(a, b), xfeat.create().match(a, b))
 
 
 def test_without_its_package_xfeat_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,7 @@ def scene_of(means: np.ndarray, opacity: float | np.ndarray = 0.9) -> GaussianSc
 # ------------------------------------------------------------------ settings
 
 COUNTS = ("workers", "queue_size", "queue_bytes", "keep_jobs", "crashes", "max_upload_bytes", "max_frames")
-COUNTS += ("max_uploads", "max_scene_bytes", "scene_memory_bytes")
+COUNTS += ("max_uploads", "max_scene_bytes", "scene_memory_bytes", "gpu_memory_bytes")
 SPANS = ("max_job_s", "stuck_s", "keep_days", "upload_s", "send_s", "max_wait_s")
 MAY_BE_ZERO = ("port", "shutdown_s", "keep_bytes", "photo_grace_s", "keep_lenses")
 

@@ -14,7 +14,7 @@ from service.bench.gpu_runner import Row
 from service.bench.gpu_shared import Shared, every
 from service.bench.large_scenes import keep_most_contributing, surround_with_copies
 from service.bench.scale import process_memory
-from service.errors import BackendMissing
+from service.errors import BackendMissing, DeviceMemoryFull
 from service.interfaces import Frame
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene, choose_rasterizer
 from service.types import Camera, GaussianScene
@@ -36,10 +36,7 @@ def sizes(shared: Shared) -> Iterator[Row]:
         scene = largest if count == largest.count else _first(largest, count)
         try:
             row = _measure_size(shared, scene, cameras)
-        except (BackendMissing, RuntimeError) as error:
-            # PyTorch's own error of a full GPU; any other may have made the GPU unusable, and ends the part.
-            if not isinstance(error, BackendMissing) and type(error).__name__ != "OutOfMemoryError":
-                raise
+        except (BackendMissing, DeviceMemoryFull) as error:  # any other may have made the GPU unusable
             yield {"gaussians": count, "error": f"{type(error).__name__}: {error}"[:300]}
             return
         yield {"gaussians": count, **row}

@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from service.device_memory import DEVICE_MEMORY
 from service.errors import SceneNotReady, SplatfixError
 from service.estimators import ESTIMATORS
 from service.jobs.engine import (
@@ -65,6 +66,8 @@ class EngineConfig:
     """Size limit of that folder; None: none."""
     memory_bytes: int | None = None
     """Of all scenes together; None: any number."""
+    gpu_memory_bytes: int | None = None
+    """Of all calls of the GPU at once, beside the scenes; None: four fifths of what is free."""
     data_folder: Path | None = None
     """Where registrations are that can't be beside their scenes."""
 
@@ -81,6 +84,7 @@ class EmbeddedEngine:
     """Implements `Engine`."""
 
     def __init__(self, config: EngineConfig) -> None:
+        DEVICE_MEMORY.set_budget(config.gpu_memory_bytes)
         self._manager = Scenes(
             config.estimator,
             config.cache_dir,

@@ -91,15 +91,22 @@ class XFeat:
 
 
 _lock = threading.Lock()
-_shared: list[XFeat] = []
+_shared: dict[str, XFeat] = {}
 
 
 def create() -> XFeat:
     """Return the one instance: it has no state, and its weights need not be twice in memory."""
+    return create_on("")
+
+
+def create_on(device: str) -> XFeat:
+    """Return the one instance for the device that renders are on (`Rasterizer.tensor_device`); empty: the host."""
+    from service.matchers.xfeat_on_gpu import XFeatOnGpu
+
     with _lock:
-        if not _shared:
-            _shared.append(XFeat())
-        return _shared[0]
+        if device not in _shared:
+            _shared[device] = XFeatOnGpu(device) if device else XFeat()
+        return _shared[device]
 
 
 def _folded(module: torch.nn.Module) -> torch.nn.Module:

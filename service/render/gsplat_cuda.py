@@ -1,20 +1,17 @@
 """The renderer on an NVIDIA GPU: gsplat's CUDA kernels, with the semantics of `cpu`. The only file with gsplat.
 
-Images of one size are rendered in one call; images and gradients are computed on the device, and only they are copied
-to the host. Gradients are summed in no fixed order, so their last digits differ from call to call.
-
-gsplat has no median depth. A second pass takes from its kernel the Gaussians that each pixel blends, 256 at a time and
-from near to far, and finds the one at which the transmittance falls to one half:
-
-    tile's list, by depth   |  256 Gaussians  |  256 Gaussians  | ...
-    transmittance of a ray  1 ......... 0.7   0.7 ... 0.5 <- here: the ray is left out of later passes
+Images of one size are rendered in one call, as many as the memory budget of all jobs has room for; while one call's
+images are copied to the host, the next is computed. A call that finds too little memory is made again in parts.
+Gradients are summed in no fixed order, so their last digits differ from call to call.
 """
 
 from __future__ import annotations
 
 import copy
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -24,17 +21,26 @@ import torch
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from service.errors import BackendMissing
-from service.interfaces import Frame, SceneGradients
+from service.device_memory import DEVICE_MEMORY
+from service.errors import BackendMissing, DeviceMemoryFull
+from service.interfaces import Frame, Rasterizer, SceneGradients
 from service.render.cpu import dilation_for
+from service.render.gsplat_median_depth import TILE, median_depth
 from service.types import Camera, GaussianScene
 
-TILE = 16
-"""Pixels; gsplat's kernels take TILE * TILE Gaussians of a tile's list at a time."""
-PROJECTED_AT_ONCE = 4_000_000
-"""Gaussians times cameras in one call: some 200 bytes of GPU memory each at SH degree 3."""
-RAYS_AT_ONCE = 2**18
-"""Pixels of one pass for the median depth: some 100 bytes of GPU memory per Gaussian, at most 256 for each."""
+CAMERAS_AT_ONCE = 16
+"""In one call: so many images of 384 px have 1.8 million pixels, more than a large GPU computes at a time."""
+BUDGET_SHARE = 0.25
+"""Of the memory budget that one call plans for: others render meanwhile."""
+PROJECTED_BYTES, COEFFICIENT_BYTES = 250, 4
+"""Of a Gaussian in a call, for each camera: its projection, colour and entries in tiles' lists, and a colour
+coefficient. Counted from gsplat's arrays, not measured."""
+PIXEL_BYTES = 60
+"""Of an image with its sums, and of its copies. Counted likewise."""
+RAYS_AT_ONCE, FEWEST_RAYS = 2**18, 2**14
+"""Pixels of one pass for the median depth; the second after too little memory."""
+RAY_BYTES = 2000
+"""Of such a pass: some 100 bytes per Gaussian of a ray, mostly some 20 for each, at most 256."""
 
 
 class Kernels(NamedTuple):
@@ -101,12 +107,62 @@ def limit_device_memory(more_bytes: int | None) -> None:
 
 def _put(scene: GaussianScene, device: torch.device, kernels: Kernels) -> GsplatRasterizer:
     try:
-        return GsplatRasterizer(scene, device, kernels)
+        made = GsplatRasterizer(scene, device, kernels)
     except torch.OutOfMemoryError as error:
         raise BackendMissing(f"the GPU has no memory left for {scene.nbytes / 1e6:.0f} MB.", where="render") from error
+    if device.type == "cuda":
+        pooled = torch.cuda.memory_reserved() - torch.cuda.memory_allocated()
+        DEVICE_MEMORY.note_free(torch.cuda.mem_get_info()[0] + pooled)
+    return made
 
 
-class GsplatRasterizer:
+class _Copies:
+    """Images that are being copied to the host, in page-locked memory and on a stream of their own."""
+
+    def __init__(self, parts: Sequence[Tensor], device_rgb: Tensor) -> None:
+        self._parts, self._rgb = parts, device_rgb
+        self._done: Any = None
+        if not parts[0].is_cuda:
+            return
+        stream = torch.cuda.Stream()
+        stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(stream):
+            self._parts = [
+                torch.empty(part.shape, dtype=part.dtype, pin_memory=True).copy_(part, non_blocking=True)
+                for part in parts
+            ]
+            for part in parts:  # whose memory must not be used again before the copy has ended
+                part.record_stream(stream)
+            self._done = stream.record_event()
+
+    def frames(self) -> Iterator[Frame]:
+        """Wait for the copies' end; yield the images."""
+        if self._done is not None:
+            self._done.synchronize()
+        for *each, rgb in zip(*(part.numpy() for part in self._parts), self._rgb, strict=True):
+            for array in each:
+                array.flags.writeable = False
+            yield Frame(*each, rgb)
+
+
+@contextmanager
+def _memory(wanted_bytes: float) -> Iterator[None]:
+    """Wait until other calls leave room for this one. Raises DeviceMemoryFull."""
+    full = ""
+    with DEVICE_MEMORY.taken(wanted_bytes):
+        try:
+            yield
+        except torch.OutOfMemoryError as error:
+            full = str(error).split(". ")[0]
+    if full:
+        raise DeviceMemoryFull(
+            f"the GPU has too little memory left ({full}).",
+            where="render",
+            hint="Unload scenes, end what else uses the GPU, render smaller, or set SPLATFIX_RASTERIZER=cpu.",
+        )
+
+
+class GsplatRasterizer(Rasterizer):
     """`Rasterizer` by gsplat."""
 
     name = "gsplat_cuda"
@@ -123,6 +179,16 @@ class GsplatRasterizer:
     def nbytes(self) -> int:
         """GPU memory of the scene."""
         return sum(tensor.nbytes for tensor in self._parameters)
+
+    @property
+    def cameras_at_once(self) -> int:
+        """As many as a call has room for at the size of an index view, at most CAMERAS_AT_ONCE."""
+        return self._at_once(384 * 288)
+
+    @property
+    def tensor_device(self) -> str:
+        """The GPU; the CPU where a test has put the scene there."""
+        return self._on.type
 
     def of(self, scene: GaussianScene) -> GsplatRasterizer:
         """Copy another scene to the same GPU. Raises BackendMissing."""
@@ -153,14 +219,17 @@ class GsplatRasterizer:
         for index, camera in enumerate(cameras):
             k = camera.intrinsics
             groups[k.width, k.height, dilation_for(camera, self.scene.info)].append(index)
-        # gsplat allocates for all cameras of a call at once.
-        at_once = max(1, PROJECTED_AT_ONCE // max(1, self.scene.count))
-        frames: dict[int, Frame] = {}
-        for members in groups.values():
-            for first in range(0, len(members), at_once):
-                some = members[first : first + at_once]
-                frames.update(zip(some, self._render([cameras[i] for i in some]), strict=True))
-        return [frames[index] for index in range(len(cameras))]
+        order = [index for members in groups.values() for index in members]
+        calls = (call for members in groups.values() for call in self._calls([cameras[i] for i in members]))
+        frames = []
+        copied = next(calls, None)
+        while copied is not None:
+            # The next call is computed while the images of this one are copied.
+            following = next(calls, None)
+            frames += copied.frames()
+            copied = following
+        by_index = dict(zip(order, frames, strict=True))
+        return [by_index[index] for index in range(len(cameras))]
 
     def pose_gradient(
         self,
@@ -170,15 +239,44 @@ class GsplatRasterizer:
         d_alpha: Float32[np.ndarray, "h w"] | None = None,
     ) -> Float64[np.ndarray, "6"]:
         """Return d loss / d twist by automatic differentiation of the view matrix."""
-        views = self._views([camera]).requires_grad_()
-        image, alpha, _ = self._rasterize([camera], views, self._parameters)
-        (d_view,) = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), views)
+        d_image = d_rgb if d_depth is None else np.concatenate([d_rgb, d_depth[..., None]], -1)
+        return self._pose_gradients([camera], [d_image], None if d_alpha is None else [d_alpha])[0]
+
+    def pose_gradients(
+        self, cameras: Sequence[Camera], d_rgb: Sequence[Float32[np.ndarray, "_ _ 3"]]
+    ) -> Float64[np.ndarray, "n 6"]:
+        """Return the gradients, those of cameras of one image size in one call."""
+        sizes = {(c.intrinsics.width, c.intrinsics.height, dilation_for(c, self.scene.info)) for c in cameras}
+        if len(sizes) != 1:
+            return super().pose_gradients(cameras, d_rgb)
+        found = []
+        at_once = self._at_once(cameras[0].intrinsics.width * cameras[0].intrinsics.height)
+        for first in range(0, len(cameras), at_once):
+            some = slice(first, first + at_once)
+            found.append(self._pose_gradients(cameras[some], d_rgb[some], None))
+        return np.concatenate(found)
+
+    def _pose_gradients(
+        self,
+        cameras: Sequence[Camera],
+        d_image: Sequence[Float32[np.ndarray, "_ _ _"]],
+        d_alpha: Sequence[Float32[np.ndarray, "_ _"]] | None,
+    ) -> Float64[np.ndarray, "n 6"]:
+        """`d_image` has 3 channels, or 4 with that of the depth."""
+        with _memory(self._bytes_of(cameras, 0)):
+            views = self._views(cameras).requires_grad_()
+            image, alpha, _ = self._rasterize(cameras, views, self._parameters)
+            # Of an image each camera's own view matrix has a part, and no other's.
+            loss = (image[..., : d_image[0].shape[-1]] * self._tensor(np.stack(d_image))).sum()
+            if d_alpha is not None:
+                loss = loss + (alpha[..., 0] * self._tensor(np.stack(d_alpha))).sum()
+            (d_views,) = torch.autograd.grad(loss, views)
+            d_views = d_views.double().cpu().numpy()
         # camera_from_world becomes exp(-twist) @ camera_from_world; a matrix gradient D there contributes D V^T, whose
         # antisymmetric part belongs to the rotation and whose last column to the translation.
-        d_view, view = d_view[0].double().cpu().numpy(), camera.pose.camera_from_world
-        m = d_view @ view.T
-        rotation = [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]
-        return -np.array([*rotation, *m[:3, 3]])
+        m = d_views @ np.stack([camera.pose.camera_from_world.T for camera in cameras])
+        rotation = [m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]]
+        return -np.concatenate([np.stack(rotation, 1), m[:, :3, 3]], 1)
 
     def scene_gradients(
         self,
@@ -189,24 +287,56 @@ class GsplatRasterizer:
     ) -> SceneGradients:
         """Return d loss / d parameter of the Gaussians in view by automatic differentiation."""
         leaves = tuple(tensor.detach().requires_grad_() for tensor in self._parameters)
-        image, alpha, meta = self._rasterize([camera], self._views([camera]), leaves)
-        gradients = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), leaves)
-        # The CPU renderer, too, has rows for the Gaussians in view only.
-        seen = (meta["radii"][0] > 0).all(-1).nonzero()[:, 0]
-        return SceneGradients(
-            seen.int().cpu().numpy(), *(gradient[seen].float().cpu().numpy() for gradient in gradients)
-        )
+        with _memory(self._bytes_of([camera], 0) + self.nbytes):
+            image, alpha, meta = self._rasterize([camera], self._views([camera]), leaves)
+            gradients = torch.autograd.grad(self._loss(image, alpha, d_rgb, d_depth, d_alpha), leaves)
+            # The CPU renderer, too, has rows for the Gaussians in view only.
+            seen = (meta["radii"][0] > 0).all(-1).nonzero()[:, 0]
+            rows = [gradient[seen].float().cpu().numpy() for gradient in gradients]
+        return SceneGradients(seen.int().cpu().numpy(), *rows)
 
-    def _render(self, cameras: Sequence[Camera]) -> Iterator[Frame]:
-        """Render cameras of one image size and dilation."""
-        with torch.no_grad():
+    def _at_once(self, pixels: int) -> int:
+        """Return how many images of so many pixels one call is planned for."""
+        one, passes = self._bytes_per_camera(pixels), RAY_BYTES * RAYS_AT_ONCE
+        room = (BUDGET_SHARE * DEVICE_MEMORY.budget_bytes - passes) / one
+        return CAMERAS_AT_ONCE if math.isinf(room) else int(np.clip(room, 1, CAMERAS_AT_ONCE))
+
+    def _bytes_per_camera(self, pixels: int) -> int:
+        projected = PROJECTED_BYTES + 3 * COEFFICIENT_BYTES * self.scene.sh.shape[1]
+        return projected * self.scene.count + PIXEL_BYTES * pixels
+
+    def _bytes_of(self, cameras: Sequence[Camera], rays: int) -> float:
+        """Return an estimate of the memory that a call takes."""
+        pixels = cameras[0].intrinsics.width * cameras[0].intrinsics.height
+        return len(cameras) * self._bytes_per_camera(pixels) + RAY_BYTES * min(rays, len(cameras) * pixels)
+
+    def _calls(self, cameras: Sequence[Camera]) -> Iterator[_Copies]:
+        """Render cameras of one image size and dilation, as many in a call as there is room for."""
+        at_once = self._at_once(cameras[0].intrinsics.width * cameras[0].intrinsics.height)
+        for first in range(0, len(cameras), at_once):
+            yield from self._call(cameras[first : first + at_once])
+
+    def _call(self, cameras: Sequence[Camera]) -> Iterator[_Copies]:
+        """Render in one call; where the memory is too small, each half by itself. Raises DeviceMemoryFull."""
+        try:
+            yield self._render(cameras, RAYS_AT_ONCE, self._bytes_of(cameras, RAYS_AT_ONCE))
+        except DeviceMemoryFull:
+            half = len(cameras) // 2
+        else:
+            return
+        if half:
+            yield from self._call(cameras[:half])
+            yield from self._call(cameras[half:])
+        else:  # when no other job renders, and in smaller passes
+            yield self._render(cameras, FEWEST_RAYS, math.inf)
+
+    def _render(self, cameras: Sequence[Camera], rays: int, wanted_bytes: float) -> _Copies:
+        with torch.no_grad(), _memory(wanted_bytes):
             image, alpha, meta = self._rasterize(cameras, self._views(cameras), self._parameters)
-            median = self._median_depth(meta, alpha[..., 0].shape)
-        parts = image[..., :3], alpha[..., 0], image[..., 3], median
-        for each in zip(*(part.float().contiguous().cpu().numpy() for part in parts), strict=True):
-            for array in each:
-                array.flags.writeable = False
-            yield Frame(*each)
+            median = median_depth(self._kernels.rasterize_to_indices_in_range, meta, alpha[..., 0].shape, rays)
+            parts = [p.float().contiguous() for p in (image[..., :3], alpha[..., 0], image[..., 3], median)]
+            # As `to_uint8` rounds and saturates.
+            return _Copies(parts, (255 * parts[0].clamp(min=0)).round().clamp(max=255).byte())
 
     def _rasterize(
         self, cameras: Sequence[Camera], views: Float[Tensor, "c 4 4"], parameters: tuple[Tensor, ...]
@@ -229,59 +359,6 @@ class GsplatRasterizer:
             render_mode="RGB+ED",
             rasterize_mode="antialiased" if info.render_mode == "antialiased" else "classic",
         )
-
-    def _median_depth(self, meta: dict[str, Any], shape: Sequence[int]) -> Float[Tensor, "c h w"]:
-        """Return the z-depth of the Gaussian at which each ray's transmittance falls to one half; 0: it never does."""
-        total = int(np.prod(shape))
-        median = torch.zeros(total, device=self._on)
-        offsets = meta["isect_offsets"].flatten()
-        longest = int(torch.diff(offsets, append=offsets.new_tensor([len(meta["flatten_ids"])])).max())
-        for first in range(0, total, RAYS_AT_ONCE):
-            rays = slice(first, first + RAYS_AT_ONCE)
-            through = torch.zeros(total, device=self._on)  # a ray of transmittance 0 blends nothing
-            through[rays] = 1
-            for step in range(-(-longest // TILE**2)):
-                self._advance(meta, shape, step, through, median)
-                if not through[rays].any():
-                    break
-        return median.reshape(*shape)
-
-    def _advance(
-        self,
-        meta: dict[str, Any],
-        shape: Sequence[int],
-        step: int,
-        through: Float[Tensor, "r"],
-        median: Float[Tensor, "r"],
-    ) -> None:
-        """Blend the next 256 Gaussians of the tiles' lists; a ray whose transmittance falls to one half ends there."""
-        _, height, width = shape
-        centres, conics, opacities = meta["means2d"], meta["conics"], meta["opacities"]
-        gaussian, pixel, image = self._kernels.rasterize_to_indices_in_range(
-            step, step + 1, through.reshape(*shape), centres, conics, opacities, width, height, TILE,
-            meta["isect_offsets"], meta["flatten_ids"],
-        )  # fmt: skip
-        if not len(gaussian):
-            return
-        ray = image * (height * width) + pixel
-        dx, dy = (centres[image, gaussian] - torch.stack([pixel % width, pixel // width], -1) - 0.5).unbind(-1)
-        a, b, c = conics[image, gaussian].unbind(-1)
-        sigma = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
-        alpha = (opacities[image, gaussian] * torch.exp(-sigma)).clamp(max=0.999)
-        # The entries are sorted by ray, then depth: transmittance is a running product that restarts with each ray,
-        # computed as a sum of logarithms minus the sum at the ray's start, in float64, as thousands are added up.
-        starts = torch.ones_like(ray, dtype=torch.bool)
-        starts[1:] = ray[1:] != ray[:-1]
-        kept = torch.log1p(-alpha.double())
-        sums = kept.cumsum(0)
-        after = through[ray] * torch.exp(sums - (sums - kept)[starts][starts.cumsum(0) - 1])
-        below_half = after <= 0.5
-        crossing = below_half.clone()
-        crossing[1:] &= starts[1:] | ~below_half[:-1]
-        last = starts.roll(-1)
-        through[ray[last]] = after[last].to(through.dtype)
-        through[ray[crossing]] = 0
-        median[ray[crossing]] = meta["depths"][image, gaussian][crossing].to(median.dtype)
 
     def _loss(self, image: Tensor, alpha: Tensor, d_rgb: Any, d_depth: Any, d_alpha: Any) -> Float[Tensor, ""]:
         """Return the scalar with the requested gradient: the sum of each output times its gradient."""

@@ -29,6 +29,11 @@ class Counted(Rasterizer):
         """As the inner rasterizer."""
         return self.inner.cameras_at_once
 
+    @property
+    def tensor_device(self) -> str:
+        """As the inner rasterizer."""
+        return self.inner.tensor_device
+
     def of(self, scene: GaussianScene) -> Counted:
         """As the inner rasterizer; the new one adds to the same tally."""
         return Counted(self.inner.of(scene), self.tally)

@@ -73,6 +73,7 @@ _BY_CODE: Mapping[str, str] = {
     "content_too_large": "Send a smaller file, or ask the operator to raise SPLATFIX_MAX_UPLOAD_BYTES.",
     "corrupt_scene": "Copy or export the file again.",
     "deadline_exceeded": "Allow more time, or send it again when the queue is shorter.",
+    "device_memory_full": "Send it again when fewer jobs run, or ask the operator to serve fewer scenes at once.",
     "estimator_fault": "Choose another estimator, and report this one.",
     "forbidden": "Use a key with a higher role: splatfix keys add NAME --role localize",
     "idempotency_conflict": "Use a new key for a new request.",

@@ -23,6 +23,7 @@ from service.errors import (
     BackendMissing,
     BadInput,
     DeadlineExceeded,
+    DeviceMemoryFull,
     Failure,
     Forbidden,
     IdempotencyConflict,
@@ -92,6 +93,7 @@ _STATUS: tuple[tuple[type[SplatfixError], int], ...] = (
     (Forbidden, 403),
     (NoKeys, 409),
     (BackendMissing, 501),
+    (DeviceMemoryFull, 503),
     (SplatfixError, 500),
 )
 

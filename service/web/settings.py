@@ -75,6 +75,9 @@ class Settings(BaseSettings):
     """Ids of the scenes to load at start; None: all. The others are loaded when a request needs them."""
     scene_memory_bytes: int | None = Field(default=None, ge=1)
     """Memory limit of all loaded scenes; the least recently used one is dropped to make room. None: no limit."""
+    gpu_memory_bytes: int | None = Field(default=None, ge=1)
+    """Limit of the GPU memory that renders and features of all jobs take at once, beside the scenes; jobs wait for each
+    other. None: four fifths of what the scenes leave."""
     max_scene_bytes: int = Field(default=2_000_000_000, ge=1)
     """Largest scene file or archive that can be uploaded; also the limit of an archive's unpacked files together."""
     upload_checkpoints: bool = False
@@ -224,6 +227,7 @@ class Settings(BaseSettings):
             self.cache_dir,
             self.cache_bytes,
             memory_bytes=self.scene_memory_bytes,
+            gpu_memory_bytes=self.gpu_memory_bytes,
             data_folder=self.data_dir,
         )
 

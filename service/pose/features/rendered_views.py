@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from service.geometry import reprojection_error_px, transformed, unproject
-from service.interfaces import Features, Frame, Matcher, Rasterizer
+from service.interfaces import Features, Frame, Matcher, Rasterizer, RenderMatcher
 from service.pose.features.image_sizes import RENDER_PX, sized
 from service.types import Camera, Pose, Query, frozen
 
@@ -136,7 +136,11 @@ def views_from(cameras: Iterable[Camera], rasterizer: Rasterizer, matcher: Match
 
 def views_of(frames: Sequence[Frame], cameras: Sequence[Camera], matcher: Matcher) -> list[View]:
     """Extract features of renders, at their own size, and backproject them."""
-    found = [matcher.extract(to_uint8(frame.rgb), VIEWS.max_features) for frame in frames]
+    sizes = {frame.alpha.shape for frame in frames}
+    if isinstance(matcher, RenderMatcher) and len(sizes) == 1 and frames[0].device_rgb is not None:
+        found = matcher.extract_rendered(frames, VIEWS.max_features)
+    else:
+        found = [matcher.extract(to_uint8(frame.rgb), VIEWS.max_features) for frame in frames]
     return [backprojected(*each) for each in zip(found, frames, cameras, strict=True)]
 
 
