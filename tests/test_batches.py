@@ -32,11 +32,13 @@ TRUTH = pose_at(0.4, 0.1)
 class InBatches(CpuRasterizer):
     """The CPU's renderer, as if it were one that renders six cameras best; keeps how many each call had."""
 
-    cameras_at_once = 6
-
     def __init__(self, scene: GaussianScene) -> None:
         super().__init__(scene)
         self.calls: list[int] = []
+
+    @property
+    def cameras_at_once(self) -> int:
+        return 6
 
     def render(self, cameras: Sequence[Camera], *rest, **named) -> list[Frame]:
         self.calls.append(len(cameras))
@@ -81,12 +83,11 @@ def test_an_index_is_rendered_in_batches(scene, index):
 
 def test_free_views_are_chosen_from_renders_in_batches(scene, index, monkeypatch):
     monkeypatch.setattr("service.pose.retrieval.free_views.lod_proxy", lambda scene, rasterizer, rng: rasterizer)
-    one_by_one, batched = (
-        free_view_cameras(scene, make(scene), index.views[:1]) for make in (CpuRasterizer, InBatches)
-    )
-    assert [c.pose.world_from_camera.tolist() for c in one_by_one] == [
-        c.pose.world_from_camera.tolist() for c in batched
-    ]
+    batched = InBatches(scene)
+    found = [free_view_cameras(scene, rasterizer, index.views[:1]) for rasterizer in (CpuRasterizer(scene), batched)]
+    one_by_one, together = ([camera.pose.world_from_camera.tolist() for camera in each] for each in found)
+    assert batched.calls == [6] * 7  # 6 views, and 7 candidates for each
+    assert one_by_one == together
 
 
 def records_of(run, rasterizer: Rasterizer, prepared: object, query: Query, options: object) -> list:
@@ -124,7 +125,12 @@ def assert_same_records(one_by_one: list, batched: list) -> None:
 
 def test_sampled_poses_and_free_views_are_rendered_in_batches(scene, index, monkeypatch):
     """A stage that ends early has not rendered more than the batch it was in."""
-    monkeypatch.setattr(view_index, "_match_and_refine", lambda views, *rest, **named: list(views))
+
+    def matched(views, *rest, **named):
+        return list(views)
+        yield
+
+    monkeypatch.setattr(view_index, "_match_and_refine", matched)
     batched = InBatches(scene)
     state = search_state.SearchState.of(query_of(scene), tools_of(batched, index), SEARCH)
     variant = view_index.ImageVariant(160)
@@ -133,7 +139,7 @@ def test_sampled_poses_and_free_views_are_rendered_in_batches(scene, index, monk
     assert batched.calls == [6]
     for _ in range(6):
         next(stage)
-    assert batched.calls == [6, 6]
+    assert batched.calls == [6, 2]
     batched.calls.clear()
     cameras = [view.camera for view in index.views]
     untried = view_index.deque(range(8))

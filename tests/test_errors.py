@@ -36,7 +36,7 @@ import service.scene_manager.scene_store
 import service.web.key_file
 import service.web.routes.keys
 from service.codec import encode
-from service.errors import BadInput, SceneError, SplatfixError
+from service.errors import BadInput, DeviceMemoryFull, SceneError, SplatfixError
 from service.estimators import ESTIMATORS
 from service.loaded_scene import LoadedScene
 from service.scene_manager.entry import Entry
@@ -162,6 +162,15 @@ def full(*_: object) -> None:
 def undeletable(path: Path, ignore_errors: bool = False) -> None:
     if not ignore_errors:
         full()
+
+
+def with_full_gpu(send: Callable[[], httpx.Response]) -> httpx.Response:
+    def refuse(*_: object) -> bytes:
+        raise DeviceMemoryFull("the GPU has too little memory left.", where="render")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.jobs.embedded_engine.scene_images.picture", refuse)
+        return send()
 
 
 def with_full_disk(s: SimpleNamespace, send: Callable[[], httpx.Response]) -> httpx.Response:
@@ -356,6 +365,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ),
     ("render_scene", "invalid_intrinsics"): lambda s: render(s, intrinsics={}),
     ("render_scene", "invalid_prior"): lambda s: render(s, pose={}),
+    ("render_scene", "device_memory_full"): lambda s: with_full_gpu(lambda: render(s)),
     ("register_scene", "invalid_request"): lambda s: register(s, photos=[]),
     ("register_scene", "bad_request"): lambda s: s.client.post(
         "/scenes/good/registration", content=b"\xff", headers={"Content-Type": "application/json"}
@@ -472,6 +482,7 @@ SHOWN = {code: "localize_photo" for name, code in PROVOKED if name == "localize_
     **{"scene_not_found": "get_scene", "bad_input": "unload_scene", "scene_in_use": "delete_scene"},
     **{
         "scene_not_ready": "render_scene",
+        "device_memory_full": "render_scene",
         "scene_exists": "upload_scene",
         "no_keys": "make_token",
         "lens_not_found": "delete_lens",

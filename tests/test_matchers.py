@@ -147,7 +147,9 @@ def test_xfeat_on_the_gpu_is_xfeat(size: tuple[int, int]) -> None:
     assert np.abs(ours.descriptors - theirs.descriptors).max() < 1e-5
     other = xfeat.create().extract(textured(*size, seed=1), 200)
     for a, b in ((ours, theirs), (ours, other)):
-        assert np.array_equal(xfeat.create_on("cpu").match(a, b), xfeat.create().match(a, b))
+        pairs = [{tuple(pair) for pair in each.match(a, b)} for each in (xfeat.create_on("cpu"), xfeat.create())]
+        assert pairs[0] == pairs[1]  # in another order where a rounding decides
+        assert len(pairs[0]) > 5
 
 
 def test_without_its_package_xfeat_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -180,7 +180,7 @@ def sampled(monkeypatch: pytest.MonkeyPatch):
             for pose in poses:
                 support = next(left)
                 solved = SimpleNamespace(support=support, pose=turned) if support >= 0 else None
-                scored.append(mc_do._Hypothesis(pose, solved))
+                scored.append(mc_do._Hypothesis(pose, solved))  # type: ignore[arg-type]
                 yield IterationRecord("hypothesis", pose)
 
         monkeypatch.setattr(mc_do, "around", around)

@@ -60,6 +60,7 @@ class XFeatOnGpu(XFeat):
     def _extract(self, images: Sequence[UInt8[Tensor, "h w 3"]], limit: int) -> Iterator[Features]:
         """Yield the features of images of one size; where the memory is too small, of each half by itself."""
         half, (height, width) = len(images) // 2, images[0].shape[:2]
+        found, rows = [], None
         try:
             with DEVICE_MEMORY.taken(PIXEL_BYTES * height * width * len(images)), torch.inference_mode():
                 found = [self._selected(*each, limit) for each in zip(*self._described(images), strict=True)]
@@ -67,7 +68,6 @@ class XFeatOnGpu(XFeat):
         except torch.OutOfMemoryError as error:
             if not half:
                 raise DeviceMemoryFull("the GPU has too little memory left for features.", where="matcher") from error
-            rows = None
         if rows is None:
             yield from self._extract(images[:half], limit)
             yield from self._extract(images[half:], limit)
@@ -79,7 +79,7 @@ class XFeatOnGpu(XFeat):
 
     def _described(
         self, images: Sequence[UInt8[Tensor, "h w 3"]]
-    ) -> tuple[Float[Tensor, "n r c d"], Float[Tensor, "n h w"], Float[Tensor, "n r c"]]:
+    ) -> tuple[Float[Tensor, "n r c d"], Float[Tensor, "n y x"], Float[Tensor, "n r c"]]:
         """Return dense descriptors, the probability of a keypoint at each pixel, and the cells' reliability."""
         gray = torch.stack(list(images)).float().sum(-1)[:, None]
         size = [_padded(side) for side in gray.shape[-2:]]

@@ -139,10 +139,10 @@ class _Copies:
         """Wait for the copies' end; yield the images."""
         if self._done is not None:
             self._done.synchronize()
-        for *each, rgb in zip(*(part.numpy() for part in self._parts), self._rgb, strict=True):
-            for array in each:
+        for rgb, alpha, depth, median, device_rgb in zip(*(p.numpy() for p in self._parts), self._rgb, strict=True):
+            for array in (rgb, alpha, depth, median):
                 array.flags.writeable = False
-            yield Frame(*each, rgb)
+            yield Frame(rgb, alpha, depth, median, device_rgb)
 
 
 @contextmanager

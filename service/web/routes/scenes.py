@@ -161,6 +161,7 @@ async def scene_splats(
     }
     | errors(
         *("invalid_request", "bad_request", "request_timeout", *SCENE_ERRORS, "invalid_intrinsics", "invalid_prior"),
+        "device_memory_full",
         body=True,
     ),
 )

@@ -43,6 +43,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/localize",
     ),
     (e.BackendMissing("'my_method' can't run here: it needs a CUDA device.", where="estimators"), "/localize"),
+    (e.DeviceMemoryFull("the GPU has too little memory left.", where="render"), f"{_SCENE}/render"),
     (
         e.IdempotencyConflict(
             "the key was used for job 3f9c2a7be1d04c58, which was another request.",

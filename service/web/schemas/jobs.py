@@ -103,8 +103,8 @@ class JobOut(JobSummary):
     """`truth` of the request; not used by the search."""
     result: Result | None
     error: Problem | None
-    """`code` is `deadline_exceeded`, `estimator_fault` or `internal_error` for a failed job; for an interrupted one
-    `interrupted` or the code of the scene's error."""
+    """`code` is `deadline_exceeded`, `estimator_fault`, `device_memory_full` or `internal_error` for a failed job;
+    for an interrupted one `interrupted` or the code of the scene's error."""
 
 
 class JobList(Model):
