@@ -351,7 +351,7 @@ def test_an_answer_says_how_the_pose_is_known(tracker):
 
 def test_positions_are_told_in_the_scenes_own_world(tracker):
     similarity = FusedOdometry(np.eye(4), 1.0, np.eye(7), 0.0, 0)
-    tracker._fusion = SimpleNamespace(told=lambda: similarity, carried=lambda: (at(3.0), np.eye(6)))
+    tracker._fusion = SimpleNamespace(reported=lambda: similarity, carried=lambda: (at(3.0), np.eye(6)))
     tracker._origin = (100.0, 0.0, 0.0)
     answer = told(tracker, None, verified_s=20.0, odometry=True)
     assert (answer.mode, answer.pose.position_in_world[0]) == ("carried", 103.0)

@@ -404,7 +404,7 @@ def test_the_newest_fixes_win_where_they_contradict_the_others_for_a_second():
         # From a second on the camera is found elsewhere; a run of its own each, as of searches.
         fusion.fix(time_s, at(x, float(number >= 10)), np.eye(6) * 1e-4, DEPTH, number)
         assert fusion.resets == (time_s >= 2.0), time_s
-    told = fusion.told()
+    told = fusion.reported()
     assert told is not None
     assert told.world_from_odom[:3, 3] == pytest.approx([0, 1.0, 0], abs=0.05)
 
@@ -436,11 +436,11 @@ def test_what_is_told_moves_by_a_centimetre_and_a_fifth_of_a_degree_a_frame():
     start = fusion._fit
     for off, off_deg, x, turned in ((1.0, 0.0, 0.02, 0.0), (0.0, 20.0, 0.0, 0.2), (0.01, 0.1, 0.01, 0.1)):
         fusion._fit = replace(start, pose=at())
-        fusion._told = None
+        fusion._reported = None
         fusion.move(fusion._samples[-1].time_s + 0.01, at())
         fusion._fit = replace(start, pose=at(off, turn_deg=off_deg))
         fusion.move(fusion._samples[-1].time_s + 0.01, at())
-        told = fusion._told
+        told = fusion._reported
         assert told is not None
         assert told.pose.world_from_camera == pytest.approx(at(x, turn_deg=turned).world_from_camera, abs=2e-4)
 
@@ -449,14 +449,14 @@ def test_the_told_similarity_says_what_is_left_to_the_estimate():
     fusion = Fusion(OdometryFacts(), replace(INFO, metres_per_unit=0.5))
     fusion.move(0.0, at(3.0))
     fusion.fix(0.0, at(), EXACT, DEPTH)
-    told = fusion.told()
+    told = fusion.reported()
     assert told is not None
     # x_world = 2 x_odom - 6.
     assert told.world_from_odom == pytest.approx(np.array([[2, 0, 0, -6], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1.0]]))
     assert fusion._fit is not None
     sure = told.covariance
     fusion._fit = replace(fusion._fit, pose=at(0.5))
-    left = fusion.told()
+    left = fusion.reported()
     assert left is not None
     assert left.covariance[3, 3] - sure[3, 3] == pytest.approx(0.25, rel=1e-3)
     assert left.world_from_odom == pytest.approx(told.world_from_odom)
