@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from small_room import FOCAL, HEIGHT, WIDTH, pose_at, write_room
 
-from service.geometry import look_at, pose_distance
+from service.geometry import look_at, moved, pose_distance
+from service.interfaces import Frame
 from service.loaded_scene import LoadedScene
 from service.localize import localize
-from service.pose.verification.captured_volume import captured_share, is_outside
+from service.pose.verification.captured_volume import CAPTURE, _is_beside_a_view, captured_share, is_outside
 from service.results import Reason, Status
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -63,6 +66,56 @@ def test_a_telephoto_lens_sees_from_afar_what_was_captured_from_near(
     seen = replace(frame, median_depth=frame.median_depth + np.float32(30.0))
     views = [replace(n.camera, intrinsics=zoomed(n.camera.intrinsics, zoom_of_views)) for n in room.scene.cameras]
     assert captured_share(seen, away, views) == pytest.approx(expected, abs=0.05)
+
+
+def share_seen(from_: Pose, lens: Intrinsics = LENS, alpha: float = 1.0) -> float | None:
+    """Of a wall 4 ahead of a camera at the origin, what a camera elsewhere has captured."""
+    image = np.full((HEIGHT, WIDTH), 4.0, np.float32)
+    frame = Frame(np.zeros((HEIGHT, WIDTH, 3), np.float32), np.full_like(image, alpha), image, image)
+    wide = replace(
+        lens, width=4000, height=4000, cx=2000.0, cy=2000.0, fx=lens.fx * 4000 / WIDTH, fy=lens.fy * 4000 / WIDTH
+    )
+    narrow = zoomed(LENS, 50.0)  # all of the wall that it shows lies on the axis
+    return captured_share(frame, Camera(narrow, Pose(np.eye(4))), [Camera(zoomed(wide, 50.0), from_)])
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "distance", "expected"),
+    [
+        (0, 4.0, 1.0), (58, 4.0, 1.0), (62, 4.0, 0.0), (-58, 4.0, 1.0), (-62, 4.0, 0.0),
+        (0, 31.0, 1.0), (0, 33.0, 0.0), (0, 1.4, 1.0), (0, 1.3, 0.0),
+    ],
+)  # fmt: skip
+def test_a_surface_is_captured_within_sixty_degrees_and_from_a_third_to_eight_times_as_far(
+    turn_deg: float, distance: float, expected: float
+) -> None:
+    ahead, angle = np.array([0.0, 0.0, 4.0]), np.radians(turn_deg)
+    eye = ahead - distance * np.array([np.sin(angle), 0.0, np.cos(angle)])
+    share = share_seen(look_at(eye, ahead, np.array([0.0, -1.0, 0.0])))
+    assert share is not None
+    assert share > 0.1 if expected else share == 0.0  # from near the view shows a part of it
+
+
+def test_only_opaque_surface_counts_and_only_what_lies_in_the_view() -> None:
+    assert share_seen(Pose(np.eye(4)), alpha=0.5) is None
+    assert share_seen(Pose(np.eye(4)), alpha=0.51) == 1.0
+    away = look_at(np.zeros(3), np.array([4.0, 0.0, 0.5]), np.array([0.0, -1.0, 0.0]))
+    assert share_seen(away) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("away", "turn_deg", "beside"),
+    [(1.9, 0, True), (2.1, 0, False), (0.0, 44, True), (0.0, 46, False), (1.9, 44, True)],
+)
+def test_a_pose_beside_a_view_needs_no_render(away: float, turn_deg: float, beside: bool) -> None:
+    """The view sees points 4 away, in the median."""
+    points = np.array([[0.0, 0, 3.0], [0.0, 0, 4.0], [0.0, 0, 50.0]])
+    view: Any = SimpleNamespace(camera=Camera(LENS, Pose(np.eye(4))), points_in_world=points)
+    empty: Any = SimpleNamespace(camera=view.camera, points_in_world=points[:0])
+    pose = moved(Pose(np.eye(4)), np.array([0, np.radians(turn_deg), 0, 0, 0, 0]))
+    pose = Pose(pose.world_from_camera + np.array([[0, 0, 0, away]] + [[0.0] * 4] * 3))
+    assert _is_beside_a_view(pose, [view], CAPTURE) == beside
+    assert not _is_beside_a_view(pose, [empty], CAPTURE)
 
 
 def zoomed(size: Intrinsics, factor: float) -> Intrinsics:

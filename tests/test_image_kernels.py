@@ -382,7 +382,7 @@ def test_areas_are_summed_in_the_cells_that_are_asked_for() -> None:
     rng = np.random.default_rng(9)
     means, areas = rng.uniform(-2, 2, (200, 3)), rng.uniform(0, 1, 200)
     largest, side = rng.uniform(0, 1.2, 200), 1.0
-    largest[5] = side
+    largest[4] = side  # its cell is asked for
     cells = np.floor(means / (side / 3)).astype(np.int64)
     asked = np.unique(cells[::2], axis=0)
     keys = floaters._keys(asked)
@@ -431,3 +431,7 @@ def test_steps_end_before_filled_cells() -> None:
     assert free_space._steps_in_the_clear(filled, starts, directions, 2, 9).tolist() == [1, 1, 2, 9, 3, 9]
     assert free_space._steps_in_the_clear(filled, starts[5:], directions[5:], 0, 9).tolist() == [0]
     assert free_space._steps_in_the_clear(filled, starts[:1], directions[:1], 1, 2).tolist() == [2]
+    # Beyond the grid nothing is filled, whatever lies on its border.
+    middle = np.array([[1.5, 2.5, 1.5]] * 3)
+    assert free_space._steps_in_the_clear(filled, middle, np.eye(3), 0, 9).tolist() == [9, 9, 9]
+    assert free_space._steps_in_the_clear(filled, middle, -np.eye(3), 0, 9).tolist() == [9, 9, 9]

@@ -64,6 +64,8 @@ def test_a_table_of_positions_and_poses(tmp_path):
         ("name,x,y,z\na.jpg,1,2,north\n", "must be numbers"),
         ("name,x,y,z\na.jpg,1,2,nan\n", "finite"),
         ("name,latitude,longitude,height\na,91,0,0\n", "latitude must lie"),
+        ("name,latitude,longitude,height\na,0,181,0\n", "latitude must lie"),
+        ("name,latitude,longitude,height\na,0,-181,0\n", "latitude must lie"),
         ("name,x,y,z,qw,qx,qy,qz\na,1,2,3,1,1,0,0\n", "length 1"),
         ("name,x,y,z,sigma_m\na,1,2,3,0\n", "at least"),
         ("name,x,y,z,colour\na,1,2,3,red\n", "unknown key 'colour'"),

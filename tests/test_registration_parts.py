@@ -393,6 +393,32 @@ def test_coordinates_are_left_handed_where_a_reflection_fits_them_far_better() -
     mirrored(12, 1.5, 6)  # the reflection leaves a fifth of the spread
 
 
+def test_a_reflection_leaves_less_than_a_fifth_of_what_a_rotation_leaves() -> None:
+    """Of a nearly flat set of places, whose mirror image a rotation nearly fits."""
+    rng = np.random.default_rng(8)
+    places = rng.uniform(-2, 2, (9, 3)) * [1, 1, 0.15]
+    refused = []
+    for noise in np.linspace(0.01, 0.3, 30):
+        target = np.array([onto(TRUTH, p) for p in places]) * [1, 1, -1] + noise * rng.choice([-1, 1], (9, 3)) / 2
+        seen = [Observation("p", p, q) for p, q in zip(places, target, strict=True)]
+        proper, reflected = umeyama(places, target), umeyama(places, target, mirrored=True)
+        right, left = (
+            max(np.linalg.norm(onto(one, p) - q) for p, q in zip(places, target, strict=True))
+            for one in (proper, reflected)
+        )
+        spread = np.sqrt(np.trace(np.cov(target.T, bias=True)))
+        expected = left < 0.2 * right and left < 0.1 * spread
+        fit: Any = SimpleNamespace(similarity=proper)
+        try:
+            register._require_right_handed(Evidence(seen), fit, range(8))
+            assert not expected
+        except RegistrationFailed:
+            assert expected
+        refused.append((expected, left / right))
+    assert {True, False} == {one for one, _ in refused}
+    assert any(0.2 < ratio < 0.35 for _, ratio in refused)
+
+
 def test_turned_photos_are_looked_for_where_rotations_differ_by_more_than_three_tenths(monkeypatch) -> None:
     """Each quarter turn costs a fit."""
     seen = [replace(full_observation(), name=str(n)) for n in range(3)]

@@ -142,3 +142,16 @@ def test_a_far_block_takes_no_part_and_a_hidden_gaussian_none_either() -> None:
     truth = render_reference(replace(scene, **fewer), camera)
     assert worst(frame.rgb, truth.rgb) < 1e-5
     assert worst(frame.rgb, render_reference(scene, camera).rgb) > 0.01
+
+
+@pytest.mark.parametrize("depths", [[4.0, 1.0, 2.0], [1.0, 4.0, np.nextafter(np.float32(4), np.float32(0))], None, []])
+def test_records_are_sorted_by_depth(depths: list[float] | None) -> None:
+    """As bits, 4 and 1 differ by 2^24: one more than 24 bits hold."""
+    given = np.random.default_rng(2).uniform(0.01, 3.0, 50) if depths is None else depths
+    values = np.asarray(given, np.float32)
+    keys, swap = np.zeros((2, max(len(values), 1)), np.uint64)
+    histogram = np.zeros(2 * 4096, np.int32)
+    KERNELS["sort_by_depth"](values, len(values), keys, swap, histogram)
+    order = (keys[: len(values)] & np.uint64(0xFFFFFFFF)).astype(int)
+    assert np.all(np.diff(values[order]) >= (-1e-6 if depths else 0))
+    assert sorted(order.tolist()) == list(range(len(values)))

@@ -220,6 +220,16 @@ def test_a_planted_rig_and_its_inliers_are_found(monkeypatch: pytest.MonkeyPatch
     assert len(sampled) >= 2 * 20 - 1
 
 
+def test_four_matches_of_a_camera_are_sampled_and_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them agree: after the fewest trials, of two cameras."""
+    planted, sampled = Rig(11, (4, 3, 4)), []
+    names = rig.search_rig.__globals__
+    monkeypatch.setitem(names, "solve_p3p", lambda *given: sampled.append(1) or solve_p3p(*given))
+    _, _, inlier = searched(planted, np.zeros((0, 4, 3)))
+    assert inlier.sum() == 11
+    assert 2 * 20 - 1 <= len(sampled) <= 2 * 20
+
+
 def test_starts_are_tried_first_and_refined(monkeypatch: pytest.MonkeyPatch) -> None:
     planted = Rig(8, (3, 3, 3))  # too few in each camera to be sampled from
     near = se3_exp(np.full(6, 0.004)) @ planted.rig_from_world

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from service.bench.render import synthetic_room
 from service.geometry import look_at, pose_distance
 from service.loaded_scene import WHITE_ASSUMED, LoadedScene
 from service.localize import localize
-from service.pose.features.unknown_background import WHITE, has_white_border
+from service.pose.features.unknown_background import WHITE, has_white_border, shows_background
 from service.render.cpu import CpuRasterizer
 from service.results import Status
 from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Query
@@ -36,6 +38,51 @@ def test_the_middle_and_invalid_pixels_decide_nothing() -> None:
     assert not has_white_border(rgb)
     padded = np.full((100, 100, 3), 255, np.uint8)
     assert not has_white_border(padded, np.zeros((100, 100), bool))
+
+
+@pytest.mark.parametrize(("level", "expected"), [(250, True), (249, False)])
+def test_white_begins_at_250_in_each_channel(level: int, expected: bool) -> None:
+    rgb = np.full((100, 100, 3), 255, np.uint8)
+    rgb[..., 1] = level
+    assert has_white_border(rgb) is expected
+
+
+@pytest.mark.parametrize(("grey", "expected"), [(392, True), (393, False)])
+def test_the_border_is_a_fiftieth_of_the_long_side_and_half_of_it_is_white(grey: int, expected: bool) -> None:
+    """Of 100 x 100 pixels two on each side: 784."""
+    rgb = np.full((100, 100, 3), 255, np.uint8)
+    row, column = np.nonzero(np.minimum.reduce(np.broadcast_arrays(*_from_border(100))) < 2)
+    assert len(row) == 784
+    rgb[row[:grey], column[:grey]] = 0
+    rgb[2:-2, 2:-2] = 0
+    assert has_white_border(rgb) is expected
+
+
+def _from_border(side: int) -> tuple[np.ndarray, ...]:
+    near = np.minimum(np.arange(side), np.arange(side)[::-1])
+    return near[:, None], near[None, :]
+
+
+@pytest.mark.parametrize(
+    ("uncovered", "alpha", "expected"), [(0.05, 0.49, True), (0.049, 0.49, False), (0.05, 0.5, False), (1.0, 0.0, True)]
+)
+def test_a_twentieth_less_than_half_opaque_shows_background(uncovered: float, alpha: float, expected: bool) -> None:
+    """In the median of eight views or so, at 64 pixels."""
+    sizes: list[int] = []
+
+    def render(cameras: list[Camera], approximate: bool) -> list[SimpleNamespace]:
+        sizes.extend(camera.intrinsics.long_side for camera in cameras)
+        shown = np.ones(1000)
+        shown[: round(1000 * uncovered)] = alpha
+        # A third of the views shows none, or nothing else.
+        odd = np.ones(1000) if expected else np.zeros(1000)
+        return [SimpleNamespace(alpha=odd if n % 3 == 1 else shown) for n in range(len(cameras))]
+
+    cameras = [Camera(LENS, look_at(PLACE, np.zeros(3), np.array([0.0, 0, 1])))] * 17
+    rasterizer: Any = SimpleNamespace(render=render)
+    assert shows_background(rasterizer, cameras) is expected
+    assert sizes == [64] * 9
+    assert not shows_background(rasterizer, [])
 
 
 def ball(count: int = 4000) -> GaussianScene:
