@@ -15,7 +15,7 @@ import pytest
 from test_bench import LENS, poses
 
 from service.bench import live
-from service.bench.live import LinkConfig, Told
+from service.bench.live import LinkConfig, SessionLog
 from service.bench.live_film import Shot
 from service.bench.live_odometry import (
     ODOMETRY,
@@ -241,7 +241,7 @@ def test_a_region_holds_the_truth_to_95_percent_of_seven_degrees_of_freedom(
 
 def test_a_session_with_odometry_counts_frames_that_the_client_carried_on() -> None:
     shots = placed(walk(8, 0.02))
-    told = Told(shots, {k: k / 30 for k in range(8)}, {k: k for k in range(8)})
+    told = SessionLog(shots, {k: k / 30 for k in range(8)}, {k: k for k in range(8)})
     matrix = shots[0].pose.world_from_camera.tolist()
     told.answers[0], told.heard_at[0] = replace(answer(0, shots[0]), world_from_camera=matrix), 0.05 / 30
     # The fourth frame has an answer with a wrong pose of its own, which counts whatever the odometry says.
@@ -554,13 +554,13 @@ def planted(monkeypatch: pytest.MonkeyPatch, clock: Clock) -> SimpleNamespace:
         seen.camera = camera
         return walk(10, 0.02)
 
-    def play(film: Any, url: str, scene: str, sessions: int, camera: Any, seed: int, link: Any) -> list[Told]:
+    def play(film: Any, url: str, scene: str, sessions: int, camera: Any, seed: int, link: Any) -> list[SessionLog]:
         assert (url, scene) == ("http://s", "room")
         seen.film, seen.given = film, camera
         seen.done.append("play")
         clock.now += 20.0
         clock.cpu += 4.0
-        told = [Told(film) for _ in range(sessions)]
+        told = [SessionLog(film) for _ in range(sessions)]
         for one in told:
             one.answers |= dict.fromkeys(range(5), None)  # type: ignore[arg-type]
         return told
