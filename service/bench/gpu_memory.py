@@ -36,7 +36,10 @@ def sizes(shared: Shared) -> Iterator[Row]:
         scene = largest if count == largest.count else _first(largest, count)
         try:
             row = _measure_size(shared, scene, cameras)
-        except (BackendMissing, DeviceMemoryFull) as error:  # any other may have made the GPU unusable
+        except (BackendMissing, DeviceMemoryFull, RuntimeError) as error:
+            # A renderer's own error, or PyTorch's of a full GPU; any other may have made the GPU unusable.
+            if isinstance(error, RuntimeError) and type(error).__name__ != "OutOfMemoryError":
+                raise
             yield {"gaussians": count, "error": f"{type(error).__name__}: {error}"[:300]}
             return
         yield {"gaussians": count, **row}
