@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pwd
 import shutil
 import socket
 import subprocess
@@ -34,6 +33,8 @@ class Server:
         self._programs, self._data = programs(), folder / "data"
         self._as: dict = {}
         if os.geteuid() == 0:
+            import pwd  # Windows has none, and collects the tests of stores, too
+
             nobody = pwd.getpwnam("nobody")
             os.chown(folder, nobody.pw_uid, nobody.pw_gid)
             self._as = {"user": nobody.pw_uid, "group": nobody.pw_gid, "extra_groups": []}
