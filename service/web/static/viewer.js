@@ -29,12 +29,18 @@ document.addEventListener("click", event => {
 });
 
 // The page belongs to one run of the viewer, with which its state ends. After a restart, be it of the service with
-// another version of viser's page, it is loaded anew; until then a bar says why nothing moves.
+// another version of viser's page, it is loaded anew at once, so that it is there when the scenes are; until then a bar
+// says why nothing moves.
 const CHECK_MS = 1000;
-let run = null;
+let run = null, ready = false;
 
 async function check() {
-  if (!document.hidden) await compare().catch(() => show("The connection to the service is lost. Reconnecting…"));
+  if (!document.hidden) {
+    await compare().catch(() => {
+      ready = false;
+      show("The connection to the service is lost. Reconnecting…");
+    });
+  }
   setTimeout(check, CHECK_MS);
 }
 
@@ -48,13 +54,16 @@ async function compare() {
   if (!answer.ok) throw new Error(answer.status);
   const current = await answer.text();
   run ??= current;
-  if (run === current) {
-    bar.remove();
+  if (run !== current) {
+    location.reload();
     return;
   }
-  const { pending } = await (await fetch(new URL("readyz", root), { cache: "no-store" })).json();
-  if (!pending.length) location.reload();
-  else show(`The service is starting (${pending[0]}).`);
+  if (!ready) {
+    const { pending } = await (await fetch(new URL("readyz", root), { cache: "no-store" })).json();
+    ready = !pending.length;
+    if (!ready) return show(`The service is starting (${pending[0]}).`);
+  }
+  bar.remove();
 }
 
 // viser's labels have a contrast of 4.0 : 1. On narrow screens its panel, 20em wide, covers a half of the view: there it
