@@ -90,7 +90,7 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
         assert shifted < 0.03
     # The lens was not told.
     assert localized[-1]["intrinsics"]["fx"] == pytest.approx(LENS.fx, rel=0.02)
-    expect(page.get_by_text("Poses a second")).to_be_visible()
+    expect(page.get_by_text("Poses per second")).to_be_visible()
     page.get_by_role("button", name="Stop").click()
     expect(page.locator(".verdict .badge")).to_have_text("Off")
 

@@ -31,7 +31,7 @@ from service.results import Status
 from service.types import Pose
 from service.web.api_keys import KeyRing
 from service.web.app import create_app
-from service.web.key_file import add_key, read_keys
+from service.web.key_file import Role, add_key, read_keys
 from service.web.settings import Settings
 
 pytestmark = NEEDS_CHROMIUM
@@ -350,6 +350,24 @@ def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_
     assert httpx.get(f"{url}/scenes/my_attic", trust_env=False).status_code == 404
 
 
+def test_photos_that_are_dropped_with_a_scene_are_looked_for_in_it(page: Page, url: str, tmp_path: Path) -> None:
+    page.get_by_role("radio", name="Studio").check()
+    scene = next(write_room(tmp_path / "room").glob("*.ply")).read_bytes()
+    other = (STUDIO / "photos" / "photo_01.jpg").read_bytes()
+    drop_all(page, {"one.jpg": PHOTO.read_bytes(), "cellar.ply": scene, "two.jpg": other})
+    rows = page.locator("tbody tr")
+    for name in ("one.jpg", "two.jpg"):
+        expect(rows.filter(has_text=name)).to_contain_text("cellar")
+        expect(rows.filter(has_text=name).locator(".badge")).to_have_text(re.compile("not localized|uncertain"))
+    # Where the scene doesn't come, its photos stay where they are.
+    page.get_by_role("link", name="Localize").click()
+    before = httpx.get(f"{url}/jobs", trust_env=False).json()["jobs"][0]["id"]
+    drop_all(page, {"three.jpg": PHOTO.read_bytes(), "junk.ply": b"not a scene"})
+    expect(page.get_by_role("alert")).to_contain_text("ply")
+    assert httpx.get(f"{url}/jobs", trust_env=False).json()["jobs"][0]["id"] == before
+    httpx.delete(f"{url}/scenes/cellar", trust_env=False)
+
+
 def test_a_dropped_file_that_is_no_scene_is_refused(page: Page, url: str) -> None:
     page.get_by_role("radio").first.wait_for()
     drop(page, b"not a scene", "junk.ply")
@@ -516,6 +534,25 @@ def test_keys_are_made_shown_once_and_revoked_by_admins(browser: Browser, tmp_pa
         page.close()
 
 
+@pytest.mark.parametrize("role", ["read", "localize", "admin"])
+def test_a_key_is_offered_what_it_may_do(browser: Browser, tmp_path: Path, role: Role) -> None:
+    keys, port = KeyRing(tmp_path / "keys.json"), free_port()
+    key = keys.make_temporary("visitor", role)
+    room = write_room(tmp_path / "room")
+    settings = Settings(scenes=[room], port=port, viewer=False, cache_dir=None, data_dir=tmp_path)
+    with served(create_app(settings, keys=keys), port) as url:
+        page = opened(browser, f"{url}/?key={key}")
+        page.get_by_role("radio").wait_for()
+        expect(page.get_by_text("Your key shows results")).to_be_visible(visible=role == "read")
+        expect(page.get_by_text("Choose photos")).to_be_visible(visible=role != "read")
+        for name in ("Unload", "Add a scene"):
+            expect(page.get_by_text(name)).to_be_visible(visible=role == "admin")
+        page.get_by_role("link", name="Plan and coverage").click()
+        page.get_by_role("img", name="Plan of the scene").wait_for()
+        expect(page.get_by_text("Measure coverage")).to_be_visible(visible=role == "admin")
+        page.close()
+
+
 def test_several_photos_get_a_table_that_is_exported(page: Page, url: str) -> None:
     page.get_by_role("radio", name="Studio").check()
     photos = sorted((STUDIO / "photos").glob("*.jpg"))[:3]
@@ -524,6 +561,10 @@ def test_several_photos_get_a_table_that_is_exported(page: Page, url: str) -> No
     row = page.get_by_role("row").filter(has_text="notes.jpg")
     expect(row).to_contain_text("photo")  # why it was refused
     expect(page.get_by_role("status").first).to_contain_text("3 of 4 photos localized.")
+    expect(page.locator(".maps a")).to_have_count(3)
+    page.get_by_label("Order").select_option("worst")
+    expect(page.locator("tbody tr").first).to_contain_text("notes.jpg")
+    page.get_by_label("Order").select_option("")
     _audit(page)
     csv, images, cameras = (_saved(page, name) for name in ("CSV", "COLMAP images.txt", "COLMAP cameras.txt"))
     frames = json.loads(_saved(page, "nerfstudio"))["frames"]

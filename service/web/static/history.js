@@ -82,7 +82,7 @@ function row(job, marked, compare, note) {
 function actions(job, name, marked, compare, note) {
   if (!ENDED.includes(job.state)) return [];
   const button = (label, act) => {
-    const element = h("button", { type: "button", class: "plain", "aria-label": `${label} ${name} of ${when(job.created)}` }, label);
+    const element = h("button", { type: "button", class: "plain", "data-needs": "localize", "aria-label": `${label} ${name} of ${when(job.created)}` }, label);
     element.addEventListener("click", async () => {
       element.disabled = true;
       await act(element).catch(error => { note.textContent = error.message; say(error.message); });

@@ -41,7 +41,7 @@ function progress(view, job) {
   const line = h("p", { class: "line" });
   const stages = h("ol", { class: "stages" });
   const trouble = h("p", { class: "trouble", role: "alert", hidden: true });
-  const cancel = h("button", { type: "button" }, "Cancel");
+  const cancel = h("button", { type: "button", "data-needs": "localize" }, "Cancel");
   cancel.addEventListener("click", async () => {
     cancel.disabled = true;
     await service.ask(job.links.self, { method: "DELETE" }).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });

@@ -9,14 +9,6 @@ const ENDS = [["", "never"], ["1", "after 1 day"], ["7", "after 7 days"], ["30",
 const DAY_MS = 86_400_000;
 const HEADS = ["Name", "Role", "Scenes", "Rate limit", "Of the queue", "Ends", "Made", "Actions"];
 
-/** Tell whether the visitor's key manages keys; where the service has none, nobody does. */
-export function mayManage() {
-  return fetch("key").then(async answer => {
-    const own = answer.ok ? await answer.json() : { name: null };
-    return own.name !== null && own.role === "admin";
-  }, () => false);
-}
-
 export function show(main) {
   document.title = "API keys – splatfix";
   const rows = h("tbody");
@@ -83,7 +75,7 @@ function newKey(make, told) {
     scenes.disabled = role.value === "admin";
   };
   for (const control of [ends, role]) control.addEventListener("change", settle);
-  const form = h("form", { class: "options" }, h("h2", {}, "New key"),
+  const form = h("form", { class: "options", "data-needs": "admin" }, h("h2", {}, "New key"),
     h("div", { class: "grid" }, field("Name", name), field("Role", role),
       field("Scenes", scenes, h("span", { class: "quiet", id: "scenes-help" }, "Names or patterns: lab, floor-*")),
       field("Rate limit", rate), field("Share of the queue, %", share), field("Ends", ends, date)),

@@ -2,8 +2,8 @@
 
 import { Camera } from "./live_camera.js";
 import { Plan } from "./live_plan.js";
-import { h, say } from "./dom.js";
-import { service } from "./service.js";
+import { h, length, say } from "./dom.js";
+import { hideForbidden, service } from "./service.js";
 
 const AGAIN = [1006, 1012, 4408, 4500, 4503];  // close codes after which connecting again makes sense
 const AGAIN_MS = 2000;
@@ -12,15 +12,15 @@ const STATES = {
   localized: "Localized", uncertain: "Uncertain", relocalizing: "Searching", lost: "Lost", waiting: "Connecting", off: "Off",
 };
 const ADVICE = {
-  localized: "The scene's picture lies over the video where the camera is.",
-  uncertain: "The position is a guess: something may be hidden, or the picture blurred.",
+  localized: "The rendered scene is aligned with the video.",
+  uncertain: "The position may be wrong: the view may be blocked or blurred.",
   relocalizing: "Looking for this view in the whole scene. Hold the camera still for a moment.",
   lost: "This view was not found so far. Point the camera at a part that was captured.",
   waiting: "Connecting to the service.",
   off: "",
 };
 
-const state = { session: null, wanted: false, rates: [], dropped: 0, used: 0, drawing: false, drawnAt: 0, url: null };
+const state = { session: null, scene: null, wanted: false, rates: [], dropped: 0, used: 0, drawing: false, drawnAt: 0, url: null };
 const video = h("video", { muted: true, playsInline: true, autoplay: true, "aria-label": "The camera's video" });
 const above = h("img", { class: "above", alt: "The scene as seen from the camera's position", hidden: true });
 const stack = h("div", { class: "stack live" }, video, above);
@@ -28,10 +28,10 @@ const badge = h("span", { class: "badge" });
 const advice = h("p", { class: "quiet", "aria-live": "polite" });
 const trouble = h("p", { class: "trouble", role: "alert", hidden: true });
 const facts = { rate: h("dd"), delay: h("dd"), left: h("dd"), position: h("dd"), accuracy: h("dd"), lens: h("dd") };
-const slider = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "How much of the scene's picture is shown" });
+const slider = h("input", { type: "range", min: 0, max: 100, value: 50, "aria-label": "Opacity of the rendered scene" });
 const scenes = h("select", { "aria-label": "Scene" });
-const button = h("button", { class: "primary" }, "Start camera");
-const canvas = h("canvas", { class: "plan", width: 480, height: 360, role: "img", "aria-label": "Plan of the scene with the camera's way" });
+const button = h("button", { class: "primary", "data-needs": "localize" }, "Start camera");
+const canvas = h("canvas", { class: "plan", width: 480, height: 360, role: "img", "aria-label": "Plan of the scene with the camera's path" });
 const plan = new Plan(canvas);
 const camera = new Camera(video, frame => state.session?.send(frame.jpeg, frame.timeS));
 camera.mayTake = () => state.session !== null && state.session.unanswered < 2;
@@ -48,9 +48,9 @@ function build() {
         h("label", { class: "slide" }, "Video", slider, "Scene"),
         h("p", { class: "verdict" }, badge), advice),
       h("div", {}, h("h2", {}, "Seen from above"), canvas,
-        h("p", { class: "quiet" }, "Grey: where the scene was captured from. Line: the camera's way."),
-        h("dl", { class: "facts" }, fact("Poses a second", facts.rate), fact("Answer after", facts.delay),
-          fact("Frames left out", facts.left), fact("Position", facts.position), fact("Standard deviation", facts.accuracy),
+        h("p", { class: "quiet" }, "Grey: training cameras. Line: the camera's path."),
+        h("dl", { class: "facts" }, fact("Poses per second", facts.rate), fact("Latency", facts.delay),
+          fact("Frames dropped", facts.left), fact("Position", facts.position), fact("Standard deviation", facts.accuracy),
           fact("Focal length", facts.lens)))));
   slider.addEventListener("input", () => { above.style.opacity = slider.value / 100; });
   above.style.opacity = slider.value / 100;
@@ -80,7 +80,8 @@ async function listScenes() {
 }
 
 async function showScene() {
-  plan.show(await service.scene(scenes.value));
+  state.scene = await service.scene(scenes.value);
+  plan.show(state.scene);
 }
 
 async function start() {
@@ -152,7 +153,7 @@ function answered(answer) {
 function spread(covariance) {
   if (!covariance) return "–";
   const sigma = first => Math.sqrt([0, 1, 2].reduce((sum, i) => sum + covariance[first + i][first + i], 0));
-  return `${(sigma(0) * 180 / Math.PI).toFixed(2)}°, ${Number(sigma(3).toPrecision(2))} units`;
+  return `${(sigma(0) * 180 / Math.PI).toFixed(2)}°, ${length(sigma(3), state.scene?.metres_per_unit)}`;
 }
 
 /** Render the scene at an answer's pose, if the last render is done and some time has passed. */
@@ -180,4 +181,5 @@ document.addEventListener("visibilitychange", () => { if (state.wanted) document
 addEventListener("pagehide", () => state.session?.close());
 
 build();
+hideForbidden();
 listScenes().catch(told);

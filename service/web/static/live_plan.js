@@ -1,4 +1,4 @@
-// The scene from above: where it was captured from, and the live camera's way.
+// The scene from above: where it was captured from, and the live camera's path.
 
 const TRAIL = 3000;  // positions
 const MARGIN = 0.12;

@@ -7,6 +7,7 @@ import * as job from "./job.js";
 import * as key from "./key.js";
 import * as keys from "./keys.js";
 import * as scene from "./scene.js";
+import { hideForbidden } from "./service.js";
 import * as start from "./start.js";
 
 const ROUTES = [
@@ -59,5 +60,5 @@ function submitted(files) {
   start.submit([...files]).catch(start.told);
 }
 
-keys.mayManage().then(may => { document.querySelector("#keys").hidden = !may; });
+hideForbidden().then(own => { document.querySelector("#keys").hidden = own?.name == null || own.role !== "admin"; });
 route();

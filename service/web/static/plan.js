@@ -1,6 +1,6 @@
 // A scene's plan as an SVG: seen from above, up out of the picture, the plan's first axis to the right.
 
-import { length } from "./dom.js";
+import { length, words } from "./dom.js";
 
 const SVG = "http://www.w3.org/2000/svg";
 const SIZE = 640;
@@ -47,6 +47,16 @@ export function inPlan(axes, matrix) {
 
 export function pointInPlan(axes, point) {
   return { x: dot(axes[0], point), y: dot(axes[1], point) };
+}
+
+/** The poses of an ended job, of a sequence all that were found, as `drawPlan` takes them. */
+export function drawnPoses(job) {
+  return (job.result.frames ?? [job.result])
+    .filter(answer => answer.status !== "not_localized")
+    .map(answer => ({
+      matrix: (answer.pose?.world_from_camera ?? answer.world_from_camera).matrix, status: answer.status,
+      href: `#/jobs/${job.id}`, title: `${answer.name ?? job.photo.name}: ${words(answer.status)}`,
+    }));
 }
 
 /**

@@ -124,7 +124,7 @@ function taking(job) {
 /** A link that shows this job to who has no key. */
 function sharing(job) {
   const place = h("div");
-  const button = h("button", { type: "button" }, "Share link");
+  const button = h("button", { type: "button", "data-needs": "localize" }, "Share link");
   button.addEventListener("click", async () => {
     button.disabled = true;
     try {
@@ -148,12 +148,12 @@ function exports({ result }) {
 function again(job) {
   const place = h("p", { class: "buttons" });
   if (!job.result?.frames) {
-    const button = h("button", { type: "button" }, "Run again");
+    const button = h("button", { type: "button", "data-needs": "localize" }, "Run again");
     button.addEventListener("click", () => repeat(job.id).catch(told));
     place.append(button);
   }
-  place.append(h("a", { class: "button", href: "#/" }, "Another photo"));
-  if (job.result) place.append(h("a", { class: "button", href: asPrior(job) }, "Another photo with this pose as prior"));
+  place.append(h("a", { class: "button", "data-needs": "localize", href: "#/" }, "Another photo"));
+  if (job.result) place.append(h("a", { class: "button", "data-needs": "localize", href: asPrior(job) }, "Another photo with this pose as prior"));
   others(job).then(jobs => {
     if (!jobs.length) return;
     const list = h("select", { "aria-label": "Another job on the same photo" },

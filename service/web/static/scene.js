@@ -2,7 +2,7 @@
 
 import { service } from "./service.js";
 import { degrees, facts, h, length, say, words } from "./dom.js";
-import { drawPlan, LEVELS, planAxes } from "./plan.js";
+import { drawnPoses, drawPlan, LEVELS, planAxes } from "./plan.js";
 
 const POLL_MS = 1000;
 const JOBS = 100;
@@ -55,7 +55,7 @@ function anchorParts(state) {
     }
   };
   const rows = state.anchors.map(({ name, position }) => {
-    const remove = h("button", { type: "button", class: "plain", "aria-label": `Delete ${name}` }, "Delete");
+    const remove = h("button", { type: "button", class: "plain", "data-needs": "admin", "aria-label": `Delete ${name}` }, "Delete");
     remove.addEventListener("click", () => change(name, () => service.deleteAnchor(state.id, name), "deleted"));
     return h("li", {}, h("span", {}, h("strong", {}, name), " ", h("span", { class: "quiet" }, position.map(x => Number(x.toPrecision(4))).join(", "))), remove);
   });
@@ -67,7 +67,7 @@ function anchorParts(state) {
 
 function namingForm(state, change) {
   const name = h("input", { id: "anchorname", required: true, maxLength: 64, pattern: "[^/\\\\]+", autocomplete: "off" });
-  const form = h("form", { class: "joined" }, h("label", { for: "anchorname" }, "Name of the picked point"), name, h("button", { class: "primary" }, "Save"));
+  const form = h("form", { class: "joined", "data-needs": "admin" }, h("label", { for: "anchorname" }, "Name of the picked point"), name, h("button", { class: "primary" }, "Save"));
   form.addEventListener("submit", event => {
     event.preventDefault();
     const { point } = state;
@@ -95,12 +95,7 @@ async function jobsOf(id) {
   const { jobs } = await service.jobs({ scene: id, limit: JOBS });
   const ended = jobs.filter(job => ["localized", "uncertain"].includes(job.status));
   const whole = await Promise.all(ended.map(job => service.job(job.id).catch(() => null)));
-  return whole.filter(Boolean).flatMap(job => (job.result.frames ?? [job.result])
-    .filter(answer => answer.status !== "not_localized")
-    .map(answer => ({
-      matrix: (answer.pose?.world_from_camera ?? answer.world_from_camera).matrix, status: answer.status,
-      href: `#/jobs/${job.id}`, title: `${answer.name ?? job.photo.name}: ${words(answer.status)}`,
-    })));
+  return whole.filter(Boolean).flatMap(drawnPoses);
 }
 
 function draw(state) {
@@ -119,7 +114,7 @@ function draw(state) {
 function coverageParts(state, map) {
   const { coverage, scene } = state;
   const running = coverage.state === "running";
-  const button = h("button", { type: "button", disabled: running }, map ? "Measure again" : "Measure coverage");
+  const button = h("button", { type: "button", disabled: running, "data-needs": "admin" }, map ? "Measure again" : "Measure coverage");
   button.addEventListener("click", () => measure(state, button));
   const parts = [h("h2", {}, "Where photos are found")];
   if (map) {

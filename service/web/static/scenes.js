@@ -95,7 +95,7 @@ export class SceneList {
     const loaded = gaussians !== null;
     const path = `scenes/${encodeURIComponent(id)}`;
     const button = (label, method, address, question = "") => {
-      const element = h("button", { type: "button", class: "plain", "aria-label": `${label} ${name}` }, label);
+      const element = h("button", { type: "button", class: "plain", "data-needs": "admin", "aria-label": `${label} ${name}` }, label);
       element.addEventListener("click", async () => {
         if (question && !confirm(question)) return;
         element.disabled = true;
@@ -121,13 +121,13 @@ export class SceneList {
       pick.value = "";
       if (file) this.upload(file);
     });
-    return h("div", { class: "card adding" }, pick, h("label", { for: "scenefile", class: "button" }, "Add a scene"),
+    return h("div", { class: "card adding", "data-needs": "admin" }, pick, h("label", { for: "scenefile", class: "button" }, "Add a scene"),
       h("span", { class: "quiet" }, "A scene file, or a ZIP of a scene folder. You can also drop it on this page."));
   }
 
-  /** Upload a scene under its file's name, and choose it. */
+  /** Upload a scene under its file's name, and choose it; tell whether it came. */
   async upload(file) {
-    const id = file.name.replace(/\.(ply\.gz|[^.]*)$/i, "").replaceAll(/[^\w-]+/g, "_").replace(/^[_-]+/, "").slice(0, 64) || "scene";
+    const id = file.name.replace(/(\.compressed)?\.(ply\.gz|[^.]*)$/i, "").replaceAll(/[^\w-]+/g, "_").replace(/^[_-]+/, "").slice(0, 64) || "scene";
     const abort = new AbortController();
     const bar = h("progress", { max: 1, "aria-label": "Upload" });
     const line = h("span", {}, "Uploading…");
@@ -144,11 +144,14 @@ export class SceneList {
       const scene = await service.upload("PUT", `scenes/${id}?file=${encodeURIComponent(file.name)}`, file, progress, abort.signal);
       this.onChoose(scene.id, [scene], true);
       say(`${scene.name} was uploaded`);
+      return true;
     } catch (error) {
       if (error.name !== "AbortError") this.onError(error);
+      return false;
+    } finally {
+      box.remove();
+      this.poll();
     }
-    box.remove();
-    this.poll();
   }
 }
 

@@ -40,7 +40,10 @@ async function untilLoaded(scene, told, signal) {
 /** Wait for what may pass by itself, and load a scene that isn't in memory; raise any other error. */
 async function mayPass(error, scene, told, signal) {
   const { code } = error;
-  if (code === "scene_unloaded") await service.ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
+  if (code === "scene_unloaded") {
+    const load = service.ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
+    await load.catch(refused => { throw refused.status === 403 ? error : refused; });  // what an admin has to do
+  }
   else if (!["queue_full", "rate_limited"].includes(code)) throw error;
   told(`Waiting: ${code === "scene_unloaded" ? "the scene is loading" : "the service is busy"}…`);
   await pause(POLL_MS, signal);

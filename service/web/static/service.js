@@ -41,6 +41,16 @@ class PageClient extends Client {
 
 export const service = new PageClient();
 
+/**
+ * Hide what the visitor's key may not do: elements with `data-needs`, a role. Where the service has no keys, all is shown.
+ * Returns what the key may do; null: not known.
+ */
+export async function hideForbidden() {
+  const own = await fetch("key").then(answer => (answer.ok ? answer.json() : null), () => null);
+  if (own) document.documentElement.dataset.role = own.role;
+  return own;
+}
+
 /** Tell whether the service answers only those who have a key: this page itself has a cookie instead. */
 export async function asksForKey() {
   return fetch("version", { credentials: "omit" }).then(response => response.status === 401, () => false);

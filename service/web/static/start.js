@@ -27,7 +27,9 @@ export function show(main, query) {
   main.append(
     h("h1", {}, "Where was this photo taken?"),
     h("p", { class: "lead" }, "splatfix finds the camera's pose of a photo inside a 3D Gaussian Splatting scene."),
-    alertLine, priorLine(), picker(example), list.element, more(),
+    alertLine, priorLine(), picker(example),
+    h("p", { class: "note readers" }, "Your key shows results. To localize photos, sign in with a key of the role “localize”."),
+    list.element, more(),
   );
   return () => { list.stop(); list = alertLine = null; };
 }
@@ -52,7 +54,10 @@ export async function submit(files, known = {}) {
   if (!files.length) return;
   if (alertLine) alertLine.hidden = true;
   const scenes = files.filter(isScene);
-  if (scenes.length) return addScenes(scenes);
+  if (scenes.length) {
+    files = files.filter(file => !isScene(file));
+    if (!await addScenes(scenes) || !files.length) return;  // photos go to the scene that came with them, or nowhere
+  }
   const fields = { ...(chosen.prior && { prior: chosen.prior.value }), ...(chosen.form ? chosen.form.fields() : {}), ...known };
   const scene = chosen.scene ?? await onlyScene();
   if (scene) fields.scene = scene;
@@ -71,13 +76,14 @@ export async function submit(files, known = {}) {
   }
 }
 
-/** Upload scenes one after the other; they are shown on the first view. */
+/** Upload scenes one after the other, which the first view shows, and choose the last; tell whether all came. */
 async function addScenes(files) {
   if (!list) {
     location.hash = "#/";
     await new Promise(resolve => addEventListener("hashchange", resolve, { once: true }));  // after which it is shown
   }
-  for (const file of files) await list?.upload(file);
+  for (const file of files) if (!await list?.upload(file)) return false;
+  return true;
 }
 
 /** Show an error: at its place in this view, above any other. */
@@ -137,7 +143,7 @@ function picker(example) {
       await submit(files).catch(told);
     });
   }
-  return h("div", { class: "drop" },
+  return h("div", { class: "drop", "data-needs": "localize" },
     h("p", {}, h("strong", {}, "Drop photos or a video here"), ", paste, or"),
     h("div", { class: "buttons" },
       pick, h("label", { for: "photo", class: "button primary" }, "Choose photos"),
@@ -145,7 +151,7 @@ function picker(example) {
 }
 
 function more() {
-  const details = h("details", { class: "more" }, h("summary", {}, "Intrinsics, prior, estimator and options"));
+  const details = h("details", { class: "more", "data-needs": "localize" }, h("summary", {}, "Intrinsics, prior, estimator and options"));
   if (chosen.form) {
     details.append(chosen.form.element);
     details.open = chosen.form.used();
