@@ -505,7 +505,7 @@ def finished_with(client: httpx.Client, path: str, key: str) -> dict:
     return client.get(path, headers=bearer(key)).json()
 
 
-def test_the_viewers_polling_is_not_logged(stepping, ring, tmp_path, caplog):
+def test_what_viewer_and_pages_poll_is_not_logged(stepping, ring, tmp_path, caplog):
     caplog.set_level(logging.INFO, "service")
     keys = KeyRing(tmp_path / "keys.json")
     reader = keys.caller(ring["read"])
@@ -514,9 +514,13 @@ def test_the_viewers_polling_is_not_logged(stepping, ring, tmp_path, caplog):
         viewer = keys.viewer_token(reader)
         for path, status in (("/jobs", 200), ("/scenes", 200), ("/jobs/none", 404)):
             assert client.get(path, headers=bearer(viewer)).status_code == status
-        client.get("/scenes", headers=bearer(ring["read"]))
+        by_page = bearer(ring["read"]) | {"Sec-Fetch-Site": "same-origin"}
+        for path in ("/jobs", "/ui/icon.svg", "/jobs/gone"):
+            client.get(path, headers=by_page)
+        client.get("/scenes", headers=bearer(ring["read"]) | {"Sec-Fetch-Site": "cross-site"})
     lines = [r.getMessage() for r in caplog.records if r.getMessage().startswith("GET")]
-    assert [line.rpartition(" ")[0].rpartition(" ")[0] for line in lines] == ["GET /jobs/none 404", "GET /scenes 200"]
+    told = [line.rpartition(" ")[0].rpartition(" ")[0] for line in lines]
+    assert told == ["GET /jobs/none 404", "GET /jobs/gone 404", "GET /scenes 200"]
 
 
 def test_the_photos_own_name_reaches_no_path(client, tmp_path, monkeypatch):

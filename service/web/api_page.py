@@ -1,13 +1,12 @@
-"""The API's description as a page at `/docs`: Swagger UI, whose files come with a package and from no other server."""
+"""The files of Swagger UI, which the page at `/docs` shows the API with: from a package, and from no other server."""
 
 from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
 
-from fastapi import FastAPI, Request
-from fastapi.openapi.docs import get_swagger_ui_html
-from fastapi.responses import FileResponse, HTMLResponse
+from fastapi import FastAPI
+from fastapi.responses import FileResponse
 
 from service.web.route_policy import route_policy
 
@@ -15,21 +14,9 @@ _SCRIPT, _STYLE = "swagger-ui-bundle.js", "swagger-ui.css"
 
 
 def add_api_page(app: FastAPI) -> None:
-    """Add the routes of the page; FastAPI's own would load a CDN's files."""
-    for path, endpoint in (("/docs", _page), (f"/docs/{_SCRIPT}", _script), (f"/docs/{_STYLE}", _style)):
-        app.add_api_route(path, endpoint, include_in_schema=False)
-
-
-@route_policy(role=None)
-async def _page(request: Request) -> HTMLResponse:
-    root = request.scope.get("root_path", "")
-    return get_swagger_ui_html(
-        openapi_url=f"{root}/openapi.json",
-        title="splatfix API",
-        swagger_js_url=f"{root}/docs/{_SCRIPT}",
-        swagger_css_url=f"{root}/docs/{_STYLE}",
-        swagger_favicon_url=f"{root}/ui/icon.svg",
-    )
+    """Add the routes of the files; FastAPI's own page would load a CDN's."""
+    app.add_api_route(f"/docs/{_SCRIPT}", _script, include_in_schema=False)
+    app.add_api_route(f"/docs/{_STYLE}", _style, include_in_schema=False)
 
 
 @route_policy(role=None)

@@ -1,4 +1,4 @@
-"""The start page at `/`, the live page, the page of a share link, their files under `/ui`, and `/client.js`."""
+"""The start page at `/`, the live page, the API's at `/docs`, the page of a share link, their files under `/ui`, and `/client.js`."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ def add_pages(app: FastAPI) -> None:
     """Add the routes of the pages."""
     app.add_api_route("/", _start_page, include_in_schema=False)
     app.add_api_route("/live", _live_page, include_in_schema=False)
+    app.add_api_route("/docs", _api_page, include_in_schema=False)
     app.add_api_route("/shared/{token}", _shared_page, include_in_schema=False)
     app.add_api_route("/client.js", _client, include_in_schema=False)
     # Public: without a key, too, the start page must be able to ask for one.
@@ -38,6 +39,11 @@ async def _start_page() -> FileResponse:
 @route_policy(role="localize", key_in_address=True)
 async def _live_page() -> FileResponse:
     return FileResponse(PAGES / "live.html", media_type="text/html", headers=_REVALIDATE)
+
+
+@route_policy(role=None)
+async def _api_page() -> FileResponse:
+    return FileResponse(PAGES / "api.html", media_type="text/html", headers=_REVALIDATE)
 
 
 @route_policy(role=None)

@@ -30,11 +30,13 @@ _HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-# Only for our own pages, which have no inline scripts; the viewer's page and /docs do.
+# Only for our own pages, which have no inline scripts; the viewer's page has.
 _PAGES_POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
     "base-uri 'none'; form-action 'self'; frame-ancestors 'self'"
 )
+_SENT_BY_PAGE = (b"sec-fetch-site", b"same-origin")
+"""The header that a browser adds to what our own pages ask for, beyond their address."""
 _NOT_LOGGED = ("/livez", "/readyz", "/metrics", "/viewer-run")
 
 
@@ -94,8 +96,9 @@ class Proxy:
         path = scope["path"].removeprefix(scope.get("root_path", ""))
         self._metrics.request(scope["method"], route, status, seconds)
         caller = scope["state"].get("caller")
-        # The viewer asks twice a second whether there are new jobs.
-        polls = caller is not None and caller.by_viewer and scope["method"] == "GET" and status < 400
+        # The viewer asks twice a second whether there are new jobs, an open page each second how far its jobs are.
+        by_us = (caller is not None and caller.by_viewer) or _SENT_BY_PAGE in scope["headers"]
+        polls = by_us and scope["method"] == "GET" and status < 400
         _audit_act(scope, caller, status)
         if not polls and not path.startswith(_NOT_LOGGED):
             # Without the query, which may contain a key.
@@ -121,7 +124,7 @@ class _Response:
         self.status = 499  # as in nginx: the client closed the connection before the response
         self.begun = self.dropped = False
         path = scope["path"].removeprefix(scope.get("root_path", ""))
-        self._own_page = path in ("/", "/live") or path.startswith("/ui/")
+        self._own_page = path in ("/", "/live", "/docs") or path.startswith("/ui/")
 
     async def send(self, message: Message) -> None:
         if message["type"] == "http.response.start":
