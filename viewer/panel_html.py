@@ -182,7 +182,7 @@ def coverage_html(answer: CoverageAnswer) -> str:
         return _small(f"coverage: {answer.done} of {answer.total or '…'} photos are localized")
     if answer.problem:
         return _small(f"coverage could not be measured: {escape(answer.problem)}")
-    return _small("coverage is not measured yet: start it on the scene's card of the start page")
+    return _small("coverage is not measured yet: measure it on the scene's page (start page, “Plan and coverage”)")
 
 
 def _swatch(ground: str, width: str = ".7em") -> str:

@@ -18,7 +18,7 @@ def scene_coverage(
     scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")],
     json_file: JsonFileOption = None,
     image: Annotated[Path | None, typer.Option("--image", help="Draw the plan view: a PNG.")] = None,
-    again: Annotated[bool, typer.Option("--again", help="Measure anew, also where a map is stored.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Measure again, even if a map is stored.")] = False,
 ) -> None:
     """Measure where a photo of a scene would be found: localizes renders made as photos are, and held-out photos."""
     from service.loaded_scene import DEFAULT_ESTIMATOR
