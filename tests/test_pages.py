@@ -792,6 +792,34 @@ def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -
 LOADED = "[...document.images].every(image => image.complete && image.naturalWidth > 0)"
 
 
+def test_a_scene_is_registered_by_anchors_and_that_undone(browser: Browser, url: str) -> None:
+    """With a length of 3 m between points that are 2 units apart; the same API takes coordinates and a floor."""
+    places = {"left": [0, 0, 0], "right": [2, 0, 0], "far": [0, 2, 0]}
+    for name, position in places.items():
+        httpx.put(f"{url}/scenes/room/anchors/{name}", json={"position": position}, trust_env=False).raise_for_status()
+    page = opened(browser, f"{url}/#/scenes/room")
+    page.get_by_text("Not registered").wait_for()
+    page.get_by_text("Register by anchors").click()
+    page.get_by_label("Coordinates of left").fill("here")
+    page.get_by_role("button", name="Register").click()
+    expect(page.get_by_role("alert")).to_contain_text("coordinates of left must be three numbers")
+    page.get_by_label("Coordinates of left").fill("")
+    page.get_by_role("button", name="Add a length").click()
+    page.get_by_label("From").select_option("left")
+    page.get_by_label("To").select_option("right")
+    page.get_by_label("Length in metres").fill("3")
+    _audit(page)
+    page.get_by_role("button", name="Register").click()
+    expect(page.get_by_text("Metres per unit")).to_be_visible()
+    found = httpx.get(f"{url}/scenes/room/registration", trust_env=False).json()
+    assert found["metres_per_unit"] == pytest.approx(1.5)
+    page.get_by_role("button", name="Undo registration").click()
+    page.get_by_text("Not registered").wait_for()
+    for name in places:
+        httpx.delete(f"{url}/scenes/room/anchors/{name}", trust_env=False)
+    page.close()
+
+
 def test_a_job_is_shared_by_a_link(browser: Browser, page: Page, url: str) -> None:
     page.set_input_files("#photo", PHOTO)
     page.locator(".verdict .badge").wait_for()

@@ -1,8 +1,9 @@
-// One scene in plan: where photos are found, its training cameras, and the poses of all jobs.
+// One scene in plan: where photos are found, its training cameras, the poses of all jobs, anchors, and its registration.
 
 import { service } from "./service.js";
 import { degrees, facts, h, length, say, words } from "./dom.js";
 import { drawnPoses, drawPlan, LEVELS, planAxes } from "./plan.js";
+import { RegistrationPart } from "./registration.js";
 
 const POLL_MS = 1000;
 const JOBS = 100;
@@ -31,6 +32,7 @@ async function begin(state, title) {
   }
   state.scene = scene;
   state.axes = planAxes(scene);
+  state.registration = new RegistrationPart(state.id);
   await refresh(state);
   [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), service.anchors(state.id)]);
   draw(state);
@@ -108,7 +110,8 @@ function draw(state) {
   });
   state.plan.replaceChildren(picture ?? h("p", { class: "note" }, "No cameras, no jobs and no coverage map yet: there is nothing to draw."));
   if (state.aside.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;  // who types
-  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, jobs, state.anchors));
+  state.registration.setAnchors(state.anchors);
+  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, jobs, state.anchors), state.registration.element);
 }
 
 function coverageParts(state, map) {
