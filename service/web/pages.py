@@ -1,4 +1,4 @@
-"""The start page at `/`, the live page, the API's at `/docs`, the page of a share link, their files under `/ui`, and `/client.js`."""
+"""The pages: start, live, API (`/docs`) and share link; their files under `/ui`, and `/client.js`."""
 
 from __future__ import annotations
 
