@@ -51,9 +51,9 @@ export class RegistrationPart {
     const names = this.anchors.map(({ name }) => [name, name]);
     const [from, to] = [select("From", names), select("To", names)];
     to.selectedIndex = 1;
-    const metres = h("input", { type: "number", min: 0, step: "any", "aria-label": "Length in metres", placeholder: "metres" });
+    const metres = h("input", { type: "number", min: 0, step: "any", "aria-label": "Length in metres", class: "short" });
     this.lengths.push({ from, to, metres });
-    return h("p", { class: "joined" }, "From", from, "to", to, "it is", metres, "m");
+    return h("p", { class: "joined" }, "From", from, "to", to, "it is", metres, "metres");
   }
 
   #register() {
@@ -84,7 +84,7 @@ export class RegistrationPart {
 
   #show(found) {
     if (!found) {
-      this.current.replaceChildren(h("p", { class: "quiet" }, "Not registered: results are in scene units, and not on Earth."));
+      this.current.replaceChildren(h("p", { class: "quiet" }, "Not registered: the scene's place in a local frame, or on Earth, is unknown."));
       return;
     }
     const undo = h("button", { type: "button", "data-needs": "admin" }, "Undo registration");
