@@ -101,12 +101,12 @@ def test_a_key_ends_with_all_that_stands_for_it(file: Path, monkeypatch: pytest.
     assert guest
     session, link, viewer = ring.token(guest, 9000), ring.share_token("job", 9000, guest), ring.viewer_token(guest)
     assert ring.bearer(session) == guest
-    assert (ring.shared_job(link), ring.lives(guest)) == ("job", True)
+    assert (ring.shared_job(link), ring.still_valid(guest)) == ("job", True)
     assert ring.viewer_bearer(viewer)
     now = time.time()
     monkeypatch.setattr(time, "time", lambda: now + 1001)
     assert ring.caller(key) is ring.bearer(session) is ring.shared_job(link) is ring.viewer_bearer(viewer) is None
-    assert not ring.lives(guest)
+    assert not ring.still_valid(guest)
     # An expired key doesn't open the service to everybody.
     assert ring
 

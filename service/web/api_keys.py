@@ -115,6 +115,7 @@ class KeyRing:
         if any(key.name == name for key in self._temporary):
             raise key_exists(name)
         key = add_key(self._stored_in(), name, role, limits)
+        # The file is read again at the next request, not at the next check: the key is used at once.
         self._read_at = -math.inf
         return key
 
@@ -142,7 +143,7 @@ class KeyRing:
                 found = known
         return _caller(found) if found and found.is_valid() else None
 
-    def lives(self, caller: Caller) -> bool:
+    def still_valid(self, caller: Caller) -> bool:
         """Return whether a caller's key is still there, and has not expired."""
         return self._find(caller.id) is not None
 
@@ -160,6 +161,7 @@ class KeyRing:
 
     def viewer_token(self, caller: Caller) -> str:
         """Return the token by which the viewer asks in the caller's name; always the same one of a key."""
+        # Without a time: the viewer shares what it has fetched among browsers whose tokens are equal.
         return self._signed(_VIEWER, {"key": caller.id})
 
     def viewer_bearer(self, token: str) -> Caller | None:
@@ -195,6 +197,7 @@ class KeyRing:
     def _claim(self, kind: str, token: str) -> dict | None:
         """Return what a token of this kind claims; None if it wasn't signed here, or is of another kind."""
         text, _, signature = token.partition(".")
+        # Before it is parsed: what is forged never reaches the parser.
         if not hmac.compare_digest(self._signature(kind + text).encode(), signature.encode()):
             return None
         return json.loads(base64.urlsafe_b64decode(text + "=" * (-len(text) % 4)))

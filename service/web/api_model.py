@@ -6,4 +6,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Model(BaseModel):
+    """A model of the API: docstrings of its fields are their descriptions, and unknown fields are refused."""
+
     model_config = ConfigDict(use_attribute_docstrings=True, extra="forbid")

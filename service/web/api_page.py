@@ -31,4 +31,5 @@ async def _style() -> FileResponse:
 
 def _packaged(name: str, media_type: str) -> FileResponse:
     file = Path(str(resources.files("fastapi_swagger") / "resources" / name))
+    # Another version of the package has other files under the same names.
     return FileResponse(file, media_type=media_type, headers={"Cache-Control": "no-cache"})

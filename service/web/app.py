@@ -92,6 +92,7 @@ def create_app(settings: Settings | None = None, engine: Engine | None = None, k
         lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
+        # Generated clients name their functions by it: FastAPI's own holds the path and the method, too.
         generate_unique_id_function=lambda route: route.name,
     )
     add_error_handlers(app)
@@ -144,6 +145,7 @@ async def _start(
         if scene.uploaded:
             engine.add(scene)
     store, photos, lenses = await to_thread.run_sync(_stores, settings, folder)
+    # Before jobs are listed: those of an earlier release belong to the name of a key alone.
     for by_name, client in keys.unnamed_clients():
         await to_thread.run_sync(store.reassign, by_name, client)
     stack.callback(lenses.close)
@@ -212,6 +214,7 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Me
             allow_origins=settings.cors_origins,
             allow_methods=["*"],
             allow_headers=["*"],
+            # Other headers a browser hides from another site's script.
             expose_headers=["Location", "Retry-After"],
         )
     app.add_middleware(HeadRequests)

@@ -66,6 +66,7 @@ class KeyLimits:
 
     def cover(self, scene_id: str) -> bool:
         """Return whether the key may use a scene of that name, be it there or not."""
+        # fnmatch itself ignores case on Windows.
         return self.scenes is None or any(fnmatchcase(scene_id, pattern) for pattern in self.scenes)
 
 
@@ -93,7 +94,7 @@ class StoredKey:
 
     @property
     def id(self) -> str:
-        """What tells a key from another one of the same name: digits of its hash."""
+        """Digits of its hash, which distinguish it from another key of the same name."""
         return self.sha256[:_ID_DIGITS]
 
     def is_valid(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 
 from prometheus_client import (
     CollectorRegistry,
@@ -22,6 +23,7 @@ METRICS_TYPE = CONTENT_TYPE_LATEST
 # From a rendered thumbnail to the longest searches.
 _SECONDS = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 30, 60, 120)
 
+# Finest around the time between two frames of a camera.
 _FRAME_SECONDS = (0.005, 0.01, 0.02, 0.03, 0.045, 0.06, 0.08, 0.12, 0.2, 0.5, 1, 2)
 
 _MOST_VALUES = 100
@@ -39,49 +41,26 @@ class Metrics:
         self._registry = registry = CollectorRegistry()
         ProcessCollector(registry=registry)
         PlatformCollector(registry=registry)
-        self._requests = Counter("splatfix_requests", "HTTP requests", ["method", "route", "status"], registry=registry)
-        self._request_s = Histogram(
-            "splatfix_request_seconds",
-            "Time from a request to the end of its response",
-            ["route"],
-            buckets=_SECONDS,
-            registry=registry,
+        counter = partial(Counter, registry=registry)
+        seconds = partial(Histogram, buckets=_SECONDS, registry=registry)
+        self._requests = counter("splatfix_requests", "HTTP requests", ["method", "route", "status"])
+        self._request_s = seconds(
+            "splatfix_request_seconds", "Time from a request to the end of its response", ["route"]
         )
-        self._jobs = Counter("splatfix_jobs", "Finished jobs", ["estimator", "state", "status"], registry=registry)
-        self._by_key = Counter(
-            "splatfix_jobs_by_key", "Finished jobs by API key and scene", ["key", "scene", "state"], registry=registry
-        )
-        self._seconds_by_key = Counter(
-            "splatfix_job_seconds_by_key", "Time of workers by API key and scene", ["key", "scene"], registry=registry
+        self._jobs = counter("splatfix_jobs", "Finished jobs", ["estimator", "state", "status"])
+        self._by_key = counter("splatfix_jobs_by_key", "Finished jobs by API key and scene", ["key", "scene", "state"])
+        self._seconds_by_key = counter(
+            "splatfix_job_seconds_by_key", "Time of workers by API key and scene", ["key", "scene"]
         )
         self._keys, self._scenes = _Bounded(), _Bounded()
-        self._wait_s = Histogram(
-            "splatfix_job_wait_seconds", "Time of a job from acceptance to start", buckets=_SECONDS, registry=registry
+        self._wait_s = seconds("splatfix_job_wait_seconds", "Time of a job from acceptance to start")
+        self._job_s = seconds("splatfix_job_seconds", "Time of a job from start to end", ["estimator"])
+        self._stage_s = seconds("splatfix_stage_seconds", "Time of a job by stage", ["estimator", "stage"])
+        self._renders = counter("splatfix_renders", "Renders made by jobs", ["estimator"])
+        self._render_s = seconds(
+            "splatfix_render_seconds", "Time to render an image for a client, including its wait", ["scene"]
         )
-        self._job_s = Histogram(
-            "splatfix_job_seconds",
-            "Time of a job from start to end",
-            ["estimator"],
-            buckets=_SECONDS,
-            registry=registry,
-        )
-        self._stage_s = Histogram(
-            "splatfix_stage_seconds",
-            "Time of a job by stage",
-            ["estimator", "stage"],
-            buckets=_SECONDS,
-            registry=registry,
-        )
-        self._renders = Counter("splatfix_renders", "Renders made by jobs", ["estimator"], registry=registry)
-        self._render_s = Histogram(
-            "splatfix_render_seconds",
-            "Time to render an image for a client, including its wait",
-            ["scene"],
-            buckets=_SECONDS,
-            registry=registry,
-        )
-
-        self._live_frames = Counter("splatfix_live_frames", "Frames of live sessions", ["outcome"], registry=registry)
+        self._live_frames = counter("splatfix_live_frames", "Frames of live sessions", ["outcome"])
         self._live_s = Histogram(
             "splatfix_live_answer_seconds",
             "Time from a frame's arrival to its answer, by the session's mode",
@@ -89,9 +68,7 @@ class Metrics:
             buckets=_FRAME_SECONDS,
             registry=registry,
         )
-        self._live_closed = Counter(
-            "splatfix_live_closed", "Live sessions that ended, by close code", ["code"], registry=registry
-        )
+        self._live_closed = counter("splatfix_live_closed", "Live sessions that ended, by close code", ["code"])
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:
         """Count a request that was answered. `route` is the path with its parameters' names."""

@@ -156,6 +156,7 @@ def _status(kind: type[SplatfixError]) -> int:
 @cache
 def _status_by_code() -> dict[str, int]:
     """Return the HTTP status of every SplatfixError, by its code."""
+    # Found by their classes, so that a new error needs no second list here.
     kinds, found = [SplatfixError], {}
     while kinds:
         kind = kinds.pop()
@@ -255,8 +256,8 @@ def _allowed(request: Request) -> set[str]:
 def field_and_message(errors: Sequence[Any], model: type[BaseModel] | None = None) -> tuple[str, str]:
     """Return the field of pydantic's first error, and the messages of all, joined; `model` is what was validated."""
     places = [".".join(str(part) for part in e["loc"]) for e in errors]
-    told = [_message(e, model) for e in errors]
-    messages = [text if p == places[0] else f"{p}: {text}" for p, text in zip(places, told, strict=True)]
+    texts = [_message(e, model) for e in errors]
+    messages = [text if p == places[0] else f"{p}: {text}" for p, text in zip(places, texts, strict=True)]
     return places[0], "; ".join(messages) + "."
 
 

@@ -66,6 +66,7 @@ DENIED_WRITE = RoutePolicy("admin", SMALL_BODY, rate_limited=True)
 
 def declare(endpoint: _Endpoint, policy: RoutePolicy) -> _Endpoint:
     """Attach a policy to what serves a route: a function, or the application of a mount."""
+    # On what serves the route: FastAPI makes its route objects later, and keeps that in them.
     setattr(endpoint, _ATTRIBUTE, policy)
     return endpoint
 

@@ -134,8 +134,8 @@ class Settings(BaseSettings):
     photo_grace_s: float = Field(default=900.0, ge=0)
     """How long a photo is kept after its job, unless the request has `keep_photo`; 0: deleted with the job's end."""
     keep_lenses: int = Field(default=10_000, ge=0)
-    """Number of cameras' lenses that are remembered: what earlier photos told is the prior of the next photo. 0: none,
-    and what was remembered is deleted at the start."""
+    """Number of cameras' lenses that are remembered: estimates by earlier photos are the prior of the next photo. 0:
+    none, and what was remembered is deleted at the start."""
     crashes: int = Field(default=3, ge=1)
     """A job whose attempts were lost this many times, by crashes of the service, is not run again."""
     max_upload_bytes: int | None = Field(default=None, ge=1)
@@ -187,6 +187,7 @@ class Settings(BaseSettings):
         """`max_upload_bytes`, or its default for the address that is listened on."""
         if self.max_upload_bytes is not None:
             return self.max_upload_bytes
+        # On this machine nobody else's uploads compete for its memory and disk.
         return 1_000_000_000 if is_loopback(self.host) else 50_000_000
 
     @property

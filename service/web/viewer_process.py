@@ -29,7 +29,7 @@ class ViewerChild:
     def __init__(self, service_url: str, certificate: Path | None = None) -> None:
         """`certificate` is the service's, if it serves HTTPS.
 
-        The viewer has no key of its own: the relay tells it for each browser in whose name to ask.
+        The viewer has no key of its own: with each browser the relay sends it a token to ask the service with.
         """
         # The viewer has threads for each browser; with a malloc arena each, they couldn't reuse each other's memory.
         # It finds modules where this process does, and not (-P) in a working directory that has a `viewer` of its own.
@@ -55,6 +55,7 @@ class ViewerChild:
         # The log goes to stderr. On stdout viser prints its own address, which users shouldn't open.
         child = await asyncio.create_subprocess_exec(
             *self.command,
+            # Held open: by its end the viewer notices that this process is gone, however it ended.
             stdin=asyncio.subprocess.PIPE,
             stdout=asyncio.subprocess.DEVNULL,
             env=self._environment,

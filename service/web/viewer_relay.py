@@ -4,7 +4,7 @@ The viewer's page derives the address of its WebSocket from its own: the page /v
 /viewer/jobs/ID. The path after /viewer is passed on, and names the job to show. All pages are the same file, so the
 relay returns it for every path that the viewer has no file for. A header has the token with which the viewer asks the
 service: in the name of the browser's user, so that it shows what that one may see. A script (`static/viewer.js`) sets
-cookies that tell whether the browser has a GPU and its time zone; the relay passes them on as query parameters. The
+cookies with its time zone and whether it has a GPU; the relay passes them on as query parameters. The
 same script asks `/viewer-run` whether the viewer is still the one that the page was opened with.
 """
 
@@ -91,21 +91,22 @@ class Relay:
     @route_policy(role="read", key_in_address=True)
     async def _socket(self, browser: WebSocket, path: str = "") -> None:
         offered = [Subprotocol(name) for name in browser.scope.get("subprotocols", [])]
-        told = {"gl": browser.cookies.get("splatfix_gl"), "zone": unquote(browser.cookies.get("splatfix_zone", ""))}
-        query = urlencode({name: value for name, value in told.items() if value})
+        facts = {"gl": browser.cookies.get("splatfix_gl"), "zone": unquote(browser.cookies.get("splatfix_zone", ""))}
+        query = urlencode({name: value for name, value in facts.items() if value})
         uri = f"ws://127.0.0.1:{self._upstream.port}/{path}{'?' if query else ''}{query}"
         caller: Caller | None = getattr(browser.state, "caller", None)
-        told_by = {"Authorization": f"Bearer {self._keys.viewer_token(caller)}"} if caller else None
+        headers = {"Authorization": f"Bearer {self._keys.viewer_token(caller)}"} if caller else None
         try:
             # No size limit and no compression: messages contain whole scenes, on loopback.
             async with connect(
                 uri,
                 subprotocols=offered or None,
-                additional_headers=told_by,
+                additional_headers=headers,
                 max_size=None,
                 compression=None,
                 proxy=None,
             ) as viewer:
+                # After the viewer's own: a socket that opens has a viewer behind it.
                 await browser.accept(viewer.subprotocol)
                 await _first_of(_to_viewer(browser, viewer), _to_browser(viewer, browser))
         except (OSError, WebSocketException) as error:

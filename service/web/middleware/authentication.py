@@ -144,7 +144,7 @@ def _check_scene(scene_id: str | None, caller: Caller | None) -> None:
 
 
 def _opens_page(scope: Scope) -> bool:
-    """Return whether a person opens a page, to whom a problem document in JSON would tell nothing."""
+    """Return whether a browser opens a page, to whose user a problem document in JSON is of no use."""
     return scope["type"] == "http" and "text/html" in Headers(scope=scope).get("accept", "")
 
 

@@ -37,6 +37,7 @@ _PAGES_POLICY = (
 )
 _SENT_BY_PAGE = (b"sec-fetch-site", b"same-origin")
 """The header that a browser adds to what our own pages ask for, beyond their address."""
+# Probes, scrapes and open pages ask every few seconds: the log would hold little else.
 _NOT_LOGGED = ("/livez", "/readyz", "/metrics", "/viewer-run")
 
 
@@ -135,6 +136,7 @@ class _Response:
                 # A policy of its own says by whom the page may be framed.
                 if name != "X-Frame-Options" or "content-security-policy" not in headers:
                     headers.setdefault(name, value)
+            # Photos and poses are one user's: no shared cache may keep them.
             headers.setdefault("Cache-Control", "private, no-cache")
             if self._own_page:
                 headers["Content-Security-Policy"] = _PAGES_POLICY

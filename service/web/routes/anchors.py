@@ -1,4 +1,4 @@
-"""`/scenes/{id}/anchors`: named points of a scene, which results tell as their photos' cameras see them."""
+"""`/scenes/{id}/anchors`: named points of a scene, which results return as their photos' cameras see them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Name = Annotated[
 @route_policy(role="read")
 def list_anchors(scene_id: str, app_state: AppStateOf) -> AnchorList:
     """List the scene's anchors by name."""
-    app_state.engine.scene(scene_id)
+    app_state.engine.scene(scene_id)  # raises SceneNotFound: the store has no list of scenes
     return AnchorList(anchors=[anchor_out(anchor) for anchor in app_state.anchors.anchors(scene_id)])
 
 
@@ -40,7 +40,7 @@ def list_anchors(scene_id: str, app_state: AppStateOf) -> AnchorList:
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def put_anchor(scene_id: str, name: Name, anchor: AnchorIn, app_state: AppStateOf) -> AnchorOut:
     """Add an anchor to the scene, or move the one of that name."""
-    app_state.engine.scene(scene_id)
+    app_state.engine.scene(scene_id)  # raises SceneNotFound
     added = Anchor(name, np.array(anchor.position, np.float64))
     app_state.anchors.put(scene_id, added)
     return anchor_out(added)
@@ -57,5 +57,5 @@ def put_anchor(scene_id: str, name: Name, anchor: AnchorIn, app_state: AppStateO
 @route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
 def delete_anchor(scene_id: str, name: Name, app_state: AppStateOf) -> None:
     """Delete an anchor of the scene."""
-    app_state.engine.scene(scene_id)
+    app_state.engine.scene(scene_id)  # raises SceneNotFound
     app_state.anchors.delete(scene_id, name)

@@ -94,6 +94,7 @@ class Visible:
         if asked is None:
             if len(usable) != 1:
                 raise SceneNotFound(f"name a scene; known: {names}.", where="scene")
+            # The engine would choose among all scenes, this key's or not.
             return None if self.all_scenes else usable[0]
         if asked == AUTO:
             return asked if self.all_scenes else self._auto(known)

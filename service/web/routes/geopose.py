@@ -9,9 +9,10 @@ from fastapi import APIRouter, Header, Query, Request, Response
 
 from service.errors import DeadlineExceeded, InvalidImage, NoGeoAnchor
 from service.photos.sequence import is_sequence
+from service.types import GeoAnchor
 from service.web.problems import problem_answer, problem_of_failure
 from service.web.route_policy import PHOTO_BODY, route_policy
-from service.web.routes.dependencies import AppStateOf, VisibleOf
+from service.web.routes.dependencies import AppState, AppStateOf, Visible, VisibleOf
 from service.web.routes.localize import create_job
 from service.web.schemas import geopose_protocol as gpp
 from service.web.schemas import resources
@@ -62,14 +63,8 @@ async def geopose(
     # The protocol has one image for each reading.
     if is_sequence(photo):
         raise InvalidImage("not a photo.", where="cameraReadings.0.imageBytes")
-    known = await to_thread.run_sync(app_state.engine.scenes)
-    if scene:
-        visible.asked(scene, known)  # raises SceneNotFound
-    named = scene or gpp.nearest_scene(visible.scenes(known), wanted)
-    scene_id = (await to_thread.run_sync(app_state.engine.scene, named)).id
-    anchor = (await to_thread.run_sync(app_state.engine.require, scene_id)).geo_anchor
-    if anchor is None:
-        raise NoGeoAnchor(f"scene '{scene_id}' has no geo_anchor.", where="scene")
+    scene_id, anchor = await to_thread.run_sync(_anchored_scene, app_state, visible, scene, wanted)
+    # Longer than it waits nobody would take the answer.
     wait_s = app_state.settings.max_wait_s
     fields = LocalizeFields(
         scene=scene_id, intrinsics=intrinsics, prior=gpp.prior_of(wanted, anchor), deadline_s=wait_s
@@ -91,3 +86,21 @@ async def geopose(
     if GEOPOSE in accept:
         return Response(answer.geopose.model_dump_json(), media_type=GEOPOSE)
     return Response(answer.model_dump_json(), media_type="application/json")
+
+
+def _anchored_scene(
+    app_state: AppState, visible: Visible, asked: str | None, wanted: gpp.GeoPoseRequest
+) -> tuple[str, GeoAnchor]:
+    """Return the scene that is asked for, else the nearest, in memory, with its anchor. Not for the event loop.
+
+    Raises SceneError, NoGeoAnchor.
+    """
+    known = app_state.engine.scenes()
+    if asked:
+        visible.asked(asked, known)  # raises SceneNotFound
+    named = asked or gpp.nearest_scene(visible.scenes(known), wanted)
+    scene_id = app_state.engine.scene(named).id
+    anchor = app_state.engine.require(scene_id).geo_anchor
+    if anchor is None:
+        raise NoGeoAnchor(f"scene '{scene_id}' has no geo_anchor.", where="scene")
+    return scene_id, anchor

@@ -49,6 +49,7 @@ def list_jobs(
     page = app_state.jobs.page(wanted, limit + 1)
     given = {"scene": scene, "estimator": estimator, "state": state, "status": status, "photo": photo, "limit": limit}
     query = {name: value for name, value in given.items() if value is not None}
+    # By the last job's number, not by an offset: jobs that come meanwhile shift no page.
     more = f"{root}/jobs?{urlencode(query | {'before': page[limit - 1].number})}" if len(page) > limit else None
     return JobList(
         jobs=[resources.job_summary_out(job, root) for job in page[:limit]],

@@ -38,6 +38,7 @@ from service.web.schemas.live import (
 
 _log = logging.getLogger(__name__)
 
+# Codes from 4000 on are an application's own (RFC 6455, 7.4.2): 4000 and the HTTP status of the same error.
 BAD_MESSAGE, KEY_GONE, NO_SCENE, TIMEOUT, TOO_LARGE, TOO_MANY, FAILED, UNAVAILABLE = (
     *(4400, 4401, 4404, 4408, 4413, 4429, 4500, 4503),
 )
@@ -107,6 +108,7 @@ class _Session:
     def _place(self) -> Iterator[None]:
         """Take a place among the sessions. Raises _End if there is none."""
         live, client = self._state.live, client_of(self._socket.scope)
+        # Nothing is awaited between check and count, so no other session takes the place.
         if live[client] >= self._settings.live_sessions_of_client:
             raise _End(TOO_MANY, f"{live[client]} live sessions of yours go on already.")
         if live.total() >= self._settings.live_sessions:
@@ -130,6 +132,7 @@ class _Session:
             await self._send(LiveWelcome(scene=self._scene, limits=self._limits()))
             await self._exchange(task)
         finally:
+            # Cancelled, too: a scene that stays held is never evicted.
             with anyio.CancelScope(shield=True):
                 await to_thread.run_sync(engine.release, held.token)
 
@@ -154,7 +157,8 @@ class _Session:
         follow = partial(self._state.engine.live, task, self._next_frame, self._on_answer)
         # A thread of its own for each session, beside those of other requests.
         followed = to_thread.run_sync(follow, limiter=anyio.CapacityLimiter(1))
-        parts = [asyncio.ensure_future(part) for part in (followed, self._frames(), self._tell(), self._watch())]
+        duties = (followed, self._frames(), self._send_answers(), self._watch())
+        parts = [asyncio.ensure_future(duty) for duty in duties]
         try:
             ended, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -178,6 +182,7 @@ class _Session:
 
     def _on_answer(self, answer: LiveAnswer) -> None:
         """Hand an answer to the event loop. On the engine's thread."""
+        # asyncio's queues are not safe from other threads.
         self._loop.call_soon_threadsafe(self._answers.put_nowait, (answer, *self._taken))
 
     async def _frames(self) -> None:
@@ -197,7 +202,7 @@ class _Session:
             last = read_frame(message, last)
             self._mailbox.put(last)
 
-    async def _tell(self) -> None:
+    async def _send_answers(self) -> None:
         """Send each answer, and advice where that changes."""
         while True:
             answer, waited_s, dropped = await self._answers.get()
@@ -214,7 +219,7 @@ class _Session:
             await asyncio.sleep(min(1.0, self._settings.live_idle_s / 4))
             if self._loop.time() - self._heard_at > self._settings.live_idle_s:
                 raise _End(TIMEOUT, f"no frame came for {self._settings.live_idle_s:g} s.")
-            if self._caller and not self._state.keys.lives(self._caller):
+            if self._caller and not self._state.keys.still_valid(self._caller):
                 raise _End(KEY_GONE, "the session's key is not valid any more.")
 
     async def _receive(self) -> str | bytes:

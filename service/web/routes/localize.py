@@ -115,6 +115,7 @@ async def localize_photo(
     if wait_s:
         if live := await to_thread.run_sync(app_state.jobs.live, job):
             await live.wait(wait_s)
+        # So that a client can tell a job that took longer from a service that ignores the header (RFC 7240, 3).
         response.headers["Preference-Applied"] = f"wait={wait_s:g}"
     answer = await to_thread.run_sync(job_document, app_state, job.id, root)
     response.headers["Location"] = f"{root}/jobs/{job.id}"

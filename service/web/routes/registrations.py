@@ -73,6 +73,7 @@ def register_scene(scene_id: str, wanted: RegistrationIn, app_state: AppStateOf)
     known, photos = known_photos(wanted, poses)
     above = _inside(app_state, scene_id)
     evidence, origin = gathered(known, photos, picked_points(wanted), info, above, gather_options(wanted))
+    # A fixed seed: the same places lead to the same registration.
     found = register(evidence, np.random.default_rng(0))
     added = file.add(replace(found, origin=origin, source="api", scene_sha256=info.sha256, created=time.time()))
     return _answer(app_state, scene_id, added)

@@ -70,6 +70,7 @@ async def upload_scene(
     if any(scene.id == scene_id for scene in known):
         raise SceneExists(f"scene '{scene_id}' already exists.", where="scene", hint="Delete it first.")
     with await to_thread.run_sync(app_state.scene_store.draft, scene_id) as draft:
+        # Chunk by chunk to the disk: a scene may be larger than the memory.
         async for chunk in request.stream():
             await to_thread.run_sync(draft.write, chunk)
         stored = await to_thread.run_sync(draft.commit, file)

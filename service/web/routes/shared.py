@@ -80,6 +80,7 @@ async def shared_render(
 
 def _with_shared_links(document: JobOut, base: str) -> JobOut:
     """Return the document with the links that a share link opens; the others are empty."""
+    # The others need a key, which whoever has the link lacks.
     links = JobLinks(
         self=f"{base}/job",
         events="",

@@ -50,16 +50,16 @@ async def live() -> Liveness:
 def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Readiness:
     """Return whether photos can be localized now: scenes are loaded and prepared, workers and storage work.
 
-    Scenes that the caller may not see are told without their names.
+    Scenes that the caller may not see are listed without their names.
     """
     scenes, problems = app_state.engine.readiness(), app_state.jobs.problems()
-    cures = {s.id: _cure(s.failure) for s in app_state.engine.scenes() if s.failure}
+    remedies = {s.id: _remedy(s.failure) for s in app_state.engine.scenes() if s.failure}
     if not scenes.ready and not scenes.pending and not scenes.failed:
         problems = [*problems, _NO_SCENE]
     readiness = Readiness(
         ready=scenes.ready and not problems,
         pending=_visible_notes(scenes.pending, visible, {}),
-        failed=[*_visible_notes(scenes.failed, visible, cures), *problems],
+        failed=[*_visible_notes(scenes.failed, visible, remedies), *problems],
         rasterizers=list(scenes.rasterizers),
         skipped_rasterizers=list(scenes.skipped_rasterizers),
     )
@@ -68,14 +68,15 @@ def ready(app_state: AppStateOf, visible: VisibleOf, response: Response) -> Read
     return readiness
 
 
-def _visible_notes(notes: Sequence[SceneNote], visible: Visible, cures: Mapping[str, str]) -> list[str]:
+def _visible_notes(notes: Sequence[SceneNote], visible: Visible, remedies: Mapping[str, str]) -> list[str]:
     """Return notes as sentences, each with what to do."""
     hidden = "a scene that this key may not use"
-    told = [(note, f"{note} {cures.get(note.scene, '')}".rstrip()) for note in notes]
-    return [text if visible.scene(note.scene) else hidden for note, text in told]
+    sentences = [(note, f"{note} {remedies.get(note.scene, '')}".rstrip()) for note in notes]
+    # Counted all the same: without them the service would look ready.
+    return [text if visible.scene(note.scene) else hidden for note, text in sentences]
 
 
-def _cure(failure: Failure) -> str:
+def _remedy(failure: Failure) -> str:
     """Return what helps against a scene's failure, unless its text says so itself."""
     return "" if failure.hint else hint_for(failure.code, failure.where)
 

@@ -32,6 +32,8 @@ class AnchorOut(Model):
 
 
 class AnchorList(Model):
+    """The anchors of a scene."""
+
     anchors: list[AnchorOut]
 
 
@@ -53,7 +55,7 @@ class GeographicOut(Model):
 
 
 class SeenAnchor(AnchorOut):
-    """An anchor as the photo's camera sees it; nothing tells whether something stands before it."""
+    """An anchor as the photo's camera sees it; whether something stands before it is not known."""
 
     in_camera: list[float]
     """In the camera's frame (+x right, +y down, +z forward), scene units."""
@@ -93,6 +95,7 @@ def _pixel(in_camera: Float64[np.ndarray, "1 3"], intrinsics: Intrinsics) -> lis
 
 
 def _on_earth(anchor: Anchor, geo_anchor: GeoAnchor) -> GeographicOut:
+    # A point has no rotation: any will do for its position.
     matrix = np.eye(4)
     matrix[:3, 3] = anchor.position_in_world
     latitude, longitude, height = geographic(geo_anchor, Pose(matrix))[0].tolist()

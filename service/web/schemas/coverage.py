@@ -119,4 +119,5 @@ def _trial_out(trial: Trial, found: CoverageMap) -> CoverageTrialOut:
 
 
 def _number(value: float) -> float | None:
+    # JSON has no NaN.
     return None if math.isnan(value) else value

@@ -53,7 +53,7 @@ def smoothed_frames(frames: Sequence[FrameOut]) -> list[tuple[FrameOut, bool]]:
 
     An interpolated frame keeps its own status, which is not `localized`.
     """
-    told = [
+    timed = [
         TimedPose(
             frame.time_s,
             Pose(np.array(frame.world_from_camera.matrix)) if frame.status is Status.LOCALIZED else None,
@@ -62,7 +62,7 @@ def smoothed_frames(frames: Sequence[FrameOut]) -> list[tuple[FrameOut, bool]]:
         for frame in frames
     ]
     found = []
-    for frame, answer in zip(frames, smoothed(told), strict=True):
+    for frame, answer in zip(frames, smoothed(timed), strict=True):
         if answer is not None:
             pose = transform_out(answer.pose.world_from_camera)
             update = {"world_from_camera": pose, "covariance": covariance_out(answer.covariance)}

@@ -82,6 +82,7 @@ def _require_later(frame_id: int, time_s: float, after: LiveFrame | None) -> Non
 
 def _intrinsics(numbers: tuple[float, ...], jpeg: bytes) -> Intrinsics:
     try:
+        # The header doesn't repeat what the JPEG's own says, its size.
         fx, fy, cx, cy = numbers
         return Intrinsics(*photo_size(jpeg), fx, fy, cx, cy)
     except InvalidIntrinsics as error:

@@ -36,12 +36,16 @@ class _Foreign(BaseModel):
 
 
 class CameraParams(_Foreign):
+    """The protocol's camera model, in COLMAP's terms."""
+
     model: str | None = None
     """Name of the camera model in COLMAP."""
     modelParams: list[float] = Field(default_factory=list)
 
 
 class CameraReading(_Foreign):
+    """A photo with its camera."""
+
     imageBytes: str
     """base64 of a JPEG, PNG, WebP or HEIC file."""
     size: list[int] = Field(default_factory=list)
@@ -51,16 +55,22 @@ class CameraReading(_Foreign):
 
 
 class GeolocationReading(_Foreign):
+    """A position on WGS84 by the device, degrees."""
+
     latitude: float = Field(ge=-90, le=90)
     longitude: float = Field(ge=-180, le=180)
 
 
 class SensorReadings(_Foreign):
+    """The readings that are used; those of other sensors are ignored."""
+
     cameraReadings: list[CameraReading] = Field(default_factory=list, max_length=16)
     geolocationReadings: list[GeolocationReading] = Field(default_factory=list, max_length=1000)
 
 
 class PriorPosition(_Foreign):
+    """A position on WGS84, degrees."""
+
     lat: float = Field(ge=-90, le=90)
     lon: float = Field(ge=-180, le=180)
     h: float = Field(allow_inf_nan=False)
@@ -68,6 +78,8 @@ class PriorPosition(_Foreign):
 
 
 class PriorQuaternion(_Foreign):
+    """A unit quaternion that rotates the camera's axes to East-North-Up."""
+
     x: float
     y: float
     z: float
@@ -75,11 +87,15 @@ class PriorQuaternion(_Foreign):
 
 
 class PriorGeoPose(_Foreign):
+    """OGC GeoPose 1.0, Basic-Quaternion."""
+
     position: PriorPosition
     quaternion: PriorQuaternion
 
 
 class PriorAccuracy(_Foreign):
+    """Standard deviations of a prior pose."""
+
     position: float = Field(gt=0, allow_inf_nan=False)
     """Metres."""
     orientation: float = Field(gt=0, le=180, allow_inf_nan=False)
@@ -95,6 +111,8 @@ class PriorPose(_Foreign):
 
 
 class GeoPoseRequest(_Foreign):
+    """A request of the protocol: photos, and where the device may be."""
+
     id: str = Field(default="", max_length=200)
     timestamp: float = 0.0
     """Milliseconds since 1970."""
@@ -114,6 +132,8 @@ class GeoPoseAccuracy(Model):
 
 
 class GeoPoseResponse(Model):
+    """The protocol's answer: the camera's pose on Earth."""
+
     id: str
     """The request's."""
     timestamp: int

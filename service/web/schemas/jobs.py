@@ -64,7 +64,7 @@ class JobSummary(Model):
 
 
 class JobLensOut(Model):
-    """What earlier photos told of a job's lens, as it was when the job was accepted."""
+    """The estimate of a job's lens from earlier photos, as it was when the job was accepted."""
 
     id: str
     """Of the lens in `/lenses`."""

@@ -68,6 +68,8 @@ class NewKey(KeyOut):
 
 
 class KeyList(Model):
+    """The API keys of the service."""
+
     keys: list[KeyOut]
 
 

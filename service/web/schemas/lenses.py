@@ -8,7 +8,7 @@ from service.web.api_model import Model
 
 
 class LensOut(Model):
-    """What earlier photos told of a lens. Sigmas are standard deviations of the prior of the next photo."""
+    """The estimate of a lens from earlier photos. Sigmas are standard deviations of the prior of the next photo."""
 
     id: str
     owner: str
@@ -46,10 +46,14 @@ class LensOut(Model):
 
 
 class LensList(Model):
+    """The lenses that the caller may see."""
+
     lenses: list[LensOut]
     """Latest update first."""
 
 
 class LensesDeleted(Model):
+    """What was deleted."""
+
     deleted: int
     """How many."""

@@ -115,7 +115,7 @@ class LiveAnswerOut(Model):
     """The similarity's scale: scene units per unit of the odometry."""
     odom_covariance: Matrix | None = None
     """7x7, of the twist (rotation in rad, translation in units) in this frame's camera, as `covariance`, and the
-    scale's logarithm: of the camera that `world_from_odom` and this frame's odometry tell."""
+    scale's logarithm: of the camera where `world_from_odom` puts this frame's odometry."""
     odom_offset_s: float | None = None
     """By how much the odometry's poses are late: they belong to a time that is this much after the frame's."""
     odom_resets: int | None = None

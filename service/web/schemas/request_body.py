@@ -36,6 +36,7 @@ class Body:
 
 async def read_body(request: Request, max_frames: int = MAX_FRAMES) -> Body:
     """Read a multipart form or a JSON body. Raises InvalidRequest, InvalidImage; HTTPException 415 for other types."""
+    # Nothing here unpacks a body: its size limit would hold for the packed bytes only.
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise HTTPException(415, f"Send the body as it is: Content-Encoding '{encoding[:40]}' is not read.")
@@ -97,6 +98,7 @@ def decoded_base64(text: str, where: str) -> bytes:
 def body_of(files: Sequence[tuple[str, bytes]], fields: Mapping[str, Any]) -> Body:
     """Combine files, as (name, content), to a body; several photos are packed. Raises InvalidImage, InvalidRequest."""
     for index, (_, data) in enumerate(files):
+        # The service packs several photos as a ZIP of its own: a ZIP that was sent must not pass for one.
         if is_packed(data):
             raise InvalidImage("a ZIP is not a photo.", where="photo", hint="Send each photo as a part of its own.")
         if len(files) > 1 and is_sequence(data):

@@ -61,4 +61,6 @@ class SceneOut(SceneSummary):
 
 
 class SceneList(Model):
+    """The scenes that the key may use."""
+
     scenes: list[SceneSummary]

@@ -48,7 +48,7 @@ class Readiness(Model):
     pending: list[str]
     """What is not done yet; empty when ready."""
     failed: list[str]
-    """Scenes that could not be loaded, storage that can't be written to, stuck workers; each with reason and cure."""
+    """Scenes that could not be loaded, storage that can't be written to, stuck workers; each with reason and remedy."""
     rasterizers: list[str]
     """Renderers of the scenes in memory: `cpu`, `gsplat_cuda`."""
     skipped_rasterizers: list[str]
@@ -64,4 +64,6 @@ class Token(Model):
 
 
 class Liveness(Model):
+    """The answer of a process that runs."""
+
     alive: Literal[True] = True
