@@ -33,6 +33,7 @@ class Accuracy:
             raise InvalidAccuracy(
                 "give one of units, metres and share.", where=f"accuracy.{given[1]}", hint=f"Leave out {given[1]}."
             )
+        # Where the default is meant, so that the bound is always there: `units`, or `share`.
         if not given:
             object.__setattr__(self, "share", DEFAULT_SHARE)
         _require("units", self.units, math.inf, "scene units")

@@ -141,6 +141,7 @@ class Accuracy:
     """Of the distance to what is seen; 0.02 if the others are None, too."""
 
     def fields(self) -> Json:
+        """Return the request's JSON."""
         return {name: value for name, value in self.__dict__.items() if value is not None}
 
 

@@ -43,6 +43,7 @@ def decode(kind: type[_T], text: str) -> _T:
 def _plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value):
         return {name: _plain(getattr(value, name)) for name in _field_names(type(value))}
+    # `tolist` gives Python's numbers, whose text is exact.
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Enum):

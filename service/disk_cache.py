@@ -41,6 +41,7 @@ def evict(folder: Path, most_bytes: int) -> int:
 
     Entries that are open stay readable to whoever has them open, or, on Windows, stay.
     """
+    # By the modification time, which `mark_used` sets: processes that share the folder need no list in common.
     entries = sorted(_entries(folder), key=lambda entry: entry.used)
     excess, deleted = sum(entry.size for entry in entries) - most_bytes, 0
     for entry in entries:

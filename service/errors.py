@@ -54,154 +54,230 @@ class SplatfixError(Exception):
 
 
 class BadInput(SplatfixError):
+    """Something that was sent can't be used."""
+
     code = "bad_input"
 
 
 class InvalidRequest(BadInput):
+    """A request, or an argument of a command, that is malformed."""
+
     code = "invalid_request"
 
 
 class InvalidImage(BadInput):
+    """A photo or a video that can't be decoded, or is too large."""
+
     code = "invalid_image"
 
 
 class InvalidIntrinsics(BadInput):
+    """A camera model that no camera has, or that doesn't belong to the photo."""
+
     code = "invalid_intrinsics"
 
 
 class InvalidPrior(BadInput):
+    """A pose, Gaussian or box that is none."""
+
     code = "invalid_prior"
 
 
 class InvalidAccuracy(BadInput):
+    """Bounds that no pose can have, or that mean nothing in the scene."""
+
     code = "invalid_accuracy"
 
 
 class InvalidOptions(BadInput):
+    """Options that an estimator doesn't have."""
+
     code = "invalid_options"
 
 
 class UnknownName(BadInput):
+    """A name that nothing has: of a plug-in, a modification, a row of a bench."""
+
     code = "unknown_name"
 
 
 class RegistrationFailed(BadInput):
+    """Known places that determine no registration, or contradict each other."""
+
     code = "registration_failed"
 
 
 class SceneError(SplatfixError):
+    """A scene that can't be used."""
+
     code = "scene_error"
 
 
 class SceneNotFound(SceneError):
+    """No scene of that name, or none at that path."""
+
     code = "scene_not_found"
 
 
 class UnsupportedFormat(SceneError):
+    """A file of a kind that no reader takes."""
+
     code = "unsupported_format"
 
 
 class CorruptScene(SceneError):
+    """A damaged file of a scene; `where` is the place of the damage."""
+
     code = "corrupt_scene"
 
 
 class SceneExists(SceneError):
+    """An upload under a name that another scene has."""
+
     code = "scene_exists"
 
 
 class SceneUnloaded(SceneError):
+    """A scene that was unloaded by request."""
+
     code = "scene_unloaded"
 
 
 class SceneInUse(SceneError):
+    """A scene that can't be removed: jobs use it, or the settings name it."""
+
     code = "scene_in_use"
 
 
 class SceneTooLarge(SceneError):
+    """A scene that takes more memory than all may."""
+
     code = "scene_too_large"
 
 
 class SceneNotReady(SceneError):
+    """A scene that is still being loaded."""
+
     code = "scene_not_ready"
 
 
 class JobNotFound(SplatfixError):
+    """No job of that id, not any more, or one that the caller may not see."""
+
     code = "job_not_found"
 
 
 class RecordNotFound(SplatfixError):
+    """A job that has fewer records."""
+
     code = "record_not_found"
 
 
 class KeyNotFound(SplatfixError):
+    """No API key of that name."""
+
     code = "key_not_found"
 
 
 class LensNotFound(SplatfixError):
+    """No lens of that id is remembered for the caller."""
+
     code = "lens_not_found"
 
 
 class AnchorNotFound(SplatfixError):
+    """The scene has no anchor of that name."""
+
     code = "anchor_not_found"
 
 
 class RegistrationNotFound(SplatfixError):
+    """The scene isn't registered."""
+
     code = "registration_not_found"
 
 
 class JobNotReady(SplatfixError):
+    """A job that has not come so far yet, or has ended otherwise."""
+
     code = "job_not_ready"
 
 
 class NoPose(SplatfixError):
+    """A job that found no pose that may be used."""
+
     code = "no_pose"
 
 
 class NoGeoAnchor(SplatfixError):
+    """A scene whose place on Earth isn't known."""
+
     code = "no_geo_anchor"
 
 
 class PhotoGone(SplatfixError):
+    """A photo that was deleted after its job."""
+
     code = "photo_gone"
 
 
 class IdempotencyConflict(SplatfixError):
+    """An idempotency key that was used for another request."""
+
     code = "idempotency_conflict"
 
 
 class DeadlineExceeded(SplatfixError):
+    """A job that could not start, or an answer that did not come, in time."""
+
     code = "deadline_exceeded"
 
 
 class Interrupted(SplatfixError):
+    """A job that ended without its fault: the service ended, or its thread was stuck."""
+
     code = "interrupted"
 
 
 class StorageFailed(SplatfixError):
+    """A disk or a database that can't be written or read; nothing was accepted."""
+
     code = "storage_failed"
 
 
 class QueueFull(SplatfixError):
+    """Too much work is waiting."""
+
     code = "queue_full"
 
 
 class RateLimited(SplatfixError):
+    """Too many requests of one client."""
+
     code = "rate_limited"
 
 
 class Unauthorized(SplatfixError):
+    """No key, or one that isn't valid."""
+
     code = "unauthorized"
 
 
 class Forbidden(SplatfixError):
+    """A key whose role doesn't suffice, or a request from another site's page."""
+
     code = "forbidden"
 
 
 class NoKeys(SplatfixError):
+    """An operation on keys where the service has none."""
+
     code = "no_keys"
 
 
 class BackendMissing(SplatfixError):
+    """A package, weights or a device that a plug-in needs isn't there."""
+
     code = "backend_missing"
 
 
@@ -210,6 +286,8 @@ class DeviceMemoryFull(SplatfixError):
 
 
 class EstimatorFault(SplatfixError):
+    """An estimator that broke its contract."""
+
     code = "estimator_fault"
 
 
@@ -228,4 +306,5 @@ class Failure:
         """Describe an exception; the message of one that isn't a SplatfixError stays in the log."""
         if isinstance(error, SplatfixError):
             return cls(error.code, error.message, error.where, error.hint)
+        # Messages of other exceptions may hold the operator's paths.
         return cls("internal_error", "The service failed; the reason is in its log.")

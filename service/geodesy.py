@@ -73,6 +73,7 @@ def utm_from_geographic(latitude_deg: float, longitude_deg: float) -> tuple[str,
     """
     zone = int((longitude_deg + 180) % 360 // 6) + 1
     north = latitude_deg >= 0
+    # EPSG:326zz and 327zz are the zones of the northern and the southern hemisphere.
     to_utm = Transformer.from_crs("EPSG:4326", f"EPSG:{326 if north else 327}{zone:02}")
     easting, northing = to_utm.transform(latitude_deg, longitude_deg)
     return f"{zone}{'N' if north else 'S'}", float(easting), float(northing)

@@ -205,6 +205,7 @@ class RenderTally:
     count: int = 0
 
 
+# Covariant: tools with a view index are tools with anything prepared.
 Prepared = TypeVar("Prepared", covariant=True)
 
 

@@ -23,6 +23,7 @@ from urllib.parse import quote
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+# Magic, version, flags, length of the header, id, zero, time: docs/live.md.
 _HEAD = struct.Struct("<4sBBHIId")
 
 
@@ -104,6 +105,7 @@ class Live:
         address = f"ws{url.removeprefix('http').rstrip('/')}/scenes/{quote(scene, safe='')}/live"
         headers = {"Authorization": f"Bearer {key}"} if key else {}
         try:
+            # JPEG doesn't get smaller by compression, which would cost both sides time for each frame.
             self._socket = connect(
                 address, additional_headers=headers, compression=None, open_timeout=timeout_s, **connection
             )
@@ -150,6 +152,7 @@ class Live:
         intrinsics in its pixels, for lenses that change. `odom_from_camera` is the 4x4 pose by the device's odometry
         and `up_in_camera` up by gravity, both in OpenCV camera axes (+x right, +y down, +z forward).
         """
+        # By the client: the answer to a frame may come before `send` could learn an id from the service.
         number, self._next_id = self._next_id, self._next_id + 1
         odometry = None if odom_from_camera is None else [value for row in odom_from_camera[:3] for value in row]
         parts = {1: (4, fx_fy_cx_cy), 2: (12, odometry), 4: (3, up_in_camera)}
@@ -169,8 +172,10 @@ class Live:
             except TimeoutError:
                 return None
             if message["type"] == "hint":
+                # Kept, not returned: who waits for an answer must not be given something else.
                 self.hint = {name: message[name] for name in ("max_fps", "long_side_px") if message[name]}
             elif message["type"] == "answer":
+                # By our own fields: a newer service may send more.
                 return LiveAnswer(**{field.name: message[field.name] for field in fields(LiveAnswer)})
 
     def close(self) -> None:

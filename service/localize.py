@@ -77,6 +77,7 @@ def localize(
     BackendMissing; InvalidAccuracy for metres in a scene without a scale.
     """
     origin = loaded.scene.info.origin_in_world
+    # Most scenes have none: their records needn't be copied.
     if not any(origin):
         return localize_in_scene(query, loaded, request, on_record)
 
@@ -101,16 +102,7 @@ def localize_in_scene(
     _require_matching(request.estimator, loaded)
     options = request.options if request.options is not None else plugin.Options()
     tally = RenderTally()
-    tools = Tools(
-        loaded.searched,
-        Counted(rasterizer_for(query, loaded), tally),
-        loaded.matcher,
-        np.random.default_rng(request.seed),
-        loaded.prepare(request.estimator),
-        image_matcher=loaded.image_matcher,
-        tally=tally,
-        surface_points=loaded.photo_digest and loaded.photo_digest.points,
-    )
+    tools = _tools(query, loaded, request, tally)
     tuning = {} if request.config is None else {"config": request.config}
     clock = Clock()
     trace = _Trace(clock, on_record)
@@ -121,11 +113,7 @@ def localize_in_scene(
         raise EstimatorFault(f"'{request.estimator}' ended without a record.")
     # Before verification: its renders are not the estimator's.
     renders, last = tally.count, trace.records[-1]
-    # The intrinsics belong to the pose, in the result and in its verification.
-    if last.lens:
-        images = QueryImages(taken_through(query, last.lens), loaded.matcher)
-    else:
-        images = QueryImages(query, loaded.matcher).corrected(last.correction)
+    images = _as_estimated(query, loaded, last)
     query = images.query
     verdict = answer.verdict if answer else render_and_verify(images, last.pose, tools.rasterizer)
     verdict = _qualified(verdict, last, trace.exhausted)
@@ -136,6 +124,29 @@ def localize_in_scene(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
     )
     return replace(found, advice=advice)
+
+
+def _tools(query: Query, loaded: LoadedScene, request: Request, tally: RenderTally) -> Tools[Any]:
+    """Return what the estimator works with; its renders are counted in `tally`."""
+    return Tools(
+        loaded.searched,
+        Counted(rasterizer_for(query, loaded), tally),
+        loaded.matcher,
+        # Of this job alone: jobs that run beside it must not change its numbers.
+        np.random.default_rng(request.seed),
+        loaded.prepare(request.estimator),
+        image_matcher=loaded.image_matcher,
+        tally=tally,
+        surface_points=loaded.photo_digest and loaded.photo_digest.points,
+    )
+
+
+def _as_estimated(query: Query, loaded: LoadedScene, last: IterationRecord) -> QueryImages:
+    """Return the photo with the intrinsics that were estimated with the pose."""
+    # They belong to the pose, in the result and in its verification.
+    if last.lens:
+        return QueryImages(taken_through(query, last.lens), loaded.matcher)
+    return QueryImages(query, loaded.matcher).corrected(last.correction)
 
 
 def _if_captured(verdict: Verdict, query: Query, pose: Pose, tools: Tools[Any]) -> Verdict:
@@ -319,8 +330,9 @@ def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:
 
 
 def _qualified(verdict: Verdict, last: IterationRecord, exhausted: bool) -> Verdict:
-    """Return the verdict with what a render doesn't show: a mirrored photo, a lens beyond what is estimated, other
-    answers, too small a budget."""
+    """Return the verdict lowered by what a render doesn't show: a mirrored photo, a lens beyond what is estimated,
+    other answers, too small a budget."""
+    # First: a mirrored photo fits no pose, whatever else is wrong with it.
     if last.mirrored:
         return replace(downgraded(verdict, Reason.MIRRORED), reason=Reason.MIRRORED)
     if at_bounds(last.correction):

@@ -100,6 +100,8 @@ class IterationRecord:
 
 
 class Status(StrEnum):
+    """Whether a pose may be used; part of the API."""
+
     LOCALIZED = "localized"
     UNCERTAIN = "uncertain"
     NOT_LOCALIZED = "not_localized"
@@ -232,6 +234,8 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class StageTiming:
+    """The time that a stage of the estimator took, seconds."""
+
     stage: str
     wall_s: float
     cpu_s: float

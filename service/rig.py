@@ -197,15 +197,7 @@ class _Search:
         self._renderer = ViewRenderer(Counted(rasterizer_for(photos[0].query, self._loaded), self._tally))
         self._records: list[IterationRecord] = []
         self._supported: Float64[np.ndarray, "photos views"] | None = None
-        self._reach = float(
-            np.median(
-                [
-                    np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1))
-                    for v in self._index.views
-                    if len(v.points_in_world)
-                ]
-            )
-        )
+        self._reach = float(np.median([view.distance for view in self._index.views if len(view.points_in_world)]))
 
     def run(self) -> RigEstimate:
         best, rivals = self._searched()
@@ -217,11 +209,12 @@ class _Search:
         for photo, images in zip(self._photos, self._images, strict=True):
             own = _pose_of(pose, photo)
             rendered = self._renderer.at(photo.query, own)
-            # Of the first photo, whose pose is told.
+            # Of the first photo, whose pose is the answer.
             depth = depth if found else typical_depth(rendered.frame)
             found.append((own, verify(images, own, rendered)))
         first = self._photos[0]
         if covariance is not None:
+            # The same small motion of the rig is another twist in each camera's frame.
             to_cameras = [adjoint(photo.rig_from_camera.camera_from_world) for photo in self._photos]
             covariances = [one @ covariance @ one.T for one in to_cameras]
             found = [(own, replace(one, covariance=c)) for (own, one), c in zip(found, covariances, strict=True)]
@@ -341,6 +334,7 @@ class _Search:
                 fresh = correspondences(images.features(), view, images.matcher)
                 matches.append(_matches(photo, fresh, self._config.rematch_error_px))
             count = sum(len(one.photo_px) for one in matches)
+            # The pose that the renders were made at is tried, too: RANSAC may draw none as good.
             again = estimate_rig_pose(matches, self._config.trials, [pose])
             if again is None:
                 return _Hypothesis(pose, 0, count, np.zeros((6, 6)))

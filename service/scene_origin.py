@@ -41,6 +41,7 @@ def record_in_world(record: IterationRecord, origin: Origin) -> IterationRecord:
     matches = record.matches
     if matches is not None:
         camera = matches.render_camera
+        # Matches are pixels; only the camera that they refer to has a position.
         matches = replace(matches, render_camera=Camera(camera.intrinsics, shifted(camera.pose, origin)))
     return replace(
         record,
@@ -66,6 +67,7 @@ def _shifted_region(region: PriorRegion, by: Float64[np.ndarray, "3"]) -> PriorR
 def _shifted_candidates(candidates: Candidates | None, by: Origin) -> Candidates | None:
     if candidates is None:
         return None
+    # In double precision, like every pose: the sum of a large origin and a small offset is exact to nanometres.
     moved = candidates.world_from_camera.copy()
     moved[:, :3, 3] += by
     return replace(candidates, world_from_camera=moved)

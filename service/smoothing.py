@@ -22,6 +22,8 @@ from service.types import Pose, frozen
 
 @dataclass(frozen=True, slots=True)
 class SmoothingConfig:
+    """What divides a trajectory, and which accelerations are tried."""
+
     max_gap_s: float = 1.0
     """A longer time without a pose divides the trajectory: nothing is known of the motion in it."""
     noise_steps: int = 13
@@ -45,6 +47,8 @@ class TimedPose:
 
 @dataclass(frozen=True, slots=True)
 class SmoothedPose:
+    """The pose of one photo given all photos."""
+
     pose: Pose
     covariance: Float64[np.ndarray, "6 6"]
     interpolated: bool
@@ -53,6 +57,8 @@ class SmoothedPose:
 
 @dataclass(frozen=True, slots=True)
 class MotionState:
+    """A camera's pose and velocity at one time, with their covariance."""
+
     pose: Pose
     velocity: Float64[np.ndarray, "6"]
     """Twist per second in the camera's frame."""
@@ -62,6 +68,8 @@ class MotionState:
 
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
+    """White noise on the acceleration: how strongly a camera changes its motion."""
+
     rotation: float
     """Spectral density of the angular acceleration, rad^2/s^3."""
     translation: float
@@ -104,7 +112,7 @@ def _stretches(photos: Sequence[TimedPose], max_gap_s: float) -> list[tuple[int,
 
 def _smoothed_stretch(photos: Sequence[TimedPose], config: SmoothingConfig) -> list[SmoothedPose]:
     known = [p for p in photos if p.pose is not None]
-    # Two poses have one velocity: nothing tells jitter from motion.
+    # Two poses have one velocity, so jitter can't be distinguished from motion.
     if len(known) < 3:
         return _joined(photos, known)
     noise, scale = _most_probable_noise(photos, config)
@@ -196,7 +204,7 @@ def _filtered(
         covariance = predicted.covariance - gain @ predicted.covariance[:6]
         # Rounding makes the difference of two covariances asymmetric, which adds up over a long sequence.
         states.append(_corrected(predicted, gain @ seen, 0.5 * (covariance + covariance.T)))
-        # The first step tells the velocity, whose prior is vague: no evidence of the noise.
+        # The first step determines the velocity, whose prior is vague: no evidence of the noise.
         if count or len(states) > 2:
             fit += float(seen @ np.linalg.solve(spread, seen))
             volume += float(np.linalg.slogdet(spread)[1])

@@ -53,6 +53,7 @@ class IntrinsicsCorrection:
             self.focal_factor * other.focal_factor,
             self.shift_x + other.shift_x,
             self.shift_y + other.shift_y,
+            # Of radii in focal lengths, which the other factor rescales.
             self.k1 * other.focal_factor**2 + other.k1,
         )
 
@@ -139,6 +140,7 @@ class Intrinsics:
             return replace(camera, model=model, distortion=distortion)
         if not correction.k1:
             return camera
+        # It has a single focal length.
         if self.fx == self.fy:
             return replace(camera, model="SIMPLE_RADIAL", distortion=(correction.k1,))
         return replace(camera, model="OPENCV", distortion=(correction.k1, 0.0, 0.0, 0.0))
@@ -194,6 +196,8 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Camera:
+    """A camera model at a pose."""
+
     intrinsics: Intrinsics
     pose: Pose
 
@@ -430,6 +434,7 @@ class Query:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rgb", frozen(self.rgb, np.uint8))
+        # Always there: estimators decide by the prior alone what of the intrinsics is estimated.
         if self.lens_prior is None and self.intrinsics.trust == "approximate":
             object.__setattr__(self, "lens_prior", LENS_PRIORS[self.intrinsics_source])
         if self.valid_mask is not None:

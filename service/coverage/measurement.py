@@ -94,8 +94,7 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
 
 def _distance(views: Sequence[View]) -> float:
     """Return the typical distance from the index's views to what they see."""
-    seeing = [v for v in views if len(v.points_in_world)]
-    far = [np.median(np.linalg.norm(v.points_in_world - v.camera.pose.position_in_world, axis=1)) for v in seeing]
+    far = [view.distance for view in views if len(view.points_in_world)]
     return float(np.median(far)) if far else 1.0
 
 

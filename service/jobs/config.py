@@ -11,6 +11,8 @@ from service.jobs.read_photo import MAX_FRAMES
 
 @dataclass(frozen=True, slots=True)
 class JobsConfig:
+    """How many jobs run and wait, when one is given up, and how much is kept of those that ended."""
+
     workers: int = 1
     """Jobs that run at once; each has one thread."""
     queue_size: int = 32

@@ -290,6 +290,7 @@ def _run_rig(
     step = (lambda record: on_record(JobRecord(record), None)) if on_record else None
     found = localize_rig(source.photos, loaded, request, step, metric=source.metric)
     verdict = found.estimate.verdict
+    # The photos were verified together: each has the verdict of all, and a covariance of its own.
     frames = tuple(
         SequenceFrame(
             index=index,
@@ -314,9 +315,9 @@ def with_left_out(result: JobResult, left_out: Sequence[str]) -> JobResult:
     """Return the result with a warning that names the scenes that were not searched, if there are any."""
     if not left_out:
         return result
-    told = f"not searched, for they are not in memory: {', '.join(left_out)}"
+    warning = f"not searched, for they are not in memory: {', '.join(left_out)}"
     estimate = result.estimate
-    return replace(result, estimate=replace(estimate, warnings=(*estimate.warnings, told)))
+    return replace(result, estimate=replace(estimate, warnings=(*estimate.warnings, warning)))
 
 
 def with_last_record_only(estimate: PoseEstimate) -> PoseEstimate:

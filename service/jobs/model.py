@@ -41,7 +41,7 @@ class JobSpec:
     options: Mapping[str, Any] = field(default_factory=dict)
     """Of the estimator's `Options`, those that were given; JSON values that its constructor takes."""
     intrinsics: Intrinsics | None = None
-    """Of the upright photo; None: as earlier photos of the camera told, from EXIF data, or guessed."""
+    """Of the upright photo; None: as estimated from earlier photos of the camera, from EXIF data, or guessed."""
     camera_id: str | None = None
     """What the caller calls the camera."""
     lens: LensUse | None = None

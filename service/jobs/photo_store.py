@@ -94,11 +94,13 @@ class FolderPhotoStore:
         try:
             return (self._folder / name).read_bytes()
         except FileNotFoundError:
-            raise PhotoGone(
-                "the photo was deleted after the job.",
-                where="photo",
-                hint="Send keep_photo=true to have it kept as long as the job.",
-            ) from None
+            raise photo_gone() from None
+
+
+def photo_gone() -> PhotoGone:
+    """Return the error of every store for a photo that isn't there any more."""
+    hint = "Send keep_photo=true to have it kept as long as the job."
+    return PhotoGone("the photo was deleted after the job.", where="photo", hint=hint)
 
 
 def write_durably(path: Path, data: bytes) -> None:

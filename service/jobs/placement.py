@@ -19,6 +19,8 @@ _OTHERS = 8
 
 @dataclass(frozen=True, slots=True)
 class PlacementConfig:
+    """The budget of a replica, and what jobs and loads are assumed to take."""
+
     budget_bytes: int | None = None
     """Of the scenes in one replica; None: any number."""
     service_s: float = 0.1

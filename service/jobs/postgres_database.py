@@ -33,9 +33,11 @@ class Connection:
         self._connection = connection
 
     def execute(self, statement: str, values: Sequence[Any] = ()) -> psycopg.Cursor:
+        """Run a statement, in psycopg's spelling; return its rows."""
         return self._connection.execute(statement.replace("?", "%s").encode(), values)
 
     def executemany(self, statement: str, rows: Sequence[Sequence[Any]]) -> None:
+        """Run a statement for each row of values."""
         self._connection.cursor().executemany(statement.replace("?", "%s").encode(), rows)
 
 
@@ -75,6 +77,7 @@ class PostgresDatabase:
         self._address = address
 
     def close(self) -> None:
+        """Close all connections."""
         self._pool.close()
 
     @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from service.errors import PhotoGone
+from service.jobs.photo_store import photo_gone
 from service.jobs.postgres_database import Connection, Migration, PostgresDatabase
 from service.jobs.sql_lens_store import SqlLensStore
 from service.jobs.sql_store import SqlJobStore
@@ -122,9 +122,5 @@ class PostgresPhotoStore:
                 "SELECT data FROM photos WHERE job = ? AND original = ?", (job_id, original)
             ).fetchone()
         if row is None:
-            raise PhotoGone(
-                "the photo was deleted after the job.",
-                where="photo",
-                hint="Send keep_photo=true to have it kept as long as the job.",
-            )
+            raise photo_gone()
         return row[0]

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class RayConfig:
+    """Where the cluster is, and what each of its replicas takes."""
+
     address: str | None = None
     """Of a Ray cluster, e.g. `auto`; None: one of this process, that ends with it."""
     replicas: int = 2

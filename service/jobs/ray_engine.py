@@ -72,6 +72,7 @@ class RayEngine:
                 "address": "local",
                 "num_cpus": max(1, round(self._ray.replicas * self._ray.cpus)),
                 "include_dashboard": False,
+                # Ray's default is a share of the machine's memory, which scenes need.
                 "object_store_memory": 500_000_000,
             }
             where: dict[str, Any] = {"address": self._ray.address} if self._ray.address else local
@@ -82,7 +83,7 @@ class RayEngine:
         threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
 
     def _connect(self) -> None:
-        """Find the coordinator or start it, with its replicas, and tell it of all scenes."""
+        """Find the coordinator or start it, with its replicas, and add all scenes to it."""
         replica = ray.remote(Replica).options(
             num_cpus=self._ray.cpus, num_gpus=self._ray.gpus, max_concurrency=_AT_ONCE
         )
@@ -93,6 +94,7 @@ class RayEngine:
             name=f"scenes-{__version__}",
             get_if_exists=True,
             lifetime="detached" if self._ray.address else None,
+            # It decides only, and must not take a replica's core.
             num_cpus=0,
             max_concurrency=_AT_ONCE,
         )

@@ -35,6 +35,8 @@ _OF_SEQUENCES = ("every", "times_s")
 
 @dataclass(frozen=True, slots=True)
 class DecodedPhoto:
+    """A job's photo as it is localized, and what its header says of its camera."""
+
     query: Query
     """The photo; of a sequence the first."""
     decode: StageTiming
@@ -146,7 +148,7 @@ def _read_sequence(
         raise InvalidRequest(
             "only a single photo is looked for in several scenes; this is a sequence.",
             where="scene",
-            hint="Name one scene; one photo of the sequence, sent by itself, can tell which.",
+            hint="Name one scene; one photo of the sequence, sent by itself, shows which.",
         )
     options = SequenceOptions(
         max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb

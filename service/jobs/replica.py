@@ -1,4 +1,4 @@
-"""One process of the Ray engine: an embedded engine that is told by `SceneCoordinator` which scenes to have.
+"""One process of the Ray engine: an embedded engine, whose scenes `SceneCoordinator` decides.
 
 Methods are coroutines, so that cancels and frames arrive while a job runs; the work is on threads. Knows no Ray.
 """

@@ -15,42 +15,18 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from service.errors import (
-    BadInput,
-    Failure,
-    SceneInUse,
-    SceneNotFound,
-    SceneNotReady,
-    SceneTooLarge,
-    SceneUnloaded,
-    SplatfixError,
-)
+from service.errors import Failure, SplatfixError
 from service.jobs.engine import HeldScenes
+from service.jobs.fleet_scenes import FleetScene, FleetScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
+from service.scene_manager.scene_errors import scene_in_use, scene_not_ready, scene_without_file
 from service.scene_manager.status import AUTO, SceneNote, SceneReadiness, SceneStatus, StoredScene
 
 _log = logging.getLogger(__name__)
 
 _WATCH_S = 1.0
 _FRONT_S = 30.0
-"""A front that says nothing for so long is taken for dead, and what it held is let go."""
-RETRY_S = 5.0
-"""A scene that failed to load is tried again by a request after this time, doubled with each failure."""
-MAX_RETRY_S = 300.0
-
-
-@dataclass(slots=True)
-class _Scene:
-    stored: StoredScene | None
-    """None: it was set up in each replica."""
-    required: bool = False
-    awaited: bool = False
-    """Required, and neither loaded nor failed yet."""
-    wanted: bool = True
-    """May be loaded; False after it was unloaded by request."""
-    error: Exception | None = None
-    retry_at: float = 0.0
-    failures: int = 0
+"""A front without a heartbeat for so long is taken to have ended, and what it held is released."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,12 +59,11 @@ class SceneCoordinator:
         config: PlacementConfig,
         expected_bytes: Callable[[StoredScene], int],
     ) -> None:
-        """`lost` are the errors that tell that a replica is gone."""
+        """`lost` are the errors of a call to a replica that is gone."""
         self._spawn, self._lost, self._expected_bytes = spawn, lost, expected_bytes
         self._placement = Placement(config)
-        self._budget = config.budget_bytes
         self._replicas: dict[str, Any] = {}
-        self._scenes: dict[str, _Scene] = {}
+        self._scenes = FleetScenes(self._placement, config.budget_bytes)
         self._holds: dict[str, _Hold] = {}
         self._fronts: dict[str, float] = {}
         self._changed = asyncio.Event()
@@ -113,7 +88,7 @@ class SceneCoordinator:
         self._replicas[name] = handle
         self._placement.add_replica(name)
         for status in built_in:
-            self._scenes.setdefault(status.id, _Scene(None))
+            self._scenes.setdefault(status.id, FleetScene(None))
             self._placement.loaded(name, status.id, status.memory_bytes or 0, pinned=True)
         self._notify()
 
@@ -174,22 +149,22 @@ class SceneCoordinator:
             await self._drop_copies(stored.id)
         self._placement.forget(stored.id)
         self._placement.expect(stored.id, self._expected_bytes(stored))
-        self._scenes[stored.id] = _Scene(stored, required, awaited=required)
+        self._scenes[stored.id] = FleetScene(stored, required, awaited=required)
 
     async def remove(self, scene_id: str) -> None:
         """Forget a scene. Raises SceneNotFound, SceneInUse."""
-        self._known(scene_id)
+        self._scenes.named(scene_id)
         if jobs := self._jobs(scene_id):
-            raise SceneInUse(f"{jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them.")
+            raise scene_in_use(jobs)
         del self._scenes[scene_id]
         await self._drop_copies(scene_id)
         self._notify()
 
     async def unload(self, scene_id: str) -> SceneStatus:
         """Drop a scene as soon as no job uses it. Raises SceneNotFound, BadInput."""
-        scene = self._known(scene_id)
+        scene = self._scenes.named(scene_id)
         if scene.stored is None:
-            raise BadInput("the scene has no file to reload it from.", where="scene")
+            raise scene_without_file()
         scene.wanted = scene.awaited = False
         await self._drop_copies(scene_id)
         self._notify()
@@ -197,9 +172,10 @@ class SceneCoordinator:
 
     async def load(self, scene_id: str) -> SceneStatus:
         """Begin to load a scene. Raises SceneNotFound."""
-        scene = self._known(scene_id)
+        scene = self._scenes.named(scene_id)
         scene.wanted, scene.error = True, None
         self._in_background(self._preload(scene_id))
+        # Lets the load begin, so that the state that is returned shows it.
         await asyncio.sleep(0)
         return await self.scene(scene_id)
 
@@ -209,12 +185,13 @@ class SceneCoordinator:
 
     async def scene(self, scene_id: str | None) -> SceneStatus:
         """Return a scene; None: the only one. Raises SceneNotFound."""
-        scene = self._known(scene_id)
+        scene = self._scenes.named(scene_id)
         scene_id = next(name for name, other in self._scenes.items() if other is scene)
         copies, jobs = self._placement.copies(scene_id), self._jobs(scene_id)
         uploaded = scene.stored is not None and scene.stored.uploaded
         ready = [name for name, copy in copies.items() if copy.ready]
         if ready:
+            # A copy may go while it is asked: then the scene is described without one.
             with suppress(ReplicaLost, SplatfixError):
                 status = await self._asked(ready[0], self._replicas[ready[0]].ask.remote("scene", scene_id))
                 total = sum(copy.bytes for copy in copies.values())
@@ -231,24 +208,15 @@ class SceneCoordinator:
             with suppress(ReplicaLost):
                 found.append(await self._asked(name, handle.readiness.remote()))
         pending = tuple(SceneNote(i, "loading") for i, s in self._scenes.items() if s.required and s.awaited)
-        told = [SceneNote(i, str(s.error)) for i, s in self._scenes.items() if s.error]
+        failed = [SceneNote(i, str(s.error)) for i, s in self._scenes.items() if s.error]
         usable = any(scene.wanted and scene.error is None for scene in self._scenes.values())
         return SceneReadiness(
             ready=usable and not pending and bool(self._placement.replicas()),
             pending=pending,
-            failed=tuple(dict.fromkeys([*told, *(note for each in found for note in each.failed)])),
+            failed=tuple(dict.fromkeys([*failed, *(note for each in found for note in each.failed)])),
             rasterizers=tuple(sorted({name for each in found for name in each.rasterizers})),
             skipped_rasterizers=tuple(sorted({name for each in found for name in each.skipped_rasterizers})),
         )
-
-    def _known(self, scene_id: str | None) -> _Scene:
-        if scene_id is None and len(self._scenes) == 1:
-            return next(iter(self._scenes.values()))
-        if scene_id is None:
-            raise SceneNotFound("name a scene.", where="scene")
-        if scene_id not in self._scenes:
-            raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
-        return self._scenes[scene_id]
 
     def _jobs(self, scene_id: str) -> int:
         return sum(scene_id in hold.ids for hold in self._holds.values())
@@ -257,20 +225,20 @@ class SceneCoordinator:
 
     async def where(self, scene_id: str) -> Any:
         """Return the handle of a replica with the scene. Raises SceneError, and has it loaded if it may be."""
-        self._require_usable(scene_id)
+        self._scenes.require_usable(scene_id)
         copies = self._placement.copies(scene_id)
         ready = [name for name, copy in copies.items() if copy.ready]
         if ready:
             return self._replicas[min(ready, key=self._placement.jobs)]
         if not copies:
             self._in_background(self._preload(scene_id))
-        raise SceneNotReady(f"scene '{scene_id}' is loading.", where="scene", hint="Try again later.")
+        raise scene_not_ready(scene_id, "loading")
 
     async def hold(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
         """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded."""
-        ids, left_out = self._chosen(asked)
+        ids, left_out = self._scenes.chosen(asked)
         for scene_id in ids:
-            self._require_usable(scene_id)
+            self._scenes.require_usable(scene_id)
         choice = self._placement.choose(ids)
         if choice is not None and self._all_ready(choice, ids):
             with suppress(ReplicaLost):
@@ -278,15 +246,16 @@ class SceneCoordinator:
         for scene_id in ids:
             if not self._placement.copies(scene_id):
                 self._in_background(self._preload(scene_id))
-        raise SceneNotReady(f"scene '{ids[0]}' is loading.", where="scene", hint="Try again later.")
+        raise scene_not_ready(ids[0], "loading")
 
     async def hold_later(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
         """Hold scenes as soon as all are in memory together. Raises SceneError if they won't be."""
         while True:
-            ids, left_out = self._chosen(asked)
+            # Anew after each change: `auto` names other scenes then.
+            ids, left_out = self._scenes.chosen(asked)
             if asked != AUTO:
                 for scene_id in ids:
-                    self._require_usable(scene_id)
+                    self._scenes.require_usable(scene_id)
             choice = self._placement.choose(ids)
             if choice is None:  # all is in use, or a replica has to start first
                 await self._change()
@@ -366,59 +335,15 @@ class SceneCoordinator:
             if over:
                 self._replicas[name].drop.remote(over)
             if scene:
-                scene.error, scene.failures = None, 0
+                scene.loaded()
         elif isinstance(found, Exception):
             self._placement.dropped(name, status.id)
             if scene:
-                scene.error, scene.retry_at = found, time.monotonic() + min(RETRY_S * 2**scene.failures, MAX_RETRY_S)
-                scene.failures += 1
+                scene.failed(found)
 
     def _release_unwanted(self, task: asyncio.Task[HeldScenes]) -> None:
         if not task.cancelled() and task.exception() is None:
             self._in_background(self.release(task.result().token))
-
-    def _chosen(self, asked: str | Sequence[str] | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Return the scenes that a request names, and those that `auto` leaves out. Raises SceneError."""
-        if asked == AUTO:
-            return self._chosen_of_all()
-        names = [asked] if asked is None or isinstance(asked, str) else asked
-        found = [self._known(name) for name in names]
-        ids = tuple(name for name, scene in self._scenes.items() if any(scene is one for one in found))
-        ids = tuple(sorted(ids, key=lambda name: names.index(name) if name in names else 0))
-        if not self._placement.could_hold(ids):
-            size = sum(map(self._placement.size, ids))
-            raise SceneTooLarge(
-                f"scene '{ids[0]}' takes {size / 1e6:.1f} MB, and all scenes together may take "
-                f"{(self._budget or 0) / 1e6:.1f} MB.",
-                where="scene",
-                hint="Raise SPLATFIX_SCENE_MEMORY_BYTES, or serve a smaller scene.",
-            )
-        return ids, ()
-
-    def _chosen_of_all(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        candidates = [name for name, scene in self._scenes.items() if scene.wanted and self._error(scene) is None]
-        # Those in memory first.
-        candidates.sort(key=lambda name: not self._placement.copies(name))
-        ids: tuple[str, ...] = ()
-        for name in candidates:
-            if self._placement.could_hold((*ids, name)):
-                ids = (*ids, name)
-        if not ids:
-            message = "no scene can be searched: none is there, or all failed or were unloaded."
-            raise SceneNotFound(message, where="scene")
-        return ids, tuple(name for name, scene in self._scenes.items() if scene.wanted and name not in ids)
-
-    def _require_usable(self, scene_id: str) -> None:
-        """Raise why a scene can't be used: it failed to load a short while ago, or was unloaded by request."""
-        scene = self._known(scene_id)
-        if error := self._error(scene):
-            raise error
-        if not scene.wanted:
-            hint = f"Load it: POST /scenes/{scene_id}/load."
-            raise SceneUnloaded(f"scene '{scene_id}' was unloaded.", where="scene", hint=hint)
-
-    def _error(self, scene: _Scene) -> Exception | None:
-        return scene.error if time.monotonic() < scene.retry_at else None
 
     # ------------------------------------------------------------------ loads
 
@@ -464,4 +389,5 @@ class SceneCoordinator:
 
     def _notify(self) -> None:
         self._changed.set()
+        # Another one: who waits for the next change must not be woken by this.
         self._changed = asyncio.Event()

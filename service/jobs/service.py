@@ -14,23 +14,19 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 from service.errors import (
     Failure,
     Interrupted,
     JobNotFound,
     JobNotReady,
-    QueueFull,
     RecordNotFound,
-    SceneNotReady,
     StorageFailed,
 )
 from service.jobs.config import JobsConfig, Observer
-from service.jobs.engine import Engine, HeldScenes
-from service.jobs.job_order import JobOrder, new_job
+from service.jobs.engine import Engine
+from service.jobs.job_order import JobOrder
 from service.jobs.left_over_photos import LeftOverPhotos
 from service.jobs.live_job import LiveJob
 from service.jobs.model import (
@@ -38,21 +34,18 @@ from service.jobs.model import (
     JobFilter,
     JobRecord,
     JobResult,
-    LensUse,
-    NewJob,
     Retention,
     StoredJob,
 )
 from service.jobs.photo_store import PhotoStore
 from service.jobs.queue import JobQueue
-from service.jobs.read_photo import Recall, read_photo
+from service.jobs.read_photo import read_photo
 from service.jobs.scene_wait import SceneWait
 from service.jobs.shared_jobs import SharedJobs
 from service.jobs.store import JobStore
 from service.jobs.worker import Worker
 from service.lenses.lens_memory import LensMemory
 from service.photos.images import encode_image, undistorted_jpeg
-from service.scene_manager.status import AUTO
 from service.types import NO_CORRECTION, Query
 
 _log = logging.getLogger(__name__)
@@ -77,7 +70,7 @@ class Jobs:
         lenses: LensMemory | None = None,
     ) -> None:
         """Make the jobs of a service; without `lenses` nothing is learnt of them, and nothing recalled."""
-        self._config, self._engine, self._lenses = config, engine, lenses
+        self._config, self._engine = config, engine
         self._photos, self._store = photos, store
         self._worker = Worker(config, engine, store, photos, observer, lenses)
         self._live = self._worker.live
@@ -90,10 +83,12 @@ class Jobs:
             stuck_s=config.stuck_s,
         )
         self._scene_wait = SceneWait(engine, self._queue, store, self._worker)
+        self._acceptance = Acceptance(
+            config, engine, store, photos, self._queue, self._scene_wait, self._worker, lenses
+        )
         watch, take = store.watch(), self._enqueue_when_ready
         self._shared = SharedJobs(watch, store, engine, self._queue, self._worker, take) if watch else None
         self._left_over = LeftOverPhotos(store, photos)
-        self._sharing = threading.Lock()
         self._renew_at = 0.0
         self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
@@ -120,94 +115,7 @@ class Jobs:
 
         Raises BadInput, SceneError, QueueFull, IdempotencyConflict, StorageFailed.
         """
-        if known := self._store.find_by_key(order.client, order.idempotency_key, order.digest):
-            return known
-        held = self._held(order.spec.scene)
-        try:
-            if held is None:
-                # The photo is checked now, and decoded again before the search, over the scene's background.
-                scene, background = self._first_scene(order.spec.scene), (0.0, 0.0, 0.0)
-            else:
-                scene, background = held.ids[0], held.background_rgb
-                for scene_id in held.ids:
-                    order.spec.accuracy.in_units(scene_id, self._engine.require(scene_id).metres_per_unit)
-            recall = self._recall(order)
-            photo = read_photo(order.photo, order.spec, background, self._config.max_frames, recall)
-            if recall:
-                # On record with the job: the same prior after a restart, whatever was learnt meanwhile.
-                lens = LensUse(order.lens_owner, photo.recalled)
-                order = replace(order, spec=replace(order.spec, lens=lens))
-            new = new_job(order, scene, photo)
-            job = self._stored_within_share(new, order)
-        # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
-        except BaseException:
-            self._release(held)
-            raise
-        if job.id != new.id:  # two requests with the same idempotency key at the same time
-            self._release(held)
-        elif held is None:
-            live = self._live[job.id] = LiveJob(job.id, job.scene)
-            self._scene_wait.submit(live, order.spec.scene, reserved=True)
-        else:
-            live = self._live[job.id] = LiveJob(job.id, job.scene, photo, held)
-            self._queue.submit(live)
-        return job
-
-    def _held(self, asked: str | Sequence[str] | None) -> HeldScenes | None:
-        """Return the scenes, held; None if one is not in memory yet: the job waits for it."""
-        try:
-            return self._engine.hold(asked)
-        except SceneNotReady:
-            return None
-
-    def _release(self, held: HeldScenes | None) -> None:
-        if held is not None:
-            self._engine.release(held.token)
-
-    def _first_scene(self, asked: str | Sequence[str] | None) -> str:
-        """Return the scene under which a job is listed until it has found the one that its photo shows."""
-        if asked == AUTO:
-            return self._engine.scenes()[0].id
-        names = [asked] if asked is None or isinstance(asked, str) else asked
-        return next(self._engine.scene(name).id for name in names)
-
-    def _recall(self, order: JobOrder) -> Recall | None:
-        """Return what recalls the lens of the order's photo; None: lenses aren't remembered."""
-        if self._lenses is None or not order.lens_owner:
-            return None
-        return partial(self._lenses.recall, order.lens_owner, order.spec.camera_id)
-
-    def _stored_within_share(self, new: NewJob, order: JobOrder) -> StoredJob:
-        """Put a job on disk unless its client has as many waiting as it may. Raises QueueFull, StorageFailed."""
-        if order.most_queued is None:
-            return self._stored(new, order.photo)
-        # One at a time: two jobs that are accepted at once must not both take the last place.
-        with self._sharing:
-            self._require_share(order.client, order.most_queued)
-            return self._stored(new, order.photo)
-
-    def _require_share(self, client: str, most: int | None) -> None:
-        if most is not None and (waiting := self._store.count("queued", client)) >= most:
-            raise QueueFull(f"the queue is full: {waiting} jobs of this key, its share.", hint="Try again later.")
-
-    def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
-        """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
-        # Reserved first: once the job is on disk it can no longer be refused.
-        self._queue.reserve()
-        taken = False
-        try:
-            # The photo first: a stored job without its photo could not be run after a crash.
-            self._photos.accept(new.id, photo)
-            job = self._store.accept(new)
-            taken = job.id == new.id
-            return job
-        except StorageFailed as error:
-            self._worker.note_storage(error)
-            raise
-        finally:
-            if not taken:
-                self._queue.release()
-                self._photos.delete(new.id)
+        return self._acceptance.accept(order)
 
     def get(self, job_id: str) -> StoredJob:
         """Return a job as it stands. Raises JobNotFound."""
@@ -288,11 +196,7 @@ class Jobs:
 
         `most`: how many jobs of the client may wait at once; None: as many as the queue takes.
         """
-        if key and self._store.has_key(client, key):
-            return
-        if self._queue.full():
-            raise QueueFull(f"the queue is full: {self._queue.waiting()} jobs.", hint="Try again later.")
-        self._require_share(client, most)
+        self._acceptance.require_capacity(client, most, key)
 
     def stuck_workers(self) -> int:
         """Return how many workers were given up."""
@@ -302,8 +206,8 @@ class Jobs:
         """Return what keeps jobs from running, as sentences; a supervisor should restart the process."""
         stuck, storage_error = self._queue.stuck(), self._worker.storage_error
         found = [f"{stuck} workers are stuck: restart the service."] if stuck >= _STUCK_LIMIT else []
-        cure = "Free space on the disk of the data folder, and check that it is writable."
-        return [*found, *([f"{storage_error} {cure}"] if storage_error else [])]
+        remedy = "Free space on the disk of the data folder, and check that it is writable."
+        return [*found, *([f"{storage_error} {remedy}"] if storage_error else [])]
 
     def cancel(self, job: StoredJob) -> None:
         """Cancel at once if the job waits, between two records if it runs; no effect once it has ended.

@@ -40,7 +40,7 @@ class SqlDatabase(Protocol):
         ...
 
     def announce(self, connection: Any, job_id: str) -> None:
-        """Tell other processes that use the database that a job has changed, once the transaction ends."""
+        """Notify other processes that use the database of a job's change, once the transaction ends."""
         ...
 
     def now(self) -> float:
@@ -55,4 +55,6 @@ class SqlDatabase(Protocol):
         """Make files smaller by what was deleted."""
         ...
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Close files and connections; nothing is called afterwards."""
+        ...

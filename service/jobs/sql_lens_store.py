@@ -31,9 +31,11 @@ class SqlLensStore:
 
     def change(self, key: LensKey, learn: Callable[[LensEstimate | None], LensEstimate]) -> None:
         with self._database.transaction() as writer:
+            # By its name: a row that isn't there yet can't be locked.
             self._database.lock(writer, key.id)
             row = writer.execute("SELECT estimate FROM lenses WHERE id = ?", (key.id,)).fetchone()
             estimate = learn(decode(LensEstimate, row[0]) if row else None)
+            # Inserted anew: `change`, by which the oldest go, counts insertions.
             writer.execute("DELETE FROM lenses WHERE id = ?", (key.id,))
             writer.execute(
                 "INSERT INTO lenses (id, owner, key, estimate, updated) VALUES (?, ?, ?, ?, ?)",
@@ -50,6 +52,7 @@ class SqlLensStore:
 
     def delete(self, lens_id: str | None = None, owner: str | None = None) -> int:
         with self._database.transaction() as writer:
+            # coalesce: a value that isn't given restricts nothing.
             deleted = writer.execute(
                 "DELETE FROM lenses WHERE id = coalesce(?, id) AND owner = coalesce(?, owner)", (lens_id, owner)
             ).rowcount

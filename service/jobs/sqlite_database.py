@@ -38,6 +38,7 @@ class Database:
             raise StorageFailed(f"{path} can't be used: {error}.", where="data_dir") from error
 
     def close(self) -> None:
+        """Close both connections, each once nothing uses it any more."""
         with self._writing, self._reading:
             self._writer.close()
             self._reader.close()

@@ -6,14 +6,13 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from service.errors import Failure
 from service.loaded_scene import LoadedScene
 from service.scene_formats.size_estimate import estimated_bytes
-from service.scene_manager.status import SceneState, SceneStatus
-
-RETRY_S = 5.0
-"""A scene that failed to load is tried again by the next request after this time, doubled with each failure."""
-MAX_RETRY_S = 300.0
+from service.scene_manager.status import MAX_RETRY_S, RETRY_S, SceneContents, SceneState, SceneStatus
+from service.scene_origin import shifted_camera
 
 
 @dataclass(slots=True)
@@ -74,6 +73,10 @@ class Entry:
         self.retry_at = time.monotonic() + min(RETRY_S * 2**self.failures, MAX_RETRY_S)
         self.failures += 1
 
+    def drop(self) -> None:
+        """Take it out of memory."""
+        self.loaded, self.state, self.is_outdated = None, "unloaded", False
+
     def status(self) -> SceneStatus:
         """Return the scene's state, and its contents if it is loaded."""
         failure = Failure.of(self.error) if self.error else None
@@ -93,3 +96,13 @@ class Entry:
             cameras=len(scene.cameras),
             memory_bytes=loaded.nbytes,
         )
+
+    def contents(self) -> SceneContents | None:
+        """Return the scene's training cameras and its bounds, in the world; None while it isn't in memory."""
+        if self.loaded is None:
+            return None
+        scene = self.loaded.scene
+        origin = scene.info.origin_in_world
+        # Quantiles: floaters far outside would make the box useless.
+        bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) + origin if scene.count else None
+        return SceneContents(tuple(shifted_camera(named, origin) for named in scene.cameras), bounds)

@@ -17,24 +17,23 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from service.disk_cache import evict
-from service.errors import (
-    BadInput,
-    SceneInUse,
-    SceneNotFound,
-    SceneNotReady,
-    SceneUnloaded,
-    SplatfixError,
-)
+from service.errors import SceneNotReady, SplatfixError
 from service.loaded_scene import DEFAULT_MATCHER, LoadedScene
 from service.scene_manager.camera_frame_search import CameraFrameSearch
 from service.scene_manager.entry import Entry
 from service.scene_manager.memory_limit import MemoryLimit
+from service.scene_manager.scene_errors import (
+    nothing_to_search,
+    scene_in_use,
+    scene_not_ready,
+    scene_unloaded,
+    scene_without_file,
+    unknown_scene,
+    unnamed_scene,
+)
 from service.scene_manager.status import AUTO, SceneContents, SceneNote, SceneReadiness
 from service.scene_manager.warm_up import warm_up
-from service.scene_origin import shifted_camera
 
 _log = logging.getLogger(__name__)
 
@@ -116,14 +115,14 @@ class Scenes:
             return list(self._entries.values())
 
     def entry(self, scene_id: str | None) -> Entry:
-        """Return a scene; None: the only one. Raises SceneNotFound, which tells of no other scene."""
+        """Return a scene; None: the only one. Raises SceneNotFound."""
         with self._lock:
             if scene_id is None and len(self._entries) == 1:
                 return next(iter(self._entries.values()))
             if scene_id is None:
-                raise SceneNotFound("name a scene.", where="scene")
+                raise unnamed_scene()
             if scene_id not in self._entries:
-                raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
+                raise unknown_scene(scene_id)
             return self._entries[scene_id]
 
     def add(self, entry: Entry) -> None:
@@ -138,9 +137,7 @@ class Scenes:
         with self._lock:
             entry = self.entry(scene_id)
             if entry.jobs:
-                raise SceneInUse(
-                    f"{entry.jobs} jobs use the scene.", where="scene", hint="Unload it, and wait for them."
-                )
+                raise scene_in_use(entry.jobs)
             del self._entries[scene_id]
             entry.wanted = False
             self._withdraw(entry)
@@ -148,13 +145,7 @@ class Scenes:
 
     def contents(self, scene_id: str) -> SceneContents | None:
         """Summarize a scene; None while it isn't in memory. Raises SceneNotFound."""
-        loaded = self.entry(scene_id).loaded
-        if loaded is None:
-            return None
-        scene = loaded.scene
-        origin = scene.info.origin_in_world
-        bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) + origin if scene.count else None
-        return SceneContents(tuple(shifted_camera(named, origin) for named in scene.cameras), bounds)
+        return self.entry(scene_id).contents()
 
     # ------------------------------------------------------------------ use
 
@@ -170,12 +161,10 @@ class Scenes:
             if entry.loaded is not None and entry.state not in ("unloading", "failed"):
                 return entry.loaded
             if not entry.wanted:
-                raise SceneUnloaded(
-                    f"scene '{entry.id}' was unloaded.", where="scene", hint=f"Load it: POST /scenes/{entry.id}/load."
-                )
+                raise scene_unloaded(entry.id)
             if entry.state in ("unloaded", "failed"):
                 self._request(entry)
-        raise SceneNotReady(f"scene '{entry.id}' is {entry.state}.", where="scene", hint="Try again later.")
+        raise scene_not_ready(entry.id, entry.state)
 
     def acquire(self, asked: str | Sequence[str] | None) -> Acquired:
         """Return scenes that stay in memory until they are released as often: one, several, the only one (None), or
@@ -216,9 +205,7 @@ class Scenes:
             entries = [entry for entry in self.entries() if entry.wanted]
             chosen = [entry.id for entry in self._limit.that_fit(entries)]
             if not chosen:
-                raise SceneNotFound(
-                    "no scene can be searched: none is there, or all failed or were unloaded.", where="scene"
-                )
+                raise nothing_to_search()
             return chosen, [entry.id for entry in entries if entry.id not in chosen]
         names = [asked] if asked is None or isinstance(asked, str) else asked
         # A scene that is named twice is searched once.
@@ -250,7 +237,7 @@ class Scenes:
                 if any(entry.loaded is loaded for loaded in held):
                     entry.jobs -= 1
                     if entry.state == "unloading" and not entry.jobs:
-                        _drop(entry)
+                        entry.drop()
                     self._reload_outdated(entry)
             self._lock.notify_all()
 
@@ -262,7 +249,7 @@ class Scenes:
 
     def _reload_outdated(self, entry: Entry) -> None:
         if entry.is_outdated and entry.is_idle and entry.wanted:
-            _drop(entry)
+            entry.drop()
             self._request(entry)
 
     def load(self, entry: Entry) -> None:
@@ -277,7 +264,7 @@ class Scenes:
     def unload(self, entry: Entry) -> None:
         """Drop a scene from memory as soon as no job uses it; none may start to. Raises BadInput."""
         if entry.path is None:
-            raise BadInput("the scene has no file to reload it from.", where="scene")
+            raise scene_without_file()
         with self._lock:
             entry.wanted = False
             self._withdraw(entry)
@@ -289,7 +276,7 @@ class Scenes:
         if entry.state == "ready":
             entry.state = "unloading"
         if entry.state == "unloading" and not entry.jobs:
-            _drop(entry)
+            entry.drop()
 
     def readiness(self) -> SceneReadiness:
         """Return whether photos can be localized, what is still loading, and what failed."""
@@ -367,7 +354,7 @@ class Scenes:
             return False
         for other in dropped or ():
             _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
-            _drop(other)
+            other.drop()
         return dropped is not None
 
     def _withdraw(self, entry: Entry) -> None:
@@ -386,9 +373,9 @@ class Scenes:
             entry.measured_bytes = loaded.nbytes
             self._limit.require(entry, loaded.nbytes)
             with self._lock:
-                # Where the header told too little the scenes in use stay, and all together are over the limit.
+                # Where the header promised too little the scenes in use stay, and all together are over the limit.
                 for other in self._limit.to_drop(entry, loaded.nbytes, self.entries()) or ():
-                    _drop(other)
+                    other.drop()
                 entry.loaded, entry.state = loaded, "preparing"
             self._settle()
         if entry.loaded is not None and not self._stop.is_set():
@@ -427,7 +414,3 @@ class Scenes:
         if any(isinstance(one, SceneNotReady) for one in found.values()):
             return None
         return self._held(waiting.ids, waiting.left_out)
-
-
-def _drop(entry: Entry) -> None:
-    entry.loaded, entry.state, entry.is_outdated = None, "unloaded", False

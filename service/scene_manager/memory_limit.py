@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
-from service.errors import SceneTooLarge
 from service.scene_manager.entry import Entry
+from service.scene_manager.scene_errors import too_large
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class MemoryLimit:
     def require(self, entry: Entry, needed: int) -> None:
         """Raise SceneTooLarge if a scene can't fit even alone: nothing is dropped for it."""
         if not self.could_hold(needed):
-            raise self._too_large(f"scene '{entry.id}' takes", needed, "serve a smaller scene")
+            raise too_large(f"scene '{entry.id}' takes", needed, self.most_bytes or 0, "serve a smaller scene")
 
     def require_together(self, entries: Sequence[Entry]) -> None:
         """Raise SceneTooLarge if scenes that are searched together can't be in memory together."""
@@ -28,15 +28,8 @@ class MemoryLimit:
         for entry, needed in zip(entries, sizes, strict=True):
             self.require(entry, needed)
         if not self.could_hold(sum(sizes)):
-            raise self._too_large(f"the {len(entries)} scenes take", sum(sizes), "name fewer scenes in one request")
-
-    def _too_large(self, what: str, needed: int, otherwise: str) -> SceneTooLarge:
-        most = self.most_bytes or 0
-        return SceneTooLarge(
-            f"{what} {needed / 1e6:.1f} MB, and all scenes together may take {most / 1e6:.1f} MB.",
-            where="scene",
-            hint=f"Raise SPLATFIX_SCENE_MEMORY_BYTES, or {otherwise}.",
-        )
+            what, otherwise = f"the {len(entries)} scenes take", "name fewer scenes in one request"
+            raise too_large(what, sum(sizes), self.most_bytes, otherwise)
 
     def could_hold(self, needed: int) -> bool:
         """Whether so much fits if nothing else is there."""

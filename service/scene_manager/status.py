@@ -15,6 +15,9 @@ from service.types import Intrinsics, NamedCamera, Pose, SceneInfo
 
 AUTO = "auto"
 """Requests name all scenes that are ready by it, so no scene is called that."""
+RETRY_S = 5.0
+"""A scene that failed to load is tried again by the next request after this time, doubled with each failure."""
+MAX_RETRY_S = 300.0
 PictureFormat = Literal["png", "jpeg", "depth"]
 SceneState = Literal["unloaded", "loading", "preparing", "ready", "unloading", "failed"]
 

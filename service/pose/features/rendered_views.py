@@ -46,6 +46,11 @@ class View:
     features: Features
     points_in_world: Float32[np.ndarray, "n 3"]
 
+    @property
+    def distance(self) -> float:
+        """Median distance from the camera to the features' scene points, scene units; needs one point."""
+        return float(np.median(np.linalg.norm(self.points_in_world - self.camera.pose.position_in_world, axis=1)))
+
 
 @dataclass(slots=True)
 class RenderedView:

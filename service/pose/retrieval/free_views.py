@@ -133,17 +133,13 @@ def free_view_cameras(
     lens = search_camera(config.candidate_px)
     limit = min(config.max_views, config.views_per_index_view * len(index))
     poses = _candidates(seeing, rng, config.candidates_per_view * limit, config)
-    nearest = config.min_distance * float(np.median([_distance(view) for view in seeing]))
+    nearest = config.min_distance * float(np.median([view.distance for view in seeing]))
     batches = list(in_batches([Camera(lens, pose) for pose in poses], search.cameras_at_once))
     cells = list(chain.from_iterable(mapped(lambda some: _solid_cells(some, search, nearest, config), batches)))
     solid = [i for i, own in enumerate(cells) if own is not None]
     known = [_cells(view.points_in_world.astype(np.float64), view.camera.pose, config) for view in seeing]
     chosen = _choice([cells[i] for i in solid], np.unique(np.concatenate(known)), limit, config)
     return [Camera(sized(lens, config.render_px), poses[solid[i]]) for i in chosen]
-
-
-def _distance(view: View) -> float:
-    return float(np.median(np.linalg.norm(view.points_in_world - view.camera.pose.position_in_world, axis=1)))
 
 
 def _candidates(views: Sequence[View], rng: np.random.Generator, count: int, config: FreeViewConfig) -> list[Pose]:

@@ -59,11 +59,10 @@ def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher, conf
     if len(view.points_in_world) == 0:
         return False
     intrinsics, pose = view.camera.intrinsics, view.camera.pose
-    distance = float(np.median(np.linalg.norm(view.points_in_world - pose.position_in_world, axis=1)))
     scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
     error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
     # The view's own pose is the answer that others are compared with.
-    own = PoseAtDistance(pose, distance)
+    own = PoseAtDistance(pose, view.distance)
     found = ambiguous_hypotheses(
         view.features, intrinsics, own, views, scores, matcher, error_px, AMBIGUITY.min_inliers
     )

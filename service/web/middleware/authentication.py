@@ -17,6 +17,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.errors import Forbidden, SceneNotFound, Unauthorized
+from service.scene_manager.scene_errors import unknown_scene
 from service.web.api_keys import Caller, KeyRing
 from service.web.key_file import Role
 from service.web.problems import problem_response, refuse
@@ -140,7 +141,7 @@ def _check_scene(scene_id: str | None, caller: Caller | None) -> None:
     """Answer for every scene that the key doesn't cover as for one that isn't there. Raises SceneNotFound."""
     # Here, for each route whose path names a scene, and not in the routes: a new one can't forget it.
     if scene_id is not None and caller is not None and not caller.limits.cover(scene_id):
-        raise SceneNotFound(f"unknown scene '{scene_id}'.", where="scene")
+        raise unknown_scene(scene_id)
 
 
 def _opens_page(scope: Scope) -> bool:

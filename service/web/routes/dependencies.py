@@ -19,6 +19,7 @@ from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
 from service.lenses.lens_store import LensStore
 from service.scene_manager.anchor_store import Anchor, AnchorStore
+from service.scene_manager.scene_errors import nothing_to_search
 from service.scene_manager.scene_store import SceneStore
 from service.scene_manager.status import AUTO, SceneStatus
 from service.web.api_keys import Caller, KeyRing
@@ -107,9 +108,7 @@ class Visible:
         """Return the scenes that `auto` stands for: as the engine means it, it would look in all."""
         found = tuple(scene.id for scene in self.scenes(known) if scene.state not in ("failed", "unloaded"))
         if not found:
-            raise SceneNotFound(
-                "no scene can be searched: none is there, or all failed or were unloaded.", where="scene"
-            )
+            raise nothing_to_search()
         return found
 
 
