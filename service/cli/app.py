@@ -28,6 +28,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Localize photos in 3D Gaussian scenes.",
 )
+# In the order in which `--help` lists them.
 for command in (serve, demo, localize, render, doctor, report):
     app.command()(command)
 app.command(hidden=True)(openapi)

@@ -22,6 +22,7 @@ from service.cli.bench_scale import bench_scale
 from service.cli.bench_track import bench_track
 
 bench_app = typer.Typer(no_args_is_help=True, help="Measure accuracy and speed.")
+# In the order in which `--help` lists them.
 bench_app.command("localize")(bench_localize)
 bench_app.command("track")(bench_track)
 bench_app.command("live")(bench_live)

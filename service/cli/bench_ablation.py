@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, settings_of, write_json
+from service.cli.bench_output import measuring
+from service.cli.terminal import JsonFileOption, out, settings_of, write_json
 from service.errors import InvalidRequest
 
 
@@ -19,11 +20,9 @@ def bench_ablation(
     """Remove each part of the default estimator in turn; print a Markdown table of what is left."""
     from service.bench.ablation import run, table
 
-    print_machine()
     if len(folders) < 2:
         raise InvalidRequest("needs two scenes or more, to hide the photos of one by another's.", where="folders")
-    with progress_bar() as progress:
-        bar = counter(progress, "conditions")
-        rows = run(folders, parts=parts or (), cache_dir=settings_of({}).cache_dir, progress=bar)
+    with measuring("conditions") as progress:
+        rows = run(folders, parts=parts or (), cache_dir=settings_of({}).cache_dir, progress=progress)
     write_json(json_file, rows)
     out.print(table(rows), markup=False, highlight=False, soft_wrap=True)

@@ -15,7 +15,7 @@ def bench_evaluate(
     truth: Annotated[Path, typer.Option(help="The true poses: likewise; see docs/benchmarks.md for the formats.")],
     names: Annotated[Path | None, typer.Option(help="A list of the photos that count.")] = None,
     metres_per_unit: Annotated[float, typer.Option(min=1e-9, help="Metres in a unit of the truth.")] = 1.0,
-    scene: Annotated[Path | None, typer.Option(help="A scene in the truth's frame: tells normalized units.")] = None,
+    scene: Annotated[Path | None, typer.Option(help="A scene in the truth's frame, for normalized units.")] = None,
     json_file: JsonFileOption = None,
 ) -> None:
     """Compare poses of photos with the truth: medians, and the share within the usual bounds."""

@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, settings_of, write_json
+from service.cli.bench_output import measuring
+from service.cli.terminal import JsonFileOption, out, settings_of, write_json
 
 
 def bench_gate(
@@ -24,9 +25,8 @@ def bench_gate(
     from service.bench.gate import run
     from service.pose.verification.gate_model import model_from_json, write_model
 
-    print_machine()
-    with progress_bar() as progress:
-        outcome = run(folders, seed=seed, progress=counter(progress, "photos"), cache_dir=settings_of({}).cache_dir)
+    with measuring("photos") as progress:
+        outcome = run(folders, seed=seed, progress=progress, cache_dir=settings_of({}).cache_dir)
     write_json(json_file, outcome)
     if model:
         write_model(model_from_json(outcome["model"]), model)

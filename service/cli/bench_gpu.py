@@ -24,8 +24,8 @@ def bench_gpu(
 ) -> None:
     """Compare a GPU's renderer with the CPU's: images, gradients, poses, times, memory. Prints a Markdown table.
 
-    The file of --json is written after every row, so that a run that is cut short still tells something. Exit code 1 if
-    a part didn't come to its end.
+    The file of --json is written after every row, so that a run that is cut short leaves its rows. Exit code 1 if a
+    part didn't come to its end.
     """
     from service.bench.gpu_table import markdown
 
@@ -51,6 +51,7 @@ def bench_gpu(
         )
     say(markdown(outcome))
     first = outcome["parts"][0]
+    # Without its first part, which loads the renderer, no other can run: that is why, and not one failure of many.
     if first["state"] != "done":
         raise BackendMissing(first.get("error", "the first part wasn't run."), where=renderer)
     if any(each["state"] != "done" for each in outcome["parts"]):

@@ -7,16 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.terminal import (
-    JsonFileOption,
-    counter,
-    print_machine,
-    progress_bar,
-    say,
-    settings_of,
-    short,
-    write_json,
-)
+from service.cli.bench_output import measuring, report_figures
+from service.cli.terminal import JsonFileOption, say, settings_of, short
 
 
 def bench_live(
@@ -32,8 +24,7 @@ def bench_live(
     """Send a hand-held camera's film to a service as it is taken, and measure what comes back."""
     from service.bench.live import run
 
-    print_machine()
-    with progress_bar() as progress:
+    with measuring("frames") as progress:
         outcome = run(
             folder,
             seconds=seconds,
@@ -42,13 +33,10 @@ def bench_live(
             seed=seed,
             withheld=intrinsics == "withheld",
             odometry=odometry,
-            progress=counter(progress, "frames"),
+            progress=progress,
             cache_dir=settings_of({}).cache_dir,
         )
-    write_json(json_file, outcome)
-    of_sessions = outcome.pop("sessions")
-    for name, value in outcome.items():
-        say(f"{name:28} {short(value)}")
-    for number, figures in enumerate(of_sessions):
+    report_figures(outcome, json_file, rows="sessions")
+    for number, figures in enumerate(outcome["sessions"]):
         for name, value in figures.items():
             say(f"session {number} {name:28} {short(value)}")

@@ -7,18 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.terminal import (
-    JsonFileOption,
-    MatcherOption,
-    counter,
-    parsed_option,
-    print_machine,
-    progress_bar,
-    say,
-    settings_of,
-    short,
-    write_json,
-)
+from service.cli.bench_output import measuring, report_figures
+from service.cli.terminal import JsonFileOption, MatcherOption, parsed_option, settings_of
 
 
 def bench_localize(
@@ -52,8 +42,7 @@ def bench_localize(
     from service.loaded_scene import DEFAULT_MATCHER
     from service.web.schemas.job_spec import accuracy_from, options_from
 
-    print_machine()
-    with progress_bar() as progress:
+    with measuring("photos") as progress:
         outcome = run(
             folder,
             data=data,
@@ -72,13 +61,9 @@ def bench_localize(
             options=options_from(estimator, parsed_option(options, "options") or {}),
             budget=Budget(budget_s, budget_renders),
             accuracy=accuracy_from(parsed_option(accuracy, "accuracy")),
-            progress=counter(progress, "photos"),
+            progress=progress,
             cache_dir=settings_of({}).cache_dir,
             photos=photos,
             on_miss=miss_images.save_miss_images(misses) if misses else None,
         )
-    write_json(json_file, outcome)
-    for name, value in outcome.items():
-        # Hundreds of rows, for the file.
-        if name != "per_query":
-            say(f"{name:28} {short(value)}")
+    report_figures(outcome, json_file, rows="per_query")

@@ -72,6 +72,7 @@ def _live_table() -> Iterator[Callable[[Progress], None]]:
 
         def show(progress: Progress) -> None:
             nonlocal printed_s
+            # A table that is drawn again would fill a log file.
             if err.is_terminal:
                 live.update(_progress_table(progress), refresh=True)
             elif time.monotonic() - printed_s > 60:

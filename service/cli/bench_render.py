@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, short, write_json
+from service.cli.bench_output import measuring
+from service.cli.terminal import JsonFileOption, out, short, write_json
 
 
 def bench_render(
@@ -16,9 +17,8 @@ def bench_render(
     """Time the renderer on the synthetic room."""
     from service.bench.render import run
 
-    print_machine()
-    with progress_bar() as progress:
-        outcome = run(repeats=repeats, progress=counter(progress, "cases"))
+    with measuring("cases") as progress:
+        outcome = run(repeats=repeats, progress=progress)
     write_json(json_file, outcome)
     for row in [outcome[0].keys(), *(row.values() for row in outcome)]:
         out.print(" ".join(f"{short(value):>13}" for value in row), highlight=False, soft_wrap=True)

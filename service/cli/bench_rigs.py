@@ -7,16 +7,8 @@ from typing import Annotated
 
 import typer
 
-from service.cli.terminal import (
-    JsonFileOption,
-    counter,
-    print_machine,
-    progress_bar,
-    say,
-    settings_of,
-    short,
-    write_json,
-)
+from service.cli.bench_output import measuring, report_figures
+from service.cli.terminal import JsonFileOption, settings_of
 
 
 def bench_rigs(
@@ -32,8 +24,7 @@ def bench_rigs(
     """Localize photos that fail alone together, with their true relative poses, and with wrong ones."""
     from service.bench.rigs import MODIFICATIONS, run
 
-    print_machine()
-    with progress_bar() as progress:
+    with measuring("rigs") as progress:
         outcome = run(
             folder,
             occluders,
@@ -43,9 +34,6 @@ def bench_rigs(
             modify=tuple(modify or MODIFICATIONS),
             seed=seed,
             cache_dir=settings_of({}).cache_dir,
-            progress=counter(progress, "rigs"),
+            progress=progress,
         )
-    write_json(json_file, outcome)
-    for name, value in outcome.items():
-        if name != "per_query":
-            say(f"{name:36} {short(value)}")
+    report_figures(outcome, json_file, rows="per_query", width=36)

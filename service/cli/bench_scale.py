@@ -7,7 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.terminal import JsonFileOption, counter, out, print_machine, progress_bar, short, write_json
+from service.cli.bench_output import measuring
+from service.cli.terminal import JsonFileOption, out, short, write_json
 
 
 def bench_scale(
@@ -25,8 +26,7 @@ def bench_scale(
     """Measure loading, indexing, memory and localization of scenes of growing size."""
     from service.bench.scale import SIZES, run
 
-    print_machine()
-    with progress_bar() as progress:
+    with measuring("sizes") as progress:
         rows = run(
             folder,
             others=around or (),
@@ -34,7 +34,7 @@ def bench_scale(
             cameras=cameras,
             compressed=compressed,
             work=work,
-            progress=counter(progress, "sizes"),
+            progress=progress,
         )
     write_json(json_file, rows)
     if plot_file:

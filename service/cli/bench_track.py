@@ -7,16 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from service.cli.terminal import (
-    JsonFileOption,
-    counter,
-    print_machine,
-    progress_bar,
-    say,
-    settings_of,
-    short,
-    write_json,
-)
+from service.cli.bench_output import measuring, report_figures
+from service.cli.terminal import JsonFileOption, settings_of
 
 
 def bench_track(
@@ -29,18 +21,13 @@ def bench_track(
     """Follow a camera along a smooth path through a scene."""
     from service.bench.track import run
 
-    print_machine()
-    with progress_bar() as progress:
+    with measuring("frames") as progress:
         outcome = run(
             folder,
             frames=frames,
             seed=seed,
             intrinsics=intrinsics,
-            progress=counter(progress, "frames"),
+            progress=progress,
             cache_dir=settings_of({}).cache_dir,
         )
-    write_json(json_file, outcome)
-    for name, value in outcome.items():
-        # Hundreds of rows, for the file.
-        if name != "per_frame":
-            say(f"{name:28} {short(value)}")
+    report_figures(outcome, json_file, rows="per_frame")

@@ -77,6 +77,7 @@ def findings() -> Iterator[Finding]:
 
 def compile_kernels() -> None:
     """Run every compiled kernel once, so that later runs find it in the cache: a minute, later seconds."""
+    # What they return doesn't matter: each call compiles kernels for the types of arrays that jobs have.
     room, (camera,) = synthetic_room(2000), room_cameras(64)[:1]
     rasterizer = RASTERIZERS.load("cpu").create(room)
     frame = rasterizer.render([camera])[0]

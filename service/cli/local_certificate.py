@@ -100,6 +100,7 @@ def _make(files: CertificateFiles, names: Sequence[str]) -> None:
         .issuer_name(owner)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
+        # A phone's clock may be behind this machine's.
         .not_valid_before(now - timedelta(hours=1))
         .not_valid_after(now + _VALID)
         .add_extension(x509.SubjectAlternativeName([_general_name(name) for name in names]), critical=False)
@@ -111,6 +112,7 @@ def _make(files: CertificateFiles, names: Sequence[str]) -> None:
     secret = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
+    # Made anew: a file that is there already would keep its own, perhaps wider, permissions.
     files.key.unlink(missing_ok=True)
     with os.fdopen(os.open(files.key, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
         file.write(secret)

@@ -46,6 +46,15 @@ class _Output:
     smooth: bool = False
 
 
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """A scene in memory, and what is kept beside its file."""
+
+    loaded: LoadedScene
+    registration: Registration | None
+    anchors: tuple[Anchor, ...]
+
+
 def localize(
     photos: Annotated[list[Path], typer.Argument(help="JPEG, PNG, WebP or HEIC; or one video.")],
     scene: Annotated[
@@ -86,7 +95,6 @@ def localize(
 
     The exit code is 0 also for photos that are not localized, unless --fail is given; 2 for an error.
     """
-    from service.loaded_scene import DEFAULT_ESTIMATOR
     from service.photos.sequence import is_sequence
     from service.results import Status
     from service.scene_formats.discovery import find_scenes
@@ -99,28 +107,19 @@ def localize(
     files = [(str(photo), read_file(photo)) for photo in photos]
     # A video is a sequence by itself; photos are one only on request.
     track_camera = sequence or any(is_sequence(data) for _, data in files)
-    if rig and track_camera:
-        raise InvalidRequest("photos are a rig, or a sequence.", where="--rig")
-    if not track_camera:
-        _refuse_sequence_options({"--tum": tum_file, "--every": every > 1, "--times": times, "--smooth": smooth})
-    elif learn_lenses:
-        raise InvalidRequest("the photos of a sequence share a lens anyway.", where="--learn-lenses")
+    of_sequences = {"--tum": tum_file, "--every": every > 1, "--times": times, "--smooth": smooth}
+    _require_consistent(track_camera, bool(rig), learn_lenses, of_sequences)
     paths = [path for given_path in scene for path in find_scenes(given_path)]
     if track_camera or rig:
         _require_one_scene(paths)
     # Last: faults of photos and fields are reported without waiting for it.
-    loaded = [loaded_scene(path, fields.estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
-    registrations, anchors = scene_registrations(paths, loaded), scene_anchors(paths)
+    known = _scenes(paths, fields.estimator, matcher)
     output = _Output(as_json, csv_file, tum_file, smooth)
     if track_camera:
-        statuses = _localize_sequence(body_of(files, {}), fields, loaded[0], registrations, anchors[0], output)
-    elif rig:
-        known = [(loaded[0], registrations[0], anchors[0])]
-        statuses = _localize_each([body_of(files, {})], fields, known, output, learn_lenses=False)
+        statuses = _localize_sequence(body_of(files, {}), fields, known[0], output)
     else:
-        bodies = [Body(data, name, {}) for name, data in files]
-        known = list(zip(loaded, registrations, anchors, strict=True))
-        statuses = _localize_each(bodies, fields, known, output, learn_lenses=learn_lenses)
+        bodies = [body_of(files, {})] if rig else [Body(data, name, {}) for name, data in files]
+        statuses = _localize_each(bodies, fields, known, output, learn_lenses=learn_lenses and not rig)
     if fail and any(status != Status.LOCALIZED for status in statuses):
         raise typer.Exit(1)
 
@@ -134,10 +133,24 @@ def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
     return read_fields({name: value for name, value in given.items() if value is not None})
 
 
-def _refuse_sequence_options(given: dict[str, Any]) -> None:
-    for option, value in given.items():
-        if value:
+def _require_consistent(track_camera: bool, rig: bool, learn_lenses: bool, of_sequences: dict[str, Any]) -> None:
+    """Raise InvalidRequest for options that don't go together; `of_sequences`: those that single photos don't have."""
+    if rig and track_camera:
+        raise InvalidRequest("photos are a rig, or a sequence.", where="--rig")
+    if track_camera and learn_lenses:
+        raise InvalidRequest("the photos of a sequence share a lens anyway.", where="--learn-lenses")
+    for option, value in of_sequences.items():
+        if value and not track_camera:
             raise InvalidRequest("this is of a sequence: add --sequence.", where=option)
+
+
+def _scenes(paths: list[Path], estimator: str | None, matcher: str) -> list[_Scene]:
+    """Load scenes, and prepare them for the estimator. Raises SceneError, BackendMissing."""
+    from service.loaded_scene import DEFAULT_ESTIMATOR
+
+    loaded = [loaded_scene(path, estimator or DEFAULT_ESTIMATOR, matcher) for path in paths]
+    parts = zip(loaded, scene_registrations(paths, loaded), scene_anchors(paths), strict=True)
+    return [_Scene(*one) for one in parts]
 
 
 def _require_one_scene(paths: list[Path]) -> None:
@@ -145,22 +158,19 @@ def _require_one_scene(paths: list[Path]) -> None:
         raise InvalidRequest(
             "only single photos are looked for in several scenes; this is a sequence.",
             where="--scene",
-            hint="Name one scene; one photo of the sequence, by itself, can tell which.",
+            hint="Name one scene; one photo of the sequence, by itself, shows which.",
         )
 
 
 def _localize_each(
     bodies: list[Body],
     fields: LocalizeFields,
-    known: list[tuple[LoadedScene, Registration | None, tuple[Anchor, ...]]],
+    known: list[_Scene],
     output: _Output,
     *,
     learn_lenses: bool,
 ) -> list[Status]:
-    """Localize every photo by itself, in the one scene or in each of several; return their statuses.
-
-    `known`: each scene, with its registration and its anchors.
-    """
+    """Localize every photo by itself, in the one scene or in each of several; return their statuses."""
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
@@ -169,7 +179,7 @@ def _localize_each(
     from service.web.schemas.conversion import result_out
     from service.web.schemas.job_spec import job_spec
 
-    loaded, registrations = [scene for scene, _, _ in known], [registration for _, registration, _ in known]
+    loaded, registrations = [scene.loaded for scene in known], [scene.registration for scene in known]
     lenses = LensMemory(MemoryLensStore(len(bodies))) if learn_lenses else None
     results: list[tuple[str, Result]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
@@ -179,7 +189,8 @@ def _localize_each(
         result, shown = run_task(photo.task(spec), loaded, registrations=registrations)
         if lenses:
             lenses.learn("", None, photo.camera, photo.recalled, result.estimate)
-        anchors = next((anchors for scene, _, anchors in known if scene is shown), ())
+        # By identity: comparing scenes would compare their arrays.
+        anchors = next((scene.anchors for scene in known if scene.loaded is shown), ())
         results.append((body.name, result_out(result, anchors)))
         if not output.as_json:
             # At once, not in the end: a photo may take seconds.
@@ -195,9 +206,7 @@ def _localize_each(
 def _localize_sequence(
     body: Body,
     fields: LocalizeFields,
-    loaded: LoadedScene,
-    registrations: list[Registration | None],
-    anchors: tuple[Anchor, ...],
+    scene: _Scene,
     output: _Output,
 ) -> list[Status]:
     """Track the camera of a video, or of photos in their order, through a scene; return the frames' statuses."""
@@ -211,7 +220,7 @@ def _localize_sequence(
 
     spec = job_spec(fields)
     # The service limits the frames of a job; the command line doesn't.
-    photo = read_photo(body.photo, spec, loaded.scene.info.background_rgb, max_frames=sys.maxsize)
+    photo = read_photo(body.photo, spec, scene.loaded.scene.info.background_rgb, max_frames=sys.maxsize)
     if not isinstance(photo.source, SequenceSource):
         raise InvalidRequest("a sequence has two photos or more, or is a video.", where="photos")
 
@@ -219,8 +228,8 @@ def _localize_sequence(
         if record.frame and not output.as_json:
             say(result_tables.frame_line(frame_out(record.frame)))
 
-    found, _ = run_task(photo.task(spec), [loaded], show, registrations=registrations)
-    result = result_out(found, anchors)
+    found, _ = run_task(photo.task(spec), [scene.loaded], show, registrations=[scene.registration])
+    result = result_out(found, scene.anchors)
     if output.as_json:
         print_json({"photo": body.name, **result.model_dump(mode="json")})
     if output.csv_file:

@@ -16,4 +16,5 @@ def openapi(
     from service.web.app import openapi_yaml
     from service.web.schemas.live import live_schema
 
+    # The texts end with a line break of their own: files of the repository are compared with them to the byte.
     typer.echo(live_schema() if live else openapi_yaml(), nl=False)

@@ -80,6 +80,7 @@ def _machine() -> Iterator[str]:
     from service.cli.doctor import settings_lines
 
     for line in chain((finding.line for finding in findings()), settings_lines()):
+        # It holds the user's name, which no bug depends on.
         yield line.replace(str(Path.home()), "~")
 
 

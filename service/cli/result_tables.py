@@ -66,6 +66,7 @@ def _pose(world_from_camera: Transform) -> list[float]:
 
 
 def _write(path: Path, head: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    # The csv module writes its own line ends.
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(head)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
 from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
-from service.types import GaussianScene
+from service.types import GaussianScene, SceneInfo
 
 
 def scene_facts(path: Path) -> dict[str, Any]:
@@ -35,7 +37,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
     rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(searched)
     info, floaters = scene.info, find_floaters(scene)
     registration = SceneRegistrations(registrations_folder()).of(path, info)
-    told = registered_info(info, registration)
+    known = registered_info(info, registration)
     # Quantiles: a few stray Gaussians would make the bounds meaningless.
     low, high = np.quantile(scene.means, [0.01, 0.99], axis=0) + info.origin_in_world
     facts: dict[str, Any] = {
@@ -51,32 +53,29 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "middle_98_percent": [low.tolist(), high.tolist()],
         "extent": float(np.linalg.norm(high - low)),
         "floaters": {"found": int(floaters.found.sum()), "veil": floaters.veil, "left_out": floaters.left_out},
-        "up": list(told.up_in_world) if told.up_in_world else None,
-        "metres_per_unit": told.metres_per_unit,
+        "up": list(known.up_in_world) if known.up_in_world else None,
+        "metres_per_unit": known.metres_per_unit,
         "background": list(info.background_rgb),
-        "on_earth": told.geo_anchor is not None,
+        "on_earth": known.geo_anchor is not None,
         "registration": registration and registration.revision,
         "training_cameras": len(scene.cameras),
         "training_size": _training_size(path, scene),
-        "frames": [
-            {
-                "name": frame.name,
-                "frame_from_world": frame.frame_from_world.tolist(),
-                "decided_by": frame.decided_by,
-                "verified": frame.verified,
-            }
-            for frame in info.frames
-        ],
+        "frames": [asdict(frame) | {"frame_from_world": frame.frame_from_world.tolist()} for frame in info.frames],
         "index": _index(searched, rasterizer),
         "training_photos": _training_photos(path, scene),
         "expected_accuracy": _expected_accuracy(path, searched, rasterizer.name),
     }
-    warnings = [*info.warnings, *(["the training size is unknown"] if not facts["training_size"]["px"] else [])]
+    return facts | {"warnings": [*info.warnings, *_unknowns(info, facts["training_size"]["px"])]}
+
+
+def _unknowns(info: SceneInfo, training_px: int | None) -> Iterator[str]:
+    """Yield what no file says of a scene, and what is assumed instead."""
+    if training_px is None:
+        yield "the training size is unknown"
     if not info.up_in_world:
-        warnings.append("up is unknown: views are placed upright by z and by -y, and shown by z")
+        yield "up is unknown: views are placed upright by z and by -y, and shown by z"
     if not info.background_is_known:
-        warnings.append("the background is unknown: black is assumed, white for photos with a white border")
-    return facts | {"warnings": warnings}
+        yield "the background is unknown: black is assumed, white for photos with a white border"
 
 
 def _training_size(path: Path, scene: GaussianScene) -> dict[str, Any]:

@@ -81,6 +81,7 @@ def _drawn(found: CoverageMap, loaded: LoadedScene) -> bytes:
     from service.coverage.plan_drawing import drawn_plan
 
     scene, origin = loaded.searched, np.array(loaded.scene.info.origin_in_world)
+    # Faint Gaussians are haze and floaters, which in plan view would cover the walls.
     opaque = scene.means[scene.opacities > 0.3].astype(np.float64) + origin
     cameras = [named.camera.pose.position_in_world + origin for named in scene.cameras]
     return drawn_plan(found, opaque, np.array(cameras).reshape(-1, 3), scene.info.metres_per_unit)

@@ -76,17 +76,13 @@ def register_scene(
     axis = unit_vector(parsed_option(up, "--up"), "--up") if up else None
     options = GatherOptions(axis, metres_per_unit, drift)
     picked = scene_points.read(parsed_option(points, "--points"), "--points") if points else None
+    if onto is not None and (photos or places or picked):
+        raise InvalidRequest("needs no photos, places or points.", where="--onto")
     if onto is not None:
-        if photos or places or picked:
-            raise InvalidRequest("needs no photos, places or points.", where="--onto")
         found = _by_scene(scene, onto, matcher, count, options)
     else:
         known, chosen = _known_photos(photos or [], places, parsed_option(times, "--times"), geoid_m)
-        if not chosen and picked is None:
-            raise InvalidRequest(
-                "nothing to register by.", where="photos", hint="Name photos, --places with photos, or --points."
-            )
-        found = _by_photos(scene, known, chosen[:: max(1, -(-len(chosen) // count))], picked, matcher, options)
+        found = _by_photos(scene, known, chosen, picked, count, matcher, options)
     if not dry_run:
         found = file.add(found)
     _show(found, None if dry_run else file.path, as_json=as_json)
@@ -97,9 +93,16 @@ def _by_photos(
     known: KnownPlaces,
     chosen: Sequence[tuple[KnownPlace, Path]],
     picked: ScenePoints | None,
+    count: int,
     matcher: str,
     options: GatherOptions,
 ) -> Registration:
+    """Register the scene by picked points and by photos, of which it localizes `count`. Raises InvalidRequest."""
+    if not chosen and picked is None:
+        raise InvalidRequest(
+            "nothing to register by.", where="photos", hint="Name photos, --places with photos, or --points."
+        )
+    chosen = chosen[:: max(1, -(-len(chosen) // count))]
     # Points that are picked by hand need no view index, which takes the longest.
     loaded = loaded_scene(scene, "view_index" if chosen else None, matcher)
     localized, missed = _localized(chosen, loaded)
@@ -193,11 +196,11 @@ def _localized(
     found, missed = [], []
     for place, path in track(chosen, "photos", console=err, transient=True):
         opened = open_photo(read_file(path))
-        camera, told = opened.camera, place.intrinsics
+        camera, stated = opened.camera, place.intrinsics
         # A photo that was resized or turned after its intrinsics were written has others.
-        if told is not None and (told.width, told.height) != (camera.width, camera.height):
-            told = None
-        intrinsics = told and oriented(told, *ORIENTATIONS[camera.orientation])
+        if stated is not None and (stated.width, stated.height) != (camera.width, camera.height):
+            stated = None
+        intrinsics = stated and oriented(stated, *ORIENTATIONS[camera.orientation])
         query = opened.query(intrinsics=intrinsics, background_rgb=loaded.scene.info.background_rgb)
         estimate = localize(query, loaded)
         if estimate.verdict.status is Status.LOCALIZED:
@@ -227,6 +230,7 @@ def _registered(
     above = np.mean(cameras, axis=0) if cameras else np.median(scene.means, axis=0).astype(np.float64)
     above = above + scene.info.origin_in_world
     evidence, origin = gathered(known, localized, picked, scene.info, above, options)
+    # A fixed seed: the same places lead to the same registration.
     found = register(evidence, np.random.default_rng(0))
     return replace(found, origin=origin, source=known.kind, scene_sha256=scene.info.sha256, created=time.time())
 

@@ -24,6 +24,7 @@ from service.errors import InvalidRequest
 from service.logs import json_handler
 from service.web.api_keys import KeyRing
 from service.web.app import create_app, data_folder
+from service.web.routes.dependencies import AppState
 from service.web.settings import CONFIG_HOME, DATA_HOME, Settings, is_loopback, unknown_variables
 
 _CONNECTIONS_S = 3
@@ -54,21 +55,7 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
             pass
         # After the port: the viewer gets the address of the service.
         application = create_app(settings, keys=keys)
-        server = uvicorn.Server(
-            uvicorn.Config(
-                application,
-                log_config=None,
-                log_level="warning",
-                access_log=False,
-                server_header=False,
-                ws="websockets-sansio",
-                ws_max_size=2**26,
-                ws_per_message_deflate=False,  # scenes are sent whole: compressing them costs more than it saves
-                timeout_graceful_shutdown=_CONNECTIONS_S,
-                ssl_certfile=settings.certificate if settings.https else None,
-                ssl_keyfile=settings.certificate_key if settings.https else None,
-            )
-        )
+        server = _server(application, settings)
         logging.getLogger("service").setLevel(logging.INFO)
         # A lasting key isn't known here, only its hash.
         shell_key = key or ("$SPLATFIX_KEY" if keys else "")
@@ -78,6 +65,25 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
         # and behind another session each of them would wait for so long.
         sys.setswitchinterval(0.0005)
         server.run(sockets=[listener])
+
+
+def _server(application: FastAPI, settings: Settings) -> uvicorn.Server:
+    return uvicorn.Server(
+        uvicorn.Config(
+            application,
+            # Its lines go through this process' handlers, like all others.
+            log_config=None,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            ws="websockets-sansio",
+            ws_max_size=2**26,
+            ws_per_message_deflate=False,  # scenes are sent whole: compressing them costs more than it saves
+            timeout_graceful_shutdown=_CONNECTIONS_S,
+            ssl_certfile=settings.certificate if settings.https else None,
+            ssl_keyfile=settings.certificate_key if settings.https else None,
+        )
+    )
 
 
 def _with_certificate(settings: Settings) -> Settings:
@@ -139,14 +145,7 @@ def _announce(
     `keys` are the key that was made for this run, and what the example takes as a key; each empty if there is none.
     """
     key, shell_key = keys
-    with err.status("starting") as status:
-        # uvicorn has no event for it; the app makes its state while it starts.
-        while not server.started:
-            time.sleep(0.05)
-        app_state = application.state.app_state
-        while pending := app_state.engine.readiness().pending:
-            status.update(", ".join(map(str, pending)))
-            time.sleep(0.1)
+    app_state = _ready_state(server, application, err)
     readiness, url = app_state.engine.readiness(), settings.loopback_url
     query = f"?key={key}" if key else ""
     for reason in readiness.failed:
@@ -159,20 +158,40 @@ def _announce(
     ]
     if settings.https:
         lines += _https_lines(settings, query)
-    scenes = app_state.engine.scenes()
-    ready = [scene.id for scene in scenes if scene.state == "ready"]
     if key:
         lines += ["The key was made for this run only; `splatfix keys add NAME` makes lasting ones."]
-    contents = app_state.engine.contents(ready[0]) if ready else None
-    if ready and contents:
-        stored = app_state.scene_store.find(ready[0])
-        # With one scene a request need not name it: a shorter example.
-        named = ready[0] if len(scenes) > 1 else ""
-        example = curl_line(url, stored and stored.path, contents.cameras, scene_id=named, key=shell_key)
-        if certificate := _local_certificate(settings):
-            example = example.replace("curl ", f"curl --cacert {certificate} ", 1)
+    if example := _example(app_state, settings, shell_key):
         hint = " (SPLATFIX_KEY: a key from `splatfix keys add NAME`)" if shell_key and not key else ""
         lines += [f"Try it{hint}:", f"  {example}"]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     if browser:
         webbrowser.open(f"{url}/{query}")
+
+
+def _ready_state(server: uvicorn.Server, application: FastAPI, err: Console) -> AppState:
+    """Wait until the scenes that are required are in memory; return the app's state."""
+    with err.status("starting") as status:
+        # uvicorn has no event for it; the app makes its state while it starts.
+        while not server.started:
+            time.sleep(0.05)
+        app_state: AppState = application.state.app_state
+        while pending := app_state.engine.readiness().pending:
+            status.update(", ".join(map(str, pending)))
+            time.sleep(0.1)
+    return app_state
+
+
+def _example(app_state: AppState, settings: Settings, key: str) -> str:
+    """Return a command that localizes a photo in the first scene that is ready; empty if there is none."""
+    scenes = app_state.engine.scenes()
+    ready = [scene.id for scene in scenes if scene.state == "ready"]
+    contents = app_state.engine.contents(ready[0]) if ready else None
+    if contents is None:
+        return ""
+    stored = app_state.scene_store.find(ready[0])
+    # With one scene a request need not name it: a shorter example.
+    named = ready[0] if len(scenes) > 1 else ""
+    example = curl_line(settings.loopback_url, stored and stored.path, contents.cameras, scene_id=named, key=key)
+    if certificate := _local_certificate(settings):
+        example = example.replace("curl ", f"curl --cacert {certificate} ", 1)
+    return example
