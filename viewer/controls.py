@@ -39,6 +39,13 @@ class Controls:
             # A script of the relay follows data-splatfix on a click; `href` would leave a service below a sub-path.
             "<a href='/' data-splatfix='./' style='padding:0 .6em;font-size:.9em'>← Start page</a>"
         )
+        self._add_job(gui)
+        self._add_view(gui)
+        self._add_layers(gui, splats)
+        self._add_window(gui)
+
+    def _add_job(self, gui: viser.GuiApi) -> None:
+        """Add what chooses a job and one of its steps, and shows that step's figures."""
         self.jobs = gui.add_dropdown("job", (NO_JOB,), initial_value=NO_JOB)
         self.newest = gui.add_checkbox("follow newest job", True, hint="Switch to each new job as it appears.")
         self.scenes = gui.add_dropdown("scene", (NO_SCENE,), initial_value=NO_SCENE)
@@ -48,6 +55,9 @@ class Controls:
         self.play = gui.add_button_group("", (PREVIOUS, PLAY, NEXT))
         self.speed = gui.add_dropdown("steps per second", _SPEEDS, initial_value="2")
         self.numbers = gui.add_html("")
+
+    def _add_view(self, gui: viser.GuiApi) -> None:
+        """Add what moves the camera, picks points, and makes files."""
         self.look_through = gui.add_button("look through this camera", disabled=True)
         self.fly = gui.add_button("fly to result", disabled=True)
         self.photo_opacity = gui.add_slider(
@@ -62,6 +72,9 @@ class Controls:
         self.use_view = gui.add_button("use this view as prior", hint="For the next photo: a pose to start from.")
         self.prior = gui.add_html("")
         self.replay = gui.add_button(_REPLAY_LABEL, disabled=True, hint=_REPLAY_HINT)
+
+    def _add_layers(self, gui: viser.GuiApi, splats: bool) -> None:
+        """Add what decides what is drawn."""
         with gui.add_folder("show"):
             shown = {"splats": splats} | dict.fromkeys(HIDDEN_AT_FIRST, False)
             self.layers = {layer: gui.add_checkbox(layer, shown.get(layer, True)) for layer in get_args(LayerName)}
@@ -75,9 +88,9 @@ class Controls:
             )
             self.legend = gui.add_html("")
             self.scene = gui.add_html("")
-        self._add_window(gui)
 
     def _add_window(self, gui: viser.GuiApi) -> None:
+        """Add the window of images, match vectors and curves."""
         # Hidden until there is an image to show.
         self.window = gui.add_panel(visible=False)
         with self.window.add_tab("photo and render"):

@@ -116,19 +116,15 @@ def run(
     )
     bench_scene = with_modified_scene(bench_scene, modify_scene, seed, matcher, cache_dir)
     digest = digested(bench_scene, data or folder) if photos else {}
-    # Preparing is a matter of the scene, and its time isn't a photo's.
-    began = time.perf_counter()
-    bench_scene.loaded.prepare(estimator)
-    prepare_s = time.perf_counter() - began
+    prepare_s = _prepared(bench_scene.loaded, estimator)
     todo = list(make_trials(bench_scene, start, trials * len(bench_scene.photos), seed, tuple(modify), occluders))
     limits = {"budget_s": budget.seconds, "budget_renders": budget.renders}
     info = bench_scene.loaded.scene.info
     accuracy = accuracy.in_units(info.name, info.metres_per_unit)
     request = Request(estimator=estimator, options=chosen_options, seed=seed, accuracy=accuracy, **limits)
-    rasterizer = bench_scene.loaded.rasterizer
 
     def asked_at(trial: Trial) -> tuple[float, float]:
-        return asked_bounds(accuracy, trial.truth, rasterizer, bench_scene.units)
+        return asked_bounds(accuracy, trial.truth, bench_scene.loaded.rasterizer, bench_scene.units)
 
     def localize_one(trial: Trial) -> PoseEstimate:
         return localize_trial(bench_scene, trial, request, intrinsics)
@@ -143,14 +139,15 @@ def run(
     settings |= {"modify_scene": list(modify_scene)}
     settings |= {"options": dataclasses.asdict(chosen_options), "budget": dataclasses.asdict(budget)}
     settings |= {"accuracy": dataclasses.asdict(accuracy)}
-    facts = {
-        "scene": bench_scene.loaded.scene.info.name,
-        **settings,
-        **_facts(bench_scene),
-        **digest,
-        "prepare_s": prepare_s,
-    }
+    facts = {"scene": info.name, **settings, **_facts(bench_scene), **digest, "prepare_s": prepare_s}
     return {**facts, **summary(outcomes), "per_query": per_query}
+
+
+def _prepared(loaded: LoadedScene, estimator: str) -> float:
+    """Prepare the scene for the estimator; return the seconds, which are no photo's."""
+    began = time.perf_counter()
+    loaded.prepare(estimator)
+    return time.perf_counter() - began
 
 
 def digested(bench_scene: BenchScene, data: Path) -> dict[str, float]:

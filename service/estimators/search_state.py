@@ -20,16 +20,9 @@ from service.pose.features.mirrored_query import mirrored_query
 from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, ViewRenderer, camera_of, in_batches
 from service.pose.matching.match_stages import match_candidates
-from service.pose.refinement.refine_stage import (
-    RefinedPose,
-    refine_stage,
-    rematch_and_refine,
-)
+from service.pose.refinement.refine_stage import RefinedPose, refine_stage, rematch_and_refine
 from service.pose.refinement.refinement_config import RefinementConfig
-from service.pose.retrieval.ambiguous_hypotheses import (
-    PoseAtDistance,
-    ambiguous_hypotheses,
-)
+from service.pose.retrieval.ambiguous_hypotheses import PoseAtDistance, ambiguous_hypotheses
 from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.scores import top_indices
@@ -156,18 +149,19 @@ class SearchState:
         return self.colour_edges_at(found) < self.config.least_colour_edges
 
     def appearance_at(self, found: RefinedPose) -> dict[str, float]:
-        """Return how alike photo and render are at a pose."""
-        images = self.images.corrected(found.correction)
-        rendered, _ = found.view_at_pose(images, self.renderer)
-        size = rendered.camera.intrinsics
-        return appearance(images.resized(size), rendered.frame, images.valid_mask(size))
+        """Return how alike photo and render are at a pose, by signal."""
+        return self._compared_at(found, appearance)
 
     def colour_edges_at(self, found: RefinedPose) -> float:
         """Return the correlation of the edges in colour of photo and render at a pose."""
+        return self._compared_at(found, colour_edge_correlation)
+
+    def _compared_at(self, found: RefinedPose, compare: Callable[..., Result]) -> Result:
+        """Return how a function of photo, render and valid mask compares them at a pose."""
         images = self.images.corrected(found.correction)
         rendered, _ = found.view_at_pose(images, self.renderer)
         size = rendered.camera.intrinsics
-        return colour_edge_correlation(images.resized(size), rendered.frame, images.valid_mask(size))
+        return compare(images.resized(size), rendered.frame, images.valid_mask(size))
 
     def with_answer(self, record: IterationRecord) -> IterationRecord:
         """Return the record with the best answer so far in place of its own pose."""

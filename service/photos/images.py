@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from PIL import ExifTags, Image
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -25,8 +25,9 @@ from PIL.WebPImagePlugin import WebPImageFile
 from service.errors import InvalidImage
 from service.photos.camera_identity import CameraIdentity, exif_focal_prior, identity_from_exif
 from service.photos.decode_config import DEFAULTS
+from service.photos.decoded_pixels import DecodedPixels
 from service.photos.heic import decode_heic
-from service.photos.intrinsics import ORIENTATIONS, UPRIGHT, require_size, undistorted
+from service.photos.intrinsics import ORIENTATIONS, require_size, undistorted
 from service.photos.jpeg_scans import count_scans
 from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
 
@@ -76,7 +77,7 @@ class OpenedPhoto:
     """Of its format."""
     image: Image.Image
     camera: CameraIdentity
-    """What the header tells of its camera."""
+    """Its camera, by the header."""
 
     @property
     def gps(self) -> dict[int, Any]:
@@ -123,11 +124,11 @@ def query_of(
     else:
         rgb = np.asarray(cv2.resize(rgb, target, interpolation=cv2.INTER_AREA))
     scale = (target[0] / width, target[1] / height)
-    return _query(_Decoded(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, lens_prior, prior)
+    return _query(DecodedPixels(rgb, None, width, height, scale, (0.0, 0.0), ()), None, intrinsics, lens_prior, prior)
 
 
 def _query(
-    decoded: _Decoded,
+    decoded: DecodedPixels,
     identity: CameraIdentity | None,
     intrinsics: Intrinsics | None,
     lens_prior: LensPrior | None,
@@ -228,36 +229,6 @@ def photo_size(data: bytes) -> tuple[int, int]:
     return (photo.height, photo.width) if transpose else photo.size
 
 
-@dataclass(frozen=True, slots=True)
-class _Decoded:
-    rgb: UInt8[np.ndarray, "h w 3"]
-    """Upright, reduced."""
-    valid_mask: Bool[np.ndarray, "h w"] | None
-    """False where the photo is transparent; None: nowhere."""
-    width: int
-    """Of the upright photo in its full size."""
-    height: int
-    scale: tuple[float, float]
-    """Pixels of `rgb` per pixel of the photo."""
-    offset: tuple[float, float]
-    """Pixels of `rgb` at which the photo's corner lies: not exactly 0 after JPEG's reduction and a mirroring."""
-    warnings: tuple[str, ...]
-    upright_from_stored: tuple[bool, bool, bool] = UPRIGHT
-
-    def camera(self, photo: Intrinsics) -> Intrinsics:
-        """Return the camera of `rgb` for that of the photo."""
-        (sx, sy), (ox, oy) = self.scale, self.offset
-        return replace(
-            photo,
-            width=self.rgb.shape[1],
-            height=self.rgb.shape[0],
-            fx=photo.fx * sx,
-            fy=photo.fy * sy,
-            cx=photo.cx * sx + ox,
-            cy=photo.cy * sy + oy,
-        )
-
-
 def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
     """Read the header and check the size. Raises InvalidImage."""
     if not data:
@@ -317,7 +288,7 @@ def _target(size: tuple[int, int], long_side: int) -> tuple[int, int]:
     return max(1, round(size[0] * factor)), max(1, round(size[1] * factor))
 
 
-def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float], long_side: int) -> _Decoded:
+def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, float], long_side: int) -> DecodedPixels:
     """Decode, reduce and turn upright, keeping track of where rays go. Raises InvalidImage."""
     raw_size = photo.size
     target = _target(raw_size, long_side)
@@ -352,7 +323,7 @@ def _decode(photo: Image.Image, name: str, background_rgb: tuple[float, float, f
     if transpose:
         scale, beyond, raw_size = scale[::-1], beyond[::-1], raw_size[::-1]
     upright = [_oriented(layer, transpose, mirror_x, mirror_y) for layer in layers]
-    return _Decoded(
+    return DecodedPixels(
         upright[0],
         upright[1] >= DEFAULTS.opaque if len(upright) > 1 else None,
         *raw_size,
