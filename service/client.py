@@ -677,7 +677,7 @@ class Client:
         return _document(self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
 
     def anchors(self, scene_id: str) -> dict[str, np.ndarray]:
-        """Return the positions of a scene's named points in its world, by name; results tell where photos see them."""
+        """Return the positions of a scene's named points in its world, by name; results have their pixels."""
         return _anchors(self._json(f"/scenes/{scene_id}/anchors"))
 
     def put_anchor(self, scene_id: str, name: str, position: Sequence[float]) -> None:

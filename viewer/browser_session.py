@@ -103,7 +103,7 @@ class BrowserSession:
         try:
             action()
         except (ServiceError, ValueError) as error:
-            # A browser that has left is told nothing: requests under way end with its client.
+            # A browser that has left shows nothing: requests under way end with its client.
             if self._queue.closed:
                 return
             log.warning("%s", error)

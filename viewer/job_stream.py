@@ -132,17 +132,17 @@ class JobStream:
                     return
                 self._stop.wait(_RETRY_S)
 
-    def _append(self, said: api.Record | api.Job | None) -> None:
-        if said is None:  # a ping, or the end of an attempt
+    def _append(self, value: api.Record | api.Job | None) -> None:
+        if value is None:  # a ping, or the end of an attempt
             return
-        if isinstance(said, api.Job):
-            self.job, self.complete = job_of(said), True
+        if isinstance(value, api.Job):
+            self.job, self.complete = job_of(value), True
             if self.job.photo_step is not None:
                 self._photo_requested = False  # while the job ran, the service returned the photo of another step
         else:
-            record = record_of(said)
-            if said.attempt != self.attempt:
-                self._restart(said.attempt)
+            record = record_of(value)
+            if value.attempt != self.attempt:
+                self._restart(value.attempt)
             if record.index != len(self.records):  # a stream that was resumed repeats the records from the first on
                 return
             self.records.append(record)

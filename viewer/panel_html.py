@@ -52,7 +52,7 @@ def headline_html(job: Job | None, records: int, error: str) -> str:
     title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
     link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>result page</a>"
     if job.outcome is None:
-        # The job was read when its stream began: that it runs meanwhile only its records tell.
+        # The job was read when its stream began: that it runs meanwhile only its records show.
         word = "queued" if not records else "running"
         return _block(_badge(word, PENDING_COLOUR), f"{records} steps so far", title, link=link)
     outcome = job.outcome

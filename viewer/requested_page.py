@@ -1,4 +1,4 @@
-"""What a browser has opened: the job, and what its page tells of the browser (`service/web/static/viewer.js`)."""
+"""What a browser has opened: the job, and what its page reports of the browser (`service/web/static/viewer.js`)."""
 
 from __future__ import annotations
 

@@ -43,8 +43,8 @@ def local_addresses() -> list[str]:
 def local_certificate(folder: Path, names: Sequence[str]) -> CertificateFiles:
     """Return a self-signed certificate for these names and addresses, and this machine's own.
 
-    It is kept in the folder, so that what a browser was told to accept stays the same, and made anew if it lacks a name
-    or ends soon. Raises BackendMissing without the package cryptography, StorageFailed.
+    It is kept in the folder, so that what a browser has accepted stays the same, and made anew if it lacks a name or
+    ends soon. Raises BackendMissing without the package cryptography, StorageFailed.
     """
     wanted = sorted({*names, "localhost", "127.0.0.1", "::1", socket.gethostname()})
     files = CertificateFiles(folder / "certificate.pem", folder / "key.pem")

@@ -38,7 +38,7 @@ class PlanConfig:
     the viewing directions, that count as 1 in the novelty."""
     novel_chord: float = 0.5
     render_px: int = 64
-    """Long side of the renders that tell whether a place sees the scene."""
+    """Long side of the renders by which it is decided whether a place sees the scene."""
     min_distance: float = 0.06
     """What is nearer than this share of the distance blocks the view."""
     min_solid_share: float = 0.3

@@ -122,6 +122,8 @@ AROUND = ("prior", "scene")
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
+    """What is computed once for a scene."""
+
     focus: Focus
     pruned: Rasterizer
     """Of the pruned scene, for the hypotheses."""

@@ -56,8 +56,8 @@ def _verdict(verdict: Verdict, found: PatchPose) -> Verdict:
     """Return the verdict with the covariance of patches and pixels, unless more than these makes the pose uncertain."""
     if verdict.asked is None or verdict.intrinsics_untested or verdict.shutter_motion:
         return verdict
-    told = replace(verdict, covariance=found.covariance)
+    refined = replace(verdict, covariance=found.covariance)
     if verdict.status is not Status.LOCALIZED:
-        return told
+        return refined
     precise = probability_within(found.covariance, *verdict.asked)
-    return replace(told, precise=precise, score=verdict.place_probability * precise)
+    return replace(refined, precise=precise, score=verdict.place_probability * precise)

@@ -23,6 +23,8 @@ from service.results import IterationRecord, Status, Verdict
 
 @dataclass(frozen=True, slots=True)
 class ShutterCheckConfig:
+    """When a photo is taken for one that was read row by row while the camera turned."""
+
     max_rounds: int = 5
     """Refinements; one step of the normal equations is a half of the motion and more."""
     settled: float = 0.0005

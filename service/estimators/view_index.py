@@ -216,7 +216,7 @@ def _search_free_views(
             untried.popleft()
             yield view
 
-    # The last views there are: of few matches, too, a render at the pose tells whether they are chance.
+    # The last views there are: of few matches, too, a render at the pose shows whether they are chance.
     return (yield from _match_and_refine(views(), variant, state, min_share=0.0))
 
 

@@ -163,6 +163,7 @@ class PostgresListener:
         self._closed = False
 
     def wait(self, seconds: float) -> set[str]:
+        """Return the ids of changed jobs, as `JobWatch.wait`. Raises StorageFailed without the server."""
         try:
             connection = self._connection or self._connect()
             # What has come by the first one's time comes with it.
@@ -172,6 +173,7 @@ class PostgresListener:
             raise StorageFailed("the service can't listen to its database.") from None
 
     def close(self) -> None:
+        """Close the connection, which ends `wait`."""
         self._closed = True
         self._disconnect()
 

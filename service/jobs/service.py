@@ -24,6 +24,7 @@ from service.errors import (
     RecordNotFound,
     StorageFailed,
 )
+from service.jobs.acceptance import Acceptance
 from service.jobs.config import JobsConfig, Observer
 from service.jobs.engine import Engine
 from service.jobs.job_order import JobOrder

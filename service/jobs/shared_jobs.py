@@ -59,7 +59,7 @@ class SharedJobs:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop listening; those who follow jobs are told that it is over here."""
+        """Stop listening; for those who follow jobs it is over here."""
         self._closing.set()
         self._watch.close()
         with self._lock:

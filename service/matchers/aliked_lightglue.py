@@ -12,6 +12,8 @@ WEIGHTS = ("aliked-n16.pth", "aliked_lightglue.pth")
 
 
 class AlikedLightGlue:
+    """Implements `Matcher` by ALIKED's features (Zhao et al. 2023) and LightGlue (Lindenberger et al. 2023)."""
+
     name = "aliked_lightglue"
 
     def __init__(self) -> None:

@@ -12,6 +12,8 @@ WEIGHTS = ("depth-save.pth", "disk_lightglue.pth")
 
 
 class DiskLightGlue:
+    """Implements `Matcher` by DISK's features (Tyszkiewicz et al. 2020) and LightGlue (Lindenberger et al. 2023)."""
+
     name = "disk_lightglue"
 
     def __init__(self) -> None:

@@ -16,6 +16,8 @@ WEIGHTS = ("loftr_outdoor.ckpt",)
 
 
 class Loftr:
+    """Implements `ImageMatcher` by LoFTR (Sun et al. 2021), a network without a detector."""
+
     name = "loftr"
 
     def __init__(self) -> None:

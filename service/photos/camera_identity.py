@@ -23,7 +23,7 @@ _SAME_ASPECT = 0.01
 
 @dataclass(frozen=True, slots=True)
 class CameraIdentity:
-    """What a photo's header tells of its camera: by this, photos of one camera in one setting are recognized."""
+    """A photo's camera by its header: by this, photos of one camera in one setting are recognized."""
 
     width: int
     """Of the photo as it is stored, before its EXIF orientation is applied."""

@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class VideoFrame:
+    """One decoded frame."""
+
     number: int
     """In the file, from 0."""
     time_s: float

@@ -126,7 +126,7 @@ def _small_sample_factor(fit: Fit, evidence: Evidence, used: Sequence[int]) -> f
     ]
     if not unsure:
         return 1.0
-    # A normal distribution's region is too small where few residuals have told the noise.
+    # A normal distribution's region is too small where the noise was estimated from few residuals.
     unknowns = free_parameters(evidence)
     # Each kind's variance is estimated by itself: the one that is known worst counts.
     freedom = max(min(fit.redundancy(kind) for kind in unsure), 1.0)

@@ -68,7 +68,7 @@ def _extracted(path: Path, folder: Path) -> dict[str, Any]:
 
 
 def checked_answer(answer: dict[str, Any], where: str) -> dict[str, Any]:
-    """Return what the other process tells. Raises what it reports: CorruptScene, UnsupportedFormat."""
+    """Return the other process' answer. Raises the error that it reports: CorruptScene, UnsupportedFormat."""
     if "unsupported" in answer:
         raise UnsupportedFormat(answer["unsupported"], where=where, hint="Export the scene as .ply.")
     if "error" in answer:

@@ -26,14 +26,14 @@ _PREFIXES = ("_model.gauss_params.", "_model.")
 
 
 def main() -> None:
-    """Load the file and tell what was found."""
+    """Load the file and print what was found."""
     path, folder, most = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     warnings.simplefilter("ignore")
     sys.stdout.write(json.dumps(extracted(path, folder, most)))
 
 
 def extracted(path: Path, folder: Path, most: int) -> dict[str, object]:
-    """Write the arrays and return what is told."""
+    """Write the arrays and return what is printed."""
     version = tuple(int(part) for part in torch.__version__.split(".")[:2])
     if version < _MINIMUM:
         return {"unsupported": f"checkpoints need PyTorch 2.10 or later; this is {torch.__version__}."}

@@ -30,6 +30,8 @@ _MAX_NAME_BYTES = 255
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
+    """What a folder's `scene.json` says; None: it says nothing."""
+
     name: str | None = None
     file: str | None = None
     """Of the scene, where the folder has several candidates."""

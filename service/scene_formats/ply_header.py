@@ -31,6 +31,8 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 
 @dataclass(frozen=True, slots=True)
 class PlyElement:
+    """One element of a header: so many records with the same properties."""
+
     name: str
     count: int
     dtype: np.dtype | None
@@ -41,6 +43,8 @@ class PlyElement:
 
 @dataclass(frozen=True, slots=True)
 class PlyHeader:
+    """A file's header, and where its records begin."""
+
     elements: tuple[PlyElement, ...]
     comments: tuple[str, ...]
     data_offset: int

@@ -21,7 +21,7 @@ _SPLAT_RECORD_BYTES = 32
 def estimated_bytes(path: Path) -> int | None:
     """Return the memory of a scene folder or file once it is loaded, within some per cent.
 
-    None where the header doesn't tell it: of compressed formats, and of files that loading will refuse.
+    None where the header doesn't have it: of compressed formats, and of files that loading will refuse.
     """
     try:
         file, _ = scene_file(path, read_manifest(path) if path.is_dir() else Manifest())

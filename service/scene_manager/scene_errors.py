@@ -1,4 +1,4 @@
-"""The errors of requests that name a scene: the same from every engine, so that clients can't tell one from another."""
+"""The errors of requests that name a scene: every engine answers with the same."""
 
 from __future__ import annotations
 

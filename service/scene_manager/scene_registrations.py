@@ -50,7 +50,7 @@ class SceneRegistrations:
 
 
 def registered_info(info: SceneInfo, registration: Registration | None) -> SceneInfo:
-    """Return what is known of a scene, with what its registration tells in place of the manifest's."""
+    """Return what is known of a scene, with what its registration determines in place of the manifest's."""
     if registration is None:
         return info
     up = registration.up_in_world

@@ -16,6 +16,8 @@ REFINING = ("l1", "blur", "relative", "l2", "feature", "corner")
 
 @dataclass(frozen=True, slots=True)
 class Claim:
+    """A claim of the paper, and whether the results support it."""
+
     statement: str
     """Source and content."""
     finding: str

@@ -25,6 +25,8 @@ METHODS = ("inerf", "inerf_dagger", "icomma", "mc_do", "view_index")
 
 @dataclass(frozen=True, slots=True)
 class FigureConfig:
+    """Poses that the figures show."""
+
     rotation_deg: float = 20.0
     """Figure 1 (a): about the scene's centre..."""
     translation_units: float = 0.35

@@ -49,6 +49,8 @@ STUDIES = StudyConfig()
 
 @dataclass(frozen=True, slots=True)
 class Method:
+    """An estimator with options, as a row of the tables."""
+
     name: str
     estimator: str
     changed: Mapping[str, Any] = field(default_factory=dict)

@@ -47,6 +47,8 @@ ERRORS = ("rotation_deg", "translation_units")
 
 @dataclass(frozen=True, slots=True)
 class Table:
+    """A table of the paper, or of this page."""
+
     name: str
     title: str
     notes: tuple[str, ...]

@@ -11,6 +11,8 @@ from jaxtyping import Float32, Float64, Int64
 
 @dataclass(frozen=True, slots=True)
 class WordsConfig:
+    """The visual vocabulary."""
+
     words: int = 1024
     sample: int = 15_000
     """Descriptors that the words are clustered from."""

@@ -29,6 +29,8 @@ BEHIND_PX = 1e6
 
 @dataclass(frozen=True, slots=True)
 class DecoupledConfig:
+    """How rotation and translation are solved for in turn."""
+
     steps: int = 20
     """Alternations on one render's matches."""
     min_points: int = 6
@@ -50,6 +52,8 @@ DECOUPLED = DecoupledConfig()
 
 @dataclass(frozen=True, slots=True)
 class DecoupledSolution:
+    """A pose, and how far each match agrees with it."""
+
     pose: Pose
     weights: Float64[np.ndarray, "n"]
     """0..1, of the matches at the pose."""

@@ -12,6 +12,8 @@ from service.types import BoxPrior, GaussianPosePrior, Pose, PriorRegion
 
 @dataclass(frozen=True, slots=True)
 class PriorRegionConfig:
+    """When a pose is outside of a prior's region, and how much nearer poses from matches alone may be."""
+
     max_squared_mahalanobis: float = 22.46
     """Poses beyond it are outside a Gaussian: the 99.9 % quantile of chi-square with 6 degrees of freedom."""
     slack_deg: float = 3.0

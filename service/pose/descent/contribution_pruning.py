@@ -19,6 +19,8 @@ from service.types import SH_C0, Camera, GaussianScene
 
 @dataclass(frozen=True, slots=True)
 class PruningConfig:
+    """How many Gaussians are kept, and where contributions are measured."""
+
     kept_share: float = 0.95
     """Of all contribution. Measured: 34 % of a chair's Gaussians remain, 2.4 times faster, 40 dB against all."""
     num_views: int = 24

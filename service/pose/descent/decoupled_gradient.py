@@ -29,6 +29,8 @@ from service.types import Pose
 
 @dataclass(frozen=True, slots=True)
 class DecoupledGradientConfig:
+    """Steps of Adam on the match vectors' angles and lengths."""
+
     steps: int = 15
     """Of Adam, on one render's matches."""
     rate: float = 0.05

@@ -35,6 +35,8 @@ NORMAL_DISTANCE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class DescentConfig:
+    """Adam's rates."""
+
     rate: float = 2e-3
     """Adam's at the first step: rad, and shares of the focus' distance."""
     end_rate: float = 1e-5
@@ -54,6 +56,8 @@ def require_within(options: object, limits: Mapping[str, tuple[float, float]]) -
 
 @dataclass(frozen=True, slots=True)
 class DescentStep:
+    """One step of a descent."""
+
     pose: Pose
     loss: float
     """At the pose."""

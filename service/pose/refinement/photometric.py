@@ -42,6 +42,8 @@ class FinalLevel:
 
 @dataclass(frozen=True, slots=True)
 class RefinementResult:
+    """The camera that photometric refinement led to."""
+
     pose: Pose
     correction: IntrinsicsCorrection
     """Of the intrinsics that were given."""

@@ -50,6 +50,8 @@ class RefinementState:
 
 @dataclass(frozen=True, slots=True)
 class PyramidLevel:
+    """A photo and a render at one size: the pixels that count, with their scene points and derivatives."""
+
     photo: Float32[np.ndarray, "h w"]
     """Luma, 0..1; negative where invalid."""
     pixels: Int64[np.ndarray, "n"]

@@ -23,6 +23,10 @@ SHUTTER = slice(14, 16)
 
 @dataclass(frozen=True, slots=True)
 class ShutterMotion:
+    """The motion of the camera while its rows were read, as a shear and a stretch of the image, and what it means for
+    the pose.
+    """
+
     shear: float
     """Normalized units right per normalized unit down."""
     stretch: float

@@ -49,6 +49,8 @@ class PoseIfCropped:
 
 @dataclass(frozen=True, slots=True)
 class PoseUncertainty:
+    """How well a photo determines a refined pose: the step that is left, and the covariance."""
+
     last_step: Float64[np.ndarray, "6"]
     """The right twist (rad, scene units) by which refinement would still move the pose: refined = pose @ exp(twist)."""
     covariance: Float64[np.ndarray, "k k"]
@@ -56,7 +58,7 @@ class PoseUncertainty:
     given_lens: Float64[np.ndarray, "6 6"] | None = None
     """Covariance of the twist if the intrinsics were known; None: they are."""
     if_cropped: PoseIfCropped | None = None
-    """Of approximate intrinsics; None: they are exact, or a good source told the principal point."""
+    """Of approximate intrinsics; None: they are exact, or the principal point is from a good source."""
     focal_step: float = 0.0
     """By how much the logarithm of an approximate focal length would still change."""
     lens_fit: LensFit | None = None

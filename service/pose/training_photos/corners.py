@@ -15,6 +15,8 @@ from service.types import Camera
 
 @dataclass(frozen=True, slots=True)
 class CornerConfig:
+    """Which corners of a training photo are kept."""
+
     count: int = 400
     """Corners of a photo at most: a patch takes 400 bytes, and two thirds of them can be triangulated."""
     spacing_px: int = 8

@@ -31,6 +31,8 @@ from service.types import Camera, GaussianScene, NamedCamera, Pose
 
 @dataclass(frozen=True, slots=True)
 class DigestConfig:
+    """How many photos a digest is made of, and when it is believed."""
+
     max_photos: int = 300
     """Of more, every second, third... is read: neighbours in a video show the same, and each takes a megabyte here."""
     sample: int = 8
@@ -116,9 +118,9 @@ class PhotoDigest:
 
 def scene_key(scene: GaussianScene) -> str:
     """Return a hash of where the scene's Gaussians are, with the origin that their positions are relative to."""
-    told = hashlib.sha256(np.ascontiguousarray(scene.means).data)
-    told.update(np.asarray(scene.info.origin_in_world, np.float64).tobytes())
-    return told.hexdigest()
+    digest = hashlib.sha256(np.ascontiguousarray(scene.means).data)
+    digest.update(np.asarray(scene.info.origin_in_world, np.float64).tobytes())
+    return digest.hexdigest()
 
 
 def digest_of(

@@ -28,6 +28,8 @@ from service.types import Camera, Pose
 
 @dataclass(frozen=True, slots=True)
 class PatchPoseConfig:
+    """Which patches are looked for in a photo, and which places of them count."""
+
     min_photo_px: int = 520
     """Long side of a photo: one hardly larger than renders has no more detail than refinement has used."""
     max_patches: int = 600

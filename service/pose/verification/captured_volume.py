@@ -1,6 +1,6 @@
 """Whether a pose shows what was captured: surfaces that views of the scene's index see about as it does.
 
-A scene tells nothing of the back of its surfaces, nor of how they look much finer or coarser than in the photos; what
+A scene shows nothing of the back of its surfaces, nor of how they look much finer or coarser than in the photos; what
 it renders there is a guess of its trainer. Views of the index stand where photos were taken, or, in a scene without
 cameras, where its surfaces look like some.
 """

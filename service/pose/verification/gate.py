@@ -152,7 +152,7 @@ def _photometric_signals(
 
 
 def _lens_is_undecided(uncertainty: PoseUncertainty, distance: float, config: VerificationConfig) -> bool:
-    """Return whether the pixels don't tell if exact intrinsics are right: matches may."""
+    """Return whether the pixels don't show if exact intrinsics are right: matches may."""
     fit, test = uncertainty.lens_fit, config.refinement.lens_test
     if uncertainty.loss > test.suspicious_loss:
         return True

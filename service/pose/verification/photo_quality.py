@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 
 @dataclass(frozen=True, slots=True)
 class PhotoQualityConfig:
-    """From when on a photo is told to be bad; grey values are sRGB, 0..1."""
+    """From when on a photo counts as bad; grey values are sRGB, 0..1."""
 
     blur_window_px: int = 9
     long_side_px: int = 640

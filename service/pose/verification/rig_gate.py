@@ -52,7 +52,7 @@ def rig_verdict(
 ) -> Verdict:
     """Return the verdict on a rig's pose from those on its photos there.
 
-    `covariance` is of the pose of the camera that the verdict is told for, from all photos; `asked` are the bounds
+    `covariance` is of the pose of the camera that the verdict is on, from all photos; `asked` are the bounds
     there. `rival_share`: matches that agree with another pose of the rig, relative to those that agree with this one.
     """
     agree = [one for one in photos if _matches(one, config) and one.signals[LOCAL_COLOUR] >= config.min_colour]

@@ -119,8 +119,8 @@ class LocalizeFields(Model):
     estimated with the pose. Default: approximate intrinsics from earlier photos of the camera, the EXIF data, or a
     guess."""
     camera_id: str | None = Field(default=None, min_length=1, max_length=64, pattern=r"^[A-Za-z0-9._:@ -]+$")
-    """A name of yours for the camera: what its earlier photos told of the lens is the prior of this one's, even without
-    EXIF data. Of a phone name the phone: its lenses are told apart by EXIF data; without these name the lens."""
+    """A name of yours for the camera: the lens as estimated from its earlier photos is the prior of this one's, even
+    without EXIF data. Of a phone name the phone: EXIF data distinguish its lenses; without these name the lens."""
     prior: PriorIn | None = None
     accuracy: AccuracyIn | None = None
     """Default: within 5 degrees and 2 % of the distance to what is seen."""
