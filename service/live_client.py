@@ -132,6 +132,7 @@ class Live:
             try:
                 answer = self.answer()
             except LiveClosed as closed:
+                # The code of a session that was ended on purpose.
                 if closed.code == 1000:
                     return
                 raise
@@ -203,6 +204,6 @@ def _closed(error: ConnectionClosed) -> LiveClosed:
 def _problem(body: bytes | bytearray | None) -> Mapping[str, Any]:
     try:
         problem = json.loads(body or b"")
-    except ValueError:
+    except ValueError:  # a proxy's answer, which need not be JSON
         return {}
     return problem if isinstance(problem, dict) else {}

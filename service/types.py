@@ -148,6 +148,7 @@ class Intrinsics:
     def with_long_side(self, pixels: int) -> Intrinsics:
         """Return the camera for the image resampled so that its long side has `pixels`, never enlarged."""
         factor = min(1.0, pixels / self.long_side)
+        # A narrow strip keeps a pixel.
         return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
 
 

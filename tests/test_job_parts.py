@@ -13,6 +13,7 @@ from test_store_contracts import new_job, record, result
 
 from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound, SceneTooLarge, StorageFailed
 from service.jobs import photo_store, service, trajectory
+from service.jobs.acceptance import Acceptance
 from service.jobs.live_job import LiveJob
 from service.jobs.model import Batch, Ending
 from service.jobs.photo_store import FolderPhotoStore
@@ -178,6 +179,8 @@ def jobs() -> Any:
     made._store, made._live, made._shared = MemoryJobStore(), {}, None
     made._queue = SimpleNamespace(full=lambda: False, waiting=lambda: 7, stuck=lambda: 0)
     made._worker = SimpleNamespace(storage_error="")
+    made._acceptance = Acceptance.__new__(Acceptance)
+    made._acceptance._store, made._acceptance._queue = made._store, made._queue
     return made
 
 

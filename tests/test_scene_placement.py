@@ -400,6 +400,7 @@ def test_a_scene_that_fails_is_tried_again_after_5_seconds_then_10_and_300_at_mo
 
     clock = SimpleNamespace(now=1000.0, monotonic=lambda: clock.now)
     monkeypatch.setattr("service.jobs.scene_coordinator.time", clock)
+    monkeypatch.setattr("service.jobs.fleet_scenes.time", clock)
     with_fleet(check)
 
 

@@ -31,7 +31,7 @@ def bench_gate(
     if model:
         write_model(model_from_json(outcome["model"]), model)
     if plot:
-        from service.bench.paper.figures import reliability
+        from service.bench.paper.figures import reliability  # loads matplotlib
 
         plot.write_bytes(reliability({name: outcome[name]["reliability"] for name in ("with_matches", "photometric")}))
     for name in ("with_matches", "photometric", "tracked"):

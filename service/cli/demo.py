@@ -21,6 +21,7 @@ def demo(
     """Serve the demo scene on this machine."""
     from service.cli.server import run
 
+    # Whatever the settings say: the demo is for this machine, and needs no key.
     run(settings_of({"scenes": [demo_scene()], "host": "127.0.0.1", "port": port}), out, err, browser)
 
 

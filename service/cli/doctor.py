@@ -24,6 +24,7 @@ def doctor(
             compile_kernels()
     healthy = True
     with err.status("examining"):
+        # Each is printed as it is made: some take seconds.
         for finding in chain(findings(), fleet_findings(settings_of({}))):
             say(finding.line)
             healthy &= finding.ok or not finding.needed

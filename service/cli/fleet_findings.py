@@ -31,6 +31,7 @@ def _ray_findings(address: str | None) -> Iterator[Finding]:
 
 
 def _database_findings(address: str) -> Iterator[Finding]:
+    # Not above: the driver is there only where the extra is installed.
     try:
         from service.jobs.postgres_database import PostgresDatabase, unprotected
     except ImportError:

@@ -80,6 +80,7 @@ def _is_good(files: CertificateFiles, wanted: Sequence[str]) -> bool:
         found = x509.load_pem_x509_certificate(files.certificate.read_bytes())
         named = found.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except (ValueError, x509.ExtensionNotFound):
+        # Damaged, or another program's: it is made anew.
         return False
     known = {*named.get_values_for_type(x509.DNSName), *map(str, named.get_values_for_type(x509.IPAddress))}
     return set(wanted) <= known and found.not_valid_after_utc > datetime.now(UTC) + _RENEW

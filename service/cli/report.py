@@ -67,6 +67,7 @@ def report(
 
 
 def _parts(client: Client, job: str, scene: str, *, with_photo: bool) -> Iterator[tuple[str, Callable[[], bytes]]]:
+    # As functions: one that fails leaves the others.
     yield "trace.json", lambda: _json(client.trace(job))
     yield "scene.json", lambda: _json(client.scene(scene).raw)
     yield "render.jpg", lambda: client.step_render(job)

@@ -57,6 +57,7 @@ def write_frame_table(path: Path, frames: Sequence[FrameOut], *, smooth: bool = 
     for f, mark in (replaced.get(f.index, (f, "")) for f in frames):
         row = (f.name, f.time_s, f.status, f.reason, f.score, *_pose(f.world_from_camera), int(f.tracked))
         rows.append((*row, mark) if smooth else row)
+    # Names of columns stay as they are, since scripts read them: `followed` is `tracked` of the API.
     head = ("photo", "time_s", "status", "reason", "score", *_POSE_COLUMNS, "followed", *["smoothed"] * smooth)
     _write(path, head, rows)
 

@@ -24,6 +24,7 @@ def index_scene(
     from service.loaded_scene import DEFAULT_ESTIMATOR
 
     loaded = loaded_scene(scene, DEFAULT_ESTIMATOR)
+    # Prepared just now: this returns the index that is in memory.
     facts: dict[str, Any] = {"views": len(loaded.prepare(DEFAULT_ESTIMATOR).views)}
     if photos:
         from service.pose.training_photos.digest_file import DIGEST_FILE, write_digest

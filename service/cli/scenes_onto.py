@@ -60,6 +60,7 @@ def renders_in(
         estimate = localize(read_query(image, intrinsics=intrinsics, background_rgb=background), other)
         name = f"render {number}"
         if estimate.verdict.status is Status.LOCALIZED:
+            # No covariance: the scene was rendered at this very pose.
             found.append(LocalizedPhoto(name, _place(name, estimate), camera.pose, None))
         else:
             missed.append(f"{name} was not localized: {estimate.verdict.reason}.")

@@ -99,6 +99,7 @@ def scene_anchors(paths: Sequence[Path]) -> list[tuple[Anchor, ...]]:
     from service.scene_manager.anchor_store import FileAnchorStore
     from service.scene_manager.status import StoredScene
 
+    # By their paths: ids belong to a service.
     stored = {str(path): StoredScene(str(path), path) for path in paths}
     store = FileAnchorStore(stored.get, registrations_folder())
     return [store.anchors(scene_id) for scene_id in map(str, paths)]
@@ -108,6 +109,7 @@ def registrations_folder() -> Path:
     """Return the data folder, where registrations are that can't be beside their scenes."""
     from service.web.settings import DATA_HOME
 
+    # Where the service has it by default, so that both find the same registrations.
     return settings_of({}).data_dir or DATA_HOME
 
 

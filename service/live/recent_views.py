@@ -34,6 +34,7 @@ class RecentViews:
 
     def before_newest(self) -> list[tuple[LiveFrame, Pose]]:
         """Return the kept frames that differ from the newest one, newest first."""
+        # The newest itself is searched for with these: one that shows the same would add nothing.
         return [kept for kept in reversed(self._kept) if _differ(kept[1], self.newest)][:MOST]
 
 
