@@ -170,7 +170,7 @@ class PlantedTrial:
     def fit(self, candidate: Candidate, found: Evidence, *, verified: bool) -> tuple[str, bool]:
         return candidate.name, verified
 
-    def none(self, by: str) -> str:
+    def none(self, by: str, hint: str = "") -> str:
         return by
 
 
@@ -183,7 +183,9 @@ def decided(monkeypatch: pytest.MonkeyPatch, *, cameras: int = 4, gaussians: int
     }
     PlantedTrial.flat, PlantedTrial.asked = set(flat), []
     monkeypatch.setattr(camera_fit, "_Trial", PlantedTrial)
-    tried = [Candidate("")] + [Candidate(name, is_normalization=name.startswith("n")) for name in names]
+    tried = [Candidate("")] + [
+        Candidate(name, is_normalization=name.startswith("n"), is_measured=name == "measured") for name in names
+    ]
     monkeypatch.setattr(camera_fit, "candidates", lambda file: tried)
     file: Any = SimpleNamespace(cameras=("camera",) * cameras, stated=())
     raw: Any = SimpleNamespace(means=np.zeros((gaussians, 3)))
@@ -231,6 +233,9 @@ def test_what_is_alike_is_compared_again_and_the_simpler_is_taken(monkeypatch: p
 def test_a_correction_must_correlate_clearly_and_cameras_as_they_are_need_less(monkeypatch) -> None:
     assert decided(monkeypatch, as_is=0.0, a=0.33) == ("a", True)
     assert decided(monkeypatch, as_is=(0.1, 0.0), a=0.32) == "their photos"
+    # What localizing the photos has told needs no more than cameras as they are.
+    assert decided(monkeypatch, as_is=(0.1, 0.0), measured=0.2) == ("measured", True)
+    assert decided(monkeypatch, as_is=(0.1, 0.0), measured=0.19) == "their photos"
     assert decided(monkeypatch, as_is=(0.1, 0.2), a=0.1) == ("", True)
     assert decided(monkeypatch, as_is=(0.1, 0.19), a=0.1) == "their photos"
     # Of a plausible geometry, and no worse than the best by more than 0.03, they stay in doubt.

@@ -134,7 +134,7 @@ def found_camera_frame(
         len(used),
         len(localized),
         tried,
-        float(np.median([residual.metres for residual in used])),
+        float(np.median([residual.metres or 0.0 for residual in used])),
         _median_deg(best),
     )
 
@@ -192,4 +192,4 @@ def _registration(
 
 
 def _median_deg(found: Registration) -> float:
-    return float(np.median([residual.degrees for residual in found.residuals if residual.used]))
+    return float(np.median([residual.degrees or 0.0 for residual in found.residuals if residual.used]))

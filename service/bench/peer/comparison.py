@@ -25,6 +25,7 @@ from service.errors import InvalidImage, SceneNotFound, UnknownName
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Request
 from service.photos.images import photo_size, read_query
+from service.pose.training_photos.patch_matching import grey
 from service.results import Status
 from service.scene_formats.training_files import training_photo_path
 from service.types import Camera, Intrinsics, Pose
@@ -221,5 +222,4 @@ def training_photos(scene: BenchScene, folder: Path) -> list[PosedPhoto]:
 
 def _decoded(data: bytes, intrinsics: Intrinsics, background: tuple[float, float, float], pose: Pose) -> PosedPhoto:
     query = read_query(data, intrinsics=intrinsics, background_rgb=background, long_side=FULL_SIZE_PX)
-    rgb = query.rgb.astype(np.float32) @ np.float32([0.299, 0.587, 0.114])
-    return PosedPhoto(np.rint(rgb).astype(np.uint8), query.valid_mask, Camera(query.intrinsics, pose))
+    return PosedPhoto(grey(query.rgb), query.valid_mask, Camera(query.intrinsics, pose))

@@ -54,7 +54,8 @@ def matched(a: PhotoFeatures, b: PhotoFeatures, config: MatchingConfig = MATCHIN
     """Return pairs of indices: mutual nearest neighbours that pass the ratio test from `a` to `b`."""
     if len(a.px) < 2 or len(b.px) < 2:
         return np.zeros((0, 2), np.int64)
-    nearest, best, second = (np.zeros(len(a.px), kind) for kind in (np.int64, np.float32, np.float32))
+    nearest = np.zeros(len(a.px), np.int64)
+    best, second = np.zeros((2, len(a.px)), np.float32)
     best_of_b = np.full(len(b.px), -2.0, np.float32)
     columns = np.ascontiguousarray(b.descriptors.T)
     for begin in range(0, len(a.px), _BLOCK):
