@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -36,6 +36,8 @@ from service.pose.retrieval.index import ViewIndex
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.captured_volume import is_outside
 from service.pose.verification.gate import VERIFICATION, doubted, downgraded, verify
+from service.readings_in_scene import contradictions, fused, scene_priors
+from service.registration.registration import Registration
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world
@@ -63,6 +65,8 @@ class Request:
     """The estimator's tuning, for benches; None: its default."""
     accuracy: Accuracy = DEFAULT_ACCURACY
     """How accurate a pose must be to be `localized`."""
+    registrations: Mapping[str, Registration] = field(default_factory=dict)
+    """Those in force, by the sha256 of their scenes: what readings of a device are placed by."""
 
 
 def localize(
@@ -118,6 +122,8 @@ def localize_in_scene(
     verdict = answer.verdict if answer else render_and_verify(images, last.pose, tools.rasterizer)
     verdict = _qualified(verdict, last, trace.exhausted)
     verdict = _if_captured(verdict, query, last.pose, tools)
+    query, verdict = _with_readings(query, verdict, last, trace, loaded, request)
+    last = trace.records[-1]
     advice = _advice(images, loaded, verdict, last, tools.rasterizer)
     timings = _timings(trace.records, clock)
     found = estimate_of(
@@ -149,6 +155,21 @@ def _as_estimated(query: Query, loaded: LoadedScene, last: IterationRecord) -> Q
     return QueryImages(query, loaded.matcher).corrected(last.correction)
 
 
+def _with_readings(
+    query: Query, verdict: Verdict, last: IterationRecord, trace: _Trace, loaded: LoadedScene, request: Request
+) -> tuple[Query, Verdict]:
+    """Add a record of the pose by photo and device together, if the device's readings move it; return the query with
+    warnings of readings that contradict the photo, and the verdict with the covariance of both."""
+    if query.scene_priors is None:
+        return query, verdict
+    info = loaded.scene.info
+    against = contradictions(query, last.pose, verdict, info, request.registrations.get(info.sha256))
+    pose, verdict = fused(query, last.pose, verdict)
+    if pose is not last.pose:
+        trace.add(replace(last, stage="fuse_readings", pose=pose, matches=None, candidates=None))
+    return replace(query, warnings=query.warnings + against), verdict
+
+
 def _if_captured(verdict: Verdict, query: Query, pose: Pose, tools: Tools[Any]) -> Verdict:
     """Return a verdict for a pose outside of what the index's views saw as `uncertain` for that reason; others as
     they are, also where another reason than that the evidence is poor decided."""
@@ -176,9 +197,12 @@ def _advice(
 
 
 def asked_of(query: Query, loaded: LoadedScene, request: Request) -> Query:
-    """Return the query with the accuracy that the request asks for. Raises InvalidAccuracy."""
+    """Return the query, relative to the scene's origin, with the accuracy that the request asks for, and with the
+    device's readings as priors in the scene. Raises InvalidAccuracy."""
     info = loaded.scene.info
-    return replace(query, accuracy=request.accuracy.in_units(info.name, info.metres_per_unit))
+    priors = query.readings and scene_priors(query.readings, info, request.registrations.get(info.sha256))
+    accuracy = request.accuracy.in_units(info.name, info.metres_per_unit)
+    return replace(query, accuracy=accuracy, scene_priors=priors)
 
 
 @dataclass(slots=True)
@@ -253,6 +277,7 @@ def estimate_of(
         renders=renders,
         timings=tuple(timings),
         warnings=query.warnings
+        + (query.scene_priors.warnings if query.scene_priors else ())
         + info.warnings
         + loaded.warnings
         + _assumptions(query, loaded)

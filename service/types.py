@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
+from service.device_readings import DeviceReadings, ScenePriors
 from service.distortion import composed
 from service.errors import InvalidIntrinsics, InvalidPrior
 
@@ -430,6 +431,10 @@ class Query:
     """Poses outside are refused."""
     accuracy: Accuracy = DEFAULT_ACCURACY
     """What a pose must be certain within; without metres."""
+    readings: DeviceReadings | None = None
+    """What the device measured beside the photo, which may be wrong."""
+    scene_priors: ScenePriors | None = None
+    """The readings in the scene that is searched, as `asked_of` in `service/localize.py` puts them there."""
     rows_are_columns: bool = False
     """Whether EXIF turned the photo by 90 degrees: what the sensor read row by row are its columns."""
 

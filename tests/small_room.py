@@ -17,14 +17,24 @@ INTRINSICS = {"width": WIDTH, "height": HEIGHT, "fx": FOCAL, "fy": FOCAL, "cx": 
 
 
 HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR_NOISE = 0.1
 
 
-def write_room(folder: Path, cameras: int = 24, *, repeated: bool = False, symmetric: bool = False) -> Path:
+def write_room(
+    folder: Path,
+    cameras: int = 24,
+    *,
+    repeated: bool = False,
+    symmetric: bool = False,
+    upside_down: bool = False,
+    apart: float = 0.0,
+) -> Path:
     """Write `scene.ply` (Inria's layout, degree 0) and `transforms.json`; return the folder.
 
     A `repeated` room is the same after HALF_TURN: every photo has two places where it may have been taken. One
-    half of a `symmetric` room is nearly the mirror image of the other: MIRROR_NOISE sets its colours apart.
+    half of a `symmetric` room is nearly the mirror image of the other: MIRROR_NOISE sets its colours apart. One that is
+    the same `upside_down` is so after UPSIDE_DOWN. With `apart` there is another room like it that far along x.
     """
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(3)
@@ -39,6 +49,17 @@ def write_room(folder: Path, cameras: int = 24, *, repeated: bool = False, symme
         means = np.concatenate([means[one], means[one] * [-1, 1, 1]])
         noise = rng.normal(0, MIRROR_NOISE, (one.sum(), 3))
         quats, colours = np.concatenate([quats[one]] * 2), np.concatenate([colours[one], colours[one] + noise])
+    if upside_down:
+        one = means[:, 2] > 0
+        means = np.concatenate([means[one], means[one] * [1, -1, -1]])
+        quats, colours = (np.concatenate([part[one]] * 2) for part in (quats, colours))
+    poses = training_poses(cameras)
+    if apart:
+        means = np.concatenate([means, means + [apart, 0, 0]])
+        quats, colours = np.concatenate([quats] * 2), np.concatenate([colours] * 2)
+        shift = np.eye(4)
+        shift[0, 3] = apart
+        poses += [Pose(shift @ pose.world_from_camera) for pose in poses]
     scales = np.tile(np.log([0.5 * SPACING, 0.5 * SPACING, 0.003]), (len(means), 1))
     columns = {
         **dict(zip("xyz", means.T, strict=True)),
@@ -56,7 +77,7 @@ def write_room(folder: Path, cameras: int = 24, *, repeated: bool = False, symme
             "file_path": f"images/{i}.png",
             "transform_matrix": (pose.world_from_camera @ np.diag([1.0, -1, -1, 1])).tolist(),
         }
-        for i, pose in enumerate(training_poses(cameras))
+        for i, pose in enumerate(poses)
     ]
     camera = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
     (folder / "transforms.json").write_text(json.dumps({**camera, "frames": frames}))

@@ -22,13 +22,14 @@ FLOORS = {
     "service": [
         {
             *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "codec"),
+            "device_readings",
             *("client", "live_client"),
             *("disk_cache", "operating_system"),
         },
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
-        {"localize", "loaded_scene"},
+        {"localize", "loaded_scene", "readings_in_scene"},
         {"tracking", "smoothing", "multi_scene", "coverage", "rig"},
         {"scene_manager", "live"},
         {"jobs"},
@@ -57,6 +58,9 @@ SAME_FLOOR = {
     "service": {
         ("types", "errors"),
         ("localize", "loaded_scene"),
+        ("localize", "readings_in_scene"),
+        ("types", "device_readings"),
+        ("device_readings", "errors"),
         ("types", "accuracy"),
         ("accuracy", "errors"),
         ("types", "distortion"),

@@ -14,6 +14,7 @@ import numpy as np
 
 from service.estimators.search_config import SearchConfig
 from service.interfaces import Answer, Tools
+from service.pose.absolute_pose.device_priors import prefers
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_query
@@ -147,6 +148,16 @@ class SearchState:
         if is_sure or not is_place or verdict.status is Status.NOT_LOCALIZED:
             return False
         return self.colour_edges_at(found) < self.config.least_colour_edges
+
+    def readings_prefer(self, one: VerifiedPose, other: VerifiedPose) -> bool:
+        """Return whether what the device measured decides for the first of two answers."""
+        return prefers(
+            self.images.query.scene_priors,
+            one.refined.pose,
+            one.verdict.covariance,
+            other.refined.pose,
+            other.verdict.covariance,
+        )
 
     def appearance_at(self, found: RefinedPose) -> dict[str, float]:
         """Return how alike photo and render are at a pose, by signal."""
@@ -307,7 +318,8 @@ def mirror_image_of(state: SearchState, answer: VerifiedPose) -> SearchState:
     """Return the state of a search for the photo's mirror image, through the lens that the answer has."""
     # The intrinsics that were estimated hold for the mirror image, too.
     query = mirrored_query(state.images.query.corrected(answer.refined.correction))
-    return SearchState.of(replace(query, prior=None, region=None), state.tools, state.config)
+    query = replace(query, prior=None, region=None, scene_priors=None)
+    return SearchState.of(query, state.tools, state.config)
 
 
 def _search_mirrored(
@@ -325,7 +337,8 @@ def _search_mirrored(
 
 
 def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None]:
-    """Look for other poses that the gate accepts; the best becomes the answer, and the last record has all.
+    """Look for other poses that the gate accepts; the best becomes the answer, and the last record has all but those
+    that the device's readings decide against.
 
     A pose that explains the whole photo has no alternative in a scene that doesn't repeat itself.
     """
@@ -348,7 +361,8 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
         if verdict.status is Status.LOCALIZED:
             answers.append(VerifiedPose(found, verdict, answer.variant))
     if len(answers) > 1:
-        yield _ranked(state, answers)
+        kept = [one for one in answers if not any(state.readings_prefer(other, one) for other in answers)]
+        yield _ranked(state, kept or answers)
 
 
 def seen_from(state: SearchState, answer: VerifiedPose) -> PoseAtDistance:

@@ -3,7 +3,8 @@
     photo's features -> retrieval scores of rendered views -> matches with the best of them -> scene points -> PnP
     -> while few agree, or the gate refuses what few led to: render there, match again, solve decoupled
     -> refine photometrically on a small render, then on larger ones
-    -> verification gate -> did another lens take the photo, or a camera that turned?
+    -> verification gate -> do readings of the device contradict? -> did another lens take the photo, or a camera that
+       turned?
     -> where the scene has a digest of its training photos: a more exact pose by their patches
     -> is the photo mirrored? Do many matches agree on another pose that is as good?
 
@@ -35,6 +36,7 @@ from service.estimators.search_state import (
     Stage,
     StageOutcome,
     StageResult,
+    VerifiedPose,
     changed,
     check_ambiguity,
     check_mirror,
@@ -42,6 +44,7 @@ from service.estimators.search_state import (
 )
 from service.estimators.shutter_check import check_shutter
 from service.interfaces import Answer, Tools
+from service.pose.absolute_pose.device_priors import contradicts
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.descent.hypotheses import poses_near_views
 from service.pose.features.image_sizes import PHOTO_PX, sized
@@ -53,7 +56,7 @@ from service.pose.refinement.refine_stage import refine_stage, rematch_and_refin
 from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.index import ViewIndex, prepared_index
 from service.pose.retrieval.scores import top_indices
-from service.results import Candidates, IterationRecord
+from service.results import Candidates, IterationRecord, Status
 from service.types import Camera, Query
 
 
@@ -90,6 +93,7 @@ def run(
         yield from run_stage(state, _refine_from_prior(state))
         if state.finished:
             state = yield from check_shutter(state)
+            yield from _check_readings(state, options)
             yield from refine_by_patches(state)
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
@@ -101,11 +105,34 @@ def run(
             yield from run_stage(state, replace(stage, records=_rematch(state.unmatched, state)))
         if state.finished:
             break
+    yield from _check_readings(state, options)
     state = yield from check_lens(state)
     state = yield from check_shutter(state)
     yield from refine_by_patches(state)
     yield from changed(_doubts(state), state.with_answer)
     return state.answer()
+
+
+def _check_readings(state: SearchState, options: Options) -> Generator[IterationRecord, None, None]:
+    """Where the answer contradicts what the device measured, search among the views that agree with it, with the photo
+    turned as gravity says. An answer that the gate accepts there replaces it if the readings decide for that one."""
+    answer, retrieval = state.best, state.retrieval
+    priors = state.images.query.scene_priors
+    if answer is None or not contradicts(priors, answer.refined.pose, answer.verdict.covariance):
+        return
+    steps = retrieval.roll_by_gravity()
+    variant = answer.variant if steps is None else replace(answer.variant, roll_steps_45deg=steps)
+    views = retrieval.ranked(variant, options.candidates, only_agreeing=True)
+    if not len(views):
+        return
+    search = _search_views("retrieve_by_readings", variant, deque(views), state)
+    found = (yield from changed(search, state.with_answer)).refined
+    if found is None:
+        return
+    other = VerifiedPose(found, state.verify(found), variant)
+    if other.verdict.status is Status.LOCALIZED and (not state.finished or state.readings_prefer(other, answer)):
+        state.best, state.finished = other, True
+    yield state.best.record("check_readings")
 
 
 def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
@@ -127,14 +154,14 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     small = upright.scaled(config.small_photo_factor)
     if not retrieval.is_upright(small):
         small = retrieval.rotated_variant(small, likeliest_only=True)
-    views = top_indices(retrieval.scores(small), min(config.small_photo_views, options.candidates))
+    views = retrieval.ranked(small, min(config.small_photo_views, options.candidates))
     rotated = small.roll_steps_45deg != 0
     name = "retrieve_rotated" if rotated else "retrieve"
     # A render at the prior pose shows the scene as the photo as it is does, not as the rotated one.
     yield Stage(_search_views(name, small, deque(views), state, try_prior_view=not rotated), small)
     # Anew: of a small copy the wrong rotation may have looked better.
     variant = retrieval.rotated_variant(upright)
-    views = top_indices(retrieval.scores(variant), options.candidates)
+    views = retrieval.ranked(variant, options.candidates)
     name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
     yield Stage(_search_views(name, variant, deque(views), state), variant)
     variant = variant.scaled(config.large_photo_factor)

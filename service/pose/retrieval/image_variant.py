@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from service.interfaces import Features
+from service.pose.absolute_pose.device_priors import compatible
 from service.pose.absolute_pose.prior_region import distance_outside
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.in_plane_rotation import rolls_to_upright
 from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.retrieval.index import ViewIndex
-from service.pose.retrieval.scores import SCORES, ScoreConfig, retrieval_scores
+from service.pose.retrieval.scores import SCORES, ScoreConfig, retrieval_scores, top_indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +37,8 @@ class RetrievalConfig:
     upright_score: float = 1.5
     """Retrieval score from which on a view is like the photo as it is: of six scenes' clean photos the best one has 1.8
     and more, of those rotated by 90 degrees 1.3 at most."""
+    least_level: float = 0.3
+    """Share of up by gravity that lies in the image plane from which on it tells the photo's rotation."""
     oblique_shrink: float = 0.8
     """Size of a photo rotated by an odd multiple of 45 degrees, which needs twice the canvas."""
     views_outside_prior: int = 16
@@ -108,12 +111,16 @@ class Retrieval:
 
         `likeliest_only`: the rotation that most corners suggest, and none if that is upright.
         """
+        by_gravity = self.roll_by_gravity()
         if not self._suggested:
             self._suggested.extend(rolls_to_upright(self.images.corners(), self.index.corners))
         suggested = self._suggested[:1] if likeliest_only else self._suggested
+        # Beside those of the corners: the reading may be wrong.
+        suggested = suggested if by_gravity is None else list(dict.fromkeys([by_gravity, *suggested]))
         best, most = upright, 0.0
         # Extracting the features of a rotation is costly, so only the likeliest are compared.
-        for steps in [steps for steps in suggested if steps][: self.config.max_rotations]:
+        most_rotations = self.config.max_rotations + (by_gravity is not None)
+        for steps in [steps for steps in suggested if steps][:most_rotations]:
             rotated = replace(upright, roll_steps_45deg=steps)
             score = self.config.rotation_bias * self.scores(rotated).max()
             if score > max(most, self.scores(upright).max()):
@@ -123,6 +130,40 @@ class Retrieval:
     def is_upright(self, variant: ImageVariant) -> bool:
         """Return whether some view is so much like the variant that no other rotation has to be compared."""
         return bool(self.scores(variant).max() >= self.config.upright_score)
+
+    def ranked(self, variant: ImageVariant, count: int, *, only_agreeing: bool = False) -> Int64[np.ndarray, "k"]:
+        """Return the views most like the variant, best first.
+
+        Of a photo with readings of the device those that agree with these come first, `count` of them, then of the
+        `count` best ones the others, unless it is `only_agreeing`: the readings may be wrong.
+        """
+        scores, agree = self.scores(variant), self._agreeing()
+        best = top_indices(scores, count)
+        if agree.all():
+            return best
+        first = top_indices(np.where(agree, scores, -np.inf), min(count, int(agree.sum())))
+        return first if only_agreeing else np.concatenate([first, best[~np.isin(best, first)]])
+
+    def roll_by_gravity(self) -> int | None:
+        """Return the rotation that makes the photo upright by gravity, in counter-clockwise steps of 45 degrees; None
+        where gravity wasn't measured, or the camera looked nearly straight up or down."""
+        priors = self.images.query.scene_priors
+        if priors is None or priors.up is None:
+            return None
+        x, y, _ = priors.up.up_in_camera
+        if np.hypot(x, y) < self.config.least_level:
+            return None
+        return round(np.degrees(np.arctan2(x, -y)) / 45) % 8
+
+    def _agreeing(self) -> Bool[np.ndarray, "views"]:
+        """Return which views may show what the photo does by the device's readings."""
+        priors, views = self.images.query.scene_priors, self.index.views
+        if priors is None:
+            return np.ones(len(views), bool)
+        poses = np.stack([view.camera.pose.world_from_camera for view in views])
+        # A sample is enough for a median; a view without points sees nothing.
+        away = [np.linalg.norm(v.points_in_world[::8] - v.camera.pose.position_in_world, axis=1) for v in views]
+        return compatible(priors, poses, np.array([np.median(d) if len(d) else 0.0 for d in away]))
 
     def _demoted_outside_prior(self, scores: Float64[np.ndarray, "views"]) -> Float64[np.ndarray, "views"]:
         region = self.images.query.region
