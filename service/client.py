@@ -550,7 +550,7 @@ class Client:
         """Localize a photo, a video, or several photos of one camera in their order; wait for the result.
 
         `fields` are those of docs/api.md: `scene`, `intrinsics` (Intrinsics), `prior` (Prior), `accuracy` (Accuracy),
-        `times_s`, ...
+        `up_in_camera`, `gps` and `heading` (mappings; `gps` also "exif"), `times_s`, ...
         `on_record` is called with each step. Raises ServiceError; a photo that is not localized is a result.
         """
         job = self.submit(photos, timeout_s=timeout_s, **fields)

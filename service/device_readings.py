@@ -15,6 +15,7 @@ from service.errors import InvalidPrior
 
 MOST_M = 1e5
 """Standard deviations and heights beyond it, in metres, are no measurements."""
+LEAST_SIGMA_DEG = 0.01
 
 
 def _in_range(value: float, low: float, high: float, where: str, unit: str) -> None:
@@ -35,9 +36,9 @@ class Gravity:
     def __post_init__(self) -> None:
         up = np.array(self.direction, np.float64)
         length = float(np.linalg.norm(up)) if up.shape == (3,) else 0.0
-        if not 1e-6 < length < 1e6:
+        if not 1e-6 < length < np.inf:
             raise InvalidPrior("must be three numbers that are a direction.", where="up_in_camera.direction")
-        _in_range(self.sigma_deg, 0.01, 90, "up_in_camera.sigma_deg", "degrees")
+        _in_range(self.sigma_deg, LEAST_SIGMA_DEG, 90, "up_in_camera.sigma_deg", "degrees")
         x, y, z = (up / length).tolist()
         object.__setattr__(self, "direction", (x, y, z))
 
@@ -74,7 +75,7 @@ class Heading:
 
     def __post_init__(self) -> None:
         _in_range(self.degrees, -360, 360, "heading.degrees", "degrees")
-        _in_range(self.sigma_deg, 0.01, 180, "heading.sigma_deg", "degrees")
+        _in_range(self.sigma_deg, LEAST_SIGMA_DEG, 180, "heading.sigma_deg", "degrees")
 
 
 @dataclass(frozen=True, slots=True)

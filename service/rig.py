@@ -23,6 +23,7 @@ from service.geometry import adjoint, moved, reprojection_error_px
 from service.interfaces import RenderTally
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Clock, Request, asked_of, estimate_of, rasterizer_for
+from service.pose.absolute_pose.device_priors import prefers
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
 from service.pose.features.image_sizes import PHOTO_PX
@@ -37,6 +38,7 @@ from service.pose.verification.gate import verify
 from service.pose.verification.precision import AskedBounds
 from service.pose.verification.rig_gate import rig_verdict
 from service.pose.verification.signals import typical_depth
+from service.readings_in_scene import contradictions, fused
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, StageTiming, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world, shifted
@@ -72,6 +74,9 @@ class RigConfig:
     min_inlier_share: float = 0.15
     """Fresh matches that agree, of all photos, and their share, from which on nothing more is searched: right poses of
     photos that are hidden by two thirds have 300 and 0.3, wrong ones 22 and 0.07."""
+    alike_share: float = 0.8
+    """Matches that agree with a hypothesis, relative to the best one's, from which on the two explain the photos alike,
+    and what the device measured may decide."""
     same_share: float = 0.5
     same_errors: float = 3.0
     """Share of a hypothesis' matches that the best one explains, within so many times the largest error of an inlier,
@@ -222,12 +227,33 @@ class _Search:
         rival = max((one.inliers for one in rivals), default=0) / max(best.inliers, 1)
         verdicts = [verdict for _, verdict in found]
         verdict = rig_verdict(verdicts, covariance, AskedBounds.of(first.query.accuracy, depth), rival)
+        query, verdict, pose, found = self._with_readings(verdict, pose, found)
         self._add("verify_rig", pose, verdict.inliers)
         timings = [StageTiming("rig", self._clock.wall_s, self._clock.cpu_s)]
         estimate = estimate_of(
-            first.query, self._loaded, self._request, verdict, self._records, timings=timings, renders=self._tally.count
+            query, self._loaded, self._request, verdict, self._records, timings=timings, renders=self._tally.count
         )
         return RigEstimate(pose, estimate, tuple(found))
+
+    def _with_readings(
+        self, verdict: Verdict, pose: Pose, found: list[tuple[Pose, Verdict]]
+    ) -> tuple[Query, Verdict, Pose, list[tuple[Pose, Verdict]]]:
+        """Return query and verdict of the first photo, the rig's pose, and that of each photo, by the photos and what a
+        device measured beside the first one together."""
+        first, info = self._photos[0], self._loaded.scene.info
+        registration = self._request.registrations.get(info.sha256)
+        against = contradictions(first.query, found[0][0], verdict, info, registration)
+        query = replace(first.query, warnings=first.query.warnings + against)
+        own, told = fused(first.query, found[0][0], verdict)
+        if own is found[0][0] or told.covariance is None:
+            return query, verdict, pose, found
+        pose = Pose(own.world_from_camera @ first.rig_from_camera.camera_from_world)
+        together = []
+        for photo, (_, verdict_of_photo) in zip(self._photos, found, strict=True):
+            between = photo.rig_from_camera.camera_from_world @ first.rig_from_camera.world_from_camera
+            covariance = adjoint(between) @ told.covariance @ adjoint(between).T
+            together.append((_pose_of(pose, photo), replace(verdict_of_photo, covariance=covariance)))
+        return query, told, pose, together
 
     # ------------------------------------------------------------------ search
 
@@ -245,7 +271,16 @@ class _Search:
         if not tried:
             tried.append(_Hypothesis(self._likeliest(), 0, 0, np.zeros((6, 6))))
         best = max(tried, key=lambda one: one.inliers)
-        return best, [one for one in tried if one is not best and not self._is_same(one, best)]
+        alike = [one for one in tried if one.inliers >= self._config.alike_share * best.inliers]
+        best = next((one for one in alike if self._readings_prefer(one, best)), best)
+        others = [one for one in tried if one is not best and not self._is_same(one, best)]
+        return best, [one for one in others if not self._readings_prefer(best, one)]
+
+    def _readings_prefer(self, one: _Hypothesis, other: _Hypothesis) -> bool:
+        """Return whether what a device measured beside the first photo decides for the first of two hypotheses."""
+        first = self._photos[0]
+        poses = [_pose_of(found.world_from_rig, first) for found in (one, other)]
+        return prefers(first.query.scene_priors, poses[0], None, poses[1], None)
 
     def _is_sure(self, found: _Hypothesis) -> bool:
         config = self._config
@@ -279,7 +314,7 @@ class _Search:
             self._check()
             variant = retrieval.rotated_variant(retrieval.upright_variant()).scaled(factor)
             features = retrieval.features(variant)
-            chosen = top_indices(retrieval.scores(variant) + self._config.support * support, views)
+            chosen = retrieval.ranked(variant, views, support=self._config.support * support)
             parts = [correspondences(features, self._index.views[i], self._loaded.matcher) for i in chosen]
             matches.append(_matches(photo, Correspondences.pooled(parts), variant.max_error_px))
             starts += self._starts(photo, parts, variant.max_error_px)

@@ -112,7 +112,10 @@ def test_the_covariance_by_photo_and_readings_holds() -> None:
     squared = []
     for _ in range(300):
         start = moved(TRUTH, rng.multivariate_normal(np.zeros(6), covariance))
-        east, up = rng.normal(0, np.hypot(1.0, 1.0)), moved(TRUTH, np.r_[rng.normal(0, np.hypot(1, 2), 3), 0, 0, 0] / 57.3)
+        east, up = (
+            rng.normal(0, np.hypot(1.0, 1.0)),
+            moved(TRUTH, np.r_[rng.normal(0, np.hypot(1, 2), 3), 0, 0, 0] / 57.3),
+        )
         priors = scene_priors(DeviceReadings(gravity_at(up), gps_at(TRUTH, 1.0, east)), INFO)
         pose, fused = with_readings(priors, start, covariance)
         from service.geometry import se3_log
@@ -142,7 +145,7 @@ def test_readings_that_differ_too_little_or_contradict_both_decide_nothing() -> 
         return prefers(scene_priors(readings, INFO), TRUTH, None, TWIN, None)
 
     apart = pose_distance(TRUTH, TWIN)[1] * 2.5
-    assert decide(DeviceReadings(gps=gps_at(TRUTH, 0.1 * apart)) ) is (apart**2 / (0.01 * apart**2 + 1.0) > 10.83)
+    assert decide(DeviceReadings(gps=gps_at(TRUTH, 0.1 * apart))) is (apart**2 / (0.01 * apart**2 + 1.0) > 10.83)
     assert not decide(DeviceReadings(gps=gps_at(TRUTH, apart)))
     assert not decide(DeviceReadings(gps=gps_at(TRUTH, 2.0, 300.0)))
     assert decide(DeviceReadings(heading=heading_at(TRUTH)))
@@ -171,14 +174,20 @@ def test_a_registration_counts_before_the_files_and_adds_its_own_uncertainty() -
     assert priors.position is not None
     arm = similarity()[:3, :3] @ TRUTH.position_in_world
     # A turn by 0.05 rad moves what is an arm away, too.
-    assert priors.position.covariance[0, 0] == pytest.approx(1 + 9 + (0.05 * arm[1]) ** 2 + (0.02 * arm[2]) ** 2, rel=1e-3)
+    assert priors.position.covariance[0, 0] == pytest.approx(
+        1 + 9 + (0.05 * arm[1]) ** 2 + (0.02 * arm[2]) ** 2, rel=1e-3
+    )
 
 
 def test_a_scene_without_up_or_place_says_what_it_can_not_use() -> None:
     nowhere = replace(INFO, up_in_world=None, geo_anchor=None)
     priors = scene_priors(all_at(TRUTH), nowhere)
     assert (priors.up, priors.position, priors.heading) == (None, None, None)
-    assert [warning.split(" was")[0] for warning in priors.warnings] == ["the gravity", "the GPS position", "the heading"]
+    assert [warning.split(" was")[0] for warning in priors.warnings] == [
+        "the gravity",
+        "the GPS position",
+        "the heading",
+    ]
     assert scene_priors(DeviceReadings(gravity_at(TRUTH)), replace(INFO, up_in_world=None)).up is not None
 
 

@@ -69,6 +69,13 @@ def localize(
     ] = "",
     intrinsics: IntrinsicsOption = "",
     prior: Annotated[str, typer.Option(help="What is known of the pose, as the API takes it: JSON or a file.")] = "",
+    up_in_camera: Annotated[
+        str, typer.Option("--up", help='Up by gravity in the camera, OpenCV axes: {"direction": [0, -1, 0]}.')
+    ] = "",
+    gps: Annotated[
+        str, typer.Option(help='{"latitude": 47.3, "longitude": 8.5, "sigma_m": 5}, or exif: of each photo itself.')
+    ] = "",
+    heading: Annotated[str, typer.Option(help='By a compass, clockwise from north: {"degrees": 120}.')] = "",
     accuracy: Annotated[
         str, typer.Option(help='How accurate a pose must be, as the API takes it: {"deg": 2, "share": 0.01}.')
     ] = "",
@@ -101,8 +108,10 @@ def localize(
     from service.web.schemas.request_body import Body, body_of
 
     fields = _fields(
-        {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every},
-        {"intrinsics": intrinsics, "prior": prior, "accuracy": accuracy, "times_s": times, "rig": rig},
+        {"estimator": estimator or None, "seed": seed, "budget_s": budget_s, "every": every}
+        | ({"gps": "exif"} if gps == "exif" else {}),
+        {"intrinsics": intrinsics, "prior": prior, "accuracy": accuracy, "times_s": times, "rig": rig}
+        | {"up_in_camera": up_in_camera, "gps": "" if gps == "exif" else gps, "heading": heading},
     )
     files = [(str(photo), read_file(photo)) for photo in photos]
     # A video is a sequence by itself; photos are one only on request.
@@ -129,7 +138,7 @@ def _fields(plain: dict[str, Any], nested: dict[str, str]) -> LocalizeFields:
     from service.web.schemas.job_spec import read_fields
 
     # Through the API's own parser: the same names, limits and error texts.
-    given = plain | {name: parsed_option(text, name) for name, text in nested.items()}
+    given = plain | {name: parsed_option(text, name) for name, text in nested.items() if text}
     return read_fields({name: value for name, value in given.items() if value is not None})
 
 

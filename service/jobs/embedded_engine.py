@@ -234,12 +234,18 @@ def run_task(
 ) -> tuple[JobResult, LoadedScene]:
     """Localize on this thread, in one scene or in the one of several that the photo shows; return that scene, too.
 
-    A sequence, or a rig, is localized in the first scene. `registrations` are the scenes', which the result's pose is
-    placed by.
+    A sequence, or a rig, is localized in the first scene. `registrations` are the scenes', by which the result's pose is
+    placed, and what the device measured before.
     """
     options = ESTIMATORS.load(task.estimator).Options(**task.options)
+    known = {one.scene_sha256: one for one in registrations if one is not None}
     request = Request(
-        task.estimator, options, seed=task.seed, budget_s=task.budget_s, cancel=cancel, accuracy=task.accuracy
+        *(task.estimator, options),
+        seed=task.seed,
+        budget_s=task.budget_s,
+        cancel=cancel,
+        accuracy=task.accuracy,
+        registrations=known,
     )
     if isinstance(task.source, SequenceSource):
         sequence = _run_sequence(task.source, request, scenes[0], on_record)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
+from service.device_readings import DeviceReadings
 from service.errors import Failure
 from service.lenses.lens_memory import RecalledLens
 from service.registration.registration import Registration
@@ -50,6 +51,10 @@ class JobSpec:
     """A guess, which may be wrong."""
     region: PriorRegion | None = None
     """Poses outside are no answers."""
+    readings: DeviceReadings | None = None
+    """What the device measured beside the photo, of several beside the first."""
+    exif_gps: bool = False
+    """Whether EXIF's position and heading of each photo are readings, too, where `readings` has none."""
     truth: Pose | None = None
     """Kept for whoever measures errors; no estimator sees it."""
     every: int = 1

@@ -13,6 +13,7 @@ from service.jobs.engine import LocalizeTask, RigSource, SequenceSource
 from service.jobs.model import JobSpec
 from service.lenses.lens_memory import RecalledLens
 from service.photos.camera_identity import CameraIdentity
+from service.photos.exif_gps import with_readings
 from service.photos.images import open_photo
 from service.photos.sequence import (
     SequenceOptions,
@@ -105,7 +106,7 @@ def _read_single(
         prior=spec.prior,
         background_rgb=background_rgb,
     )
-    query = replace(query, region=spec.region)
+    query = with_readings(replace(query, region=spec.region), spec.readings, opened if spec.exif_gps else None)
     return DecodedPhoto(query, _UNTIMED, query, opened.camera, recalled)
 
 
@@ -133,6 +134,8 @@ def _read_rig(
             opened = open_photo(photo)
             first = first or opened.camera
             query = opened.query(intrinsics=camera.intrinsics, background_rgb=background_rgb)
+            if not index:
+                query = with_readings(query, spec.readings, opened if spec.exif_gps else None)
         photos.append(RigPhoto(query, camera.rig_from_camera, name))
     assert first is not None
     return DecodedPhoto(photos[0].query, _UNTIMED, RigSource(tuple(photos), spec.rig.metric), first, None)
@@ -151,7 +154,15 @@ def _read_sequence(
             hint="Name one scene; one photo of the sequence, sent by itself, shows which.",
         )
     options = SequenceOptions(
-        max_frames, spec.every, spec.times_s, spec.intrinsics, spec.prior, spec.region, background_rgb
+        max_frames,
+        spec.every,
+        spec.times_s,
+        spec.intrinsics,
+        spec.prior,
+        spec.region,
+        background_rgb,
+        readings=spec.readings,
+        exif_gps=spec.exif_gps,
     )
     # Before the job is accepted, so that most faults of a sequence are answered at once.
     check_sequence(data, options)

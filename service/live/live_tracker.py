@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.device_readings import LEAST_SIGMA_DEG, DeviceReadings, Gravity
 from service.errors import InvalidImage
 from service.live.background import Background
 from service.live.fusion import Fusion
@@ -187,7 +188,9 @@ class LiveTracker:
         if intrinsics is not None and (intrinsics.width, intrinsics.height) != size:
             intrinsics = _resized(intrinsics, size)
         query = read_query(frame.data, intrinsics=intrinsics, prior=self._task.prior, long_side=PHOTO_LONG_SIDE)
-        query = replace(query, region=self._task.region)
+        up, facts = frame.up_in_camera, self._task.odometry
+        gravity = None if up is None else DeviceReadings(Gravity(up, max(facts.up_sigma_deg, LEAST_SIGMA_DEG)))
+        query = replace(query, region=self._task.region, readings=gravity)
         if any(self._origin):
             query = query_in_scene(query, self._origin)
         return asked_of(query, self._loaded, Request(accuracy=self._task.accuracy))

@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import UInt8
 
+from service.device_readings import DeviceReadings
 from service.errors import InvalidImage, InvalidRequest
 from service.photos.camera_identity import CameraIdentity
+from service.photos.exif_gps import with_readings
 from service.photos.images import open_photo, photo_size, query_of
 from service.photos.video import frame_count, is_video, read_video
 from service.types import Intrinsics, LensPrior, Pose, PriorRegion, Query
@@ -50,6 +52,10 @@ class SequenceOptions:
     background_rgb: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lens_prior: LensPrior | None = None
     """How certain `intrinsics` are, where earlier photos of the camera are their source."""
+    readings: DeviceReadings | None = None
+    """What the device measured beside the first photo."""
+    exif_gps: bool = False
+    """Whether EXIF's position and heading of each photo are readings, too."""
 
 
 def is_packed(data: bytes) -> bool:
@@ -114,9 +120,12 @@ def read_sequence(data: bytes, options: SequenceOptions) -> Generator[SequencePh
                 opened = open_photo(source)
                 camera = opened.camera
                 query = opened.query(prior=prior, background_rgb=options.background_rgb, **given)
+                readings = options.readings if first is None else None
+                query = with_readings(query, readings, opened if options.exif_gps else None)
             else:
                 camera = CameraIdentity(source.shape[1], source.shape[0], is_video=True)
                 query = query_of(source, prior=prior, **given)
+                query = with_readings(query, options.readings if first is None else None)
             if first is None:
                 query = replace(query, region=options.region)
             # One camera: intrinsics that are refined with one photo hold for the next.

@@ -131,13 +131,20 @@ class Retrieval:
         """Return whether some view is so much like the variant that no other rotation has to be compared."""
         return bool(self.scores(variant).max() >= self.config.upright_score)
 
-    def ranked(self, variant: ImageVariant, count: int, *, only_agreeing: bool = False) -> Int64[np.ndarray, "k"]:
-        """Return the views most like the variant, best first.
+    def ranked(
+        self,
+        variant: ImageVariant,
+        count: int,
+        *,
+        support: Float64[np.ndarray, "views"] | float = 0.0,
+        only_agreeing: bool = False,
+    ) -> Int64[np.ndarray, "k"]:
+        """Return the views most like the variant, best first; `support` is added to their scores.
 
         Of a photo with readings of the device those that agree with these come first, `count` of them, then of the
         `count` best ones the others, unless it is `only_agreeing`: the readings may be wrong.
         """
-        scores, agree = self.scores(variant), self._agreeing()
+        scores, agree = self.scores(variant) + support, self._agreeing()
         best = top_indices(scores, count)
         if agree.all():
             return best

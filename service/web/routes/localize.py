@@ -19,7 +19,7 @@ from service.web.schemas.error_examples import AWAITED_SCENE_ERRORS, errors
 from service.web.schemas.job_spec import job_spec, read_fields
 from service.web.schemas.jobs import JobOut
 from service.web.schemas.request_body import Body, read_body
-from service.web.schemas.requests import LocalizeFields, LocalizeIn
+from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields, LocalizeIn
 
 router = APIRouter()
 
@@ -29,8 +29,10 @@ def _form_schema() -> dict[str, Any]:
     schema = LocalizeIn.model_json_schema(ref_template="#/components/schemas/{model}")
     # The definitions are among the document's components already.
     schema.pop("$defs", None)
-    schema["description"] = "`options`, `intrinsics`, `prior`, `accuracy`, `truth`, `times_s` and `rig` are JSON text."
-    for name in ("options", "intrinsics", "prior", "accuracy", "truth", "times_s", "rig"):
+    names = tuple(FIELD_ERRORS)
+    listed = ", ".join(f"`{name}`" for name in names[:-1])
+    schema["description"] = f"{listed} and `{names[-1]}` are JSON text, unless `gps` is `exif`."
+    for name in names:
         described = LocalizeFields.model_fields[name].description or "See the JSON body."
         schema["properties"][name] = {
             "type": "string",
@@ -144,7 +146,8 @@ async def create_job(
         sha256 = hashlib.sha256(body.photo).hexdigest()
         # Of the validated fields: the same request as form and as JSON is the same job. Requests of before there were
         # these fields keep their digest.
-        absent = {name for name in ("camera_id", "accuracy", "rig") if getattr(fields, name) is None}
+        later = ("camera_id", "accuracy", "rig", "up_in_camera", "gps", "heading")
+        absent = {name for name in later if getattr(fields, name) is None}
         digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
         spec = replace(spec, scene=visible.asked(spec.scene, app_state.engine.scenes()))

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from service.accuracy import DEFAULT_ACCURACY, Accuracy
+from service.device_readings import DeviceReadings, GpsPosition, Gravity, Heading
 from service.errors import (
     InvalidIntrinsics,
     InvalidOptions,
@@ -26,7 +27,7 @@ from service.pose.absolute_pose.prior_region import inside_prior
 from service.types import BoxPrior, GaussianPosePrior, Intrinsics, Pose, PriorRegion, Rig, RigCamera
 from service.web.problems import field_and_message
 from service.web.schemas.conversion import OPENCV_FROM_OPENGL
-from service.web.schemas.requests import FIELD_ERRORS, LocalizeFields, PoseIn, PriorIn, RigIn
+from service.web.schemas.requests import FIELD_ERRORS, GpsIn, LocalizeFields, PoseIn, PriorIn, RigIn
 
 
 def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
@@ -35,6 +36,7 @@ def read_fields(values: Mapping[str, Any]) -> LocalizeFields:
         return LocalizeFields.model_validate(values)
     except ValidationError as error:
         where, message = field_and_message(error.errors(), LocalizeFields)
+        where = where.replace("gps.GpsIn", "gps", 1)  # pydantic names the member of a union
         raise FIELD_ERRORS.get(where.partition(".")[0], InvalidRequest)(message, where=where) from error
 
 
@@ -58,6 +60,8 @@ def job_spec(fields: LocalizeFields, default_estimator: str = DEFAULT_ESTIMATOR)
         camera_id=fields.camera_id,
         prior=prior,
         region=region,
+        readings=_readings(fields),
+        exif_gps=fields.gps == "exif",
         truth=None if fields.truth is None else pose_from(fields.truth, "truth"),
         every=fields.every,
         times_s=None if fields.times_s is None else tuple(fields.times_s),
@@ -87,6 +91,20 @@ def _rig(rig: RigIn) -> Rig:
             raise
         cameras.append(RigCamera(pose, dataclasses.replace(intrinsics, trust="exact")))
     return Rig(tuple(cameras), rig.metric)
+
+
+def _readings(fields: LocalizeFields) -> DeviceReadings | None:
+    """Return what the device measured; None: the request says nothing of it. Raises InvalidPrior."""
+    up, gps, heading = fields.up_in_camera, fields.gps, fields.heading
+    x, y, z = up.direction if up else (0.0, -1.0, 0.0)
+    found = DeviceReadings(
+        Gravity((x, y, z), up.sigma_deg) if up else None,
+        GpsPosition(gps.latitude, gps.longitude, gps.sigma_m, gps.height, gps.height_sigma_m)
+        if isinstance(gps, GpsIn)
+        else None,
+        Heading(heading.degrees, heading.sigma_deg) if heading else None,
+    )
+    return None if found == DeviceReadings() else found
 
 
 def accuracy_from(value: Any) -> Accuracy:

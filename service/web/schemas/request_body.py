@@ -49,7 +49,7 @@ async def read_body(request: Request, max_frames: int = MAX_FRAMES) -> Body:
 
 
 async def _form_body(request: Request, max_frames: int) -> Body:
-    async with request.form(max_files=max_frames, max_fields=16) as form:
+    async with request.form(max_files=max_frames, max_fields=24) as form:
         names = [name for name, _ in form.multi_items()]
         _refuse_unknown(names)
         repeated = sorted({name for name in names if name != "photo" and names.count(name) > 1})
@@ -61,8 +61,9 @@ async def _form_body(request: Request, max_frames: int) -> Body:
         # Browsers send an empty text for each field that was left empty.
         texts = {name: str(value) for name, value in form.items() if name != "photo" and value != ""}
         # Ids of scenes can't begin with a bracket, so such a text is a list.
-        listed = {"scene"} if texts.get("scene", "").startswith("[") else set()
-        fields = {name: parsed_json(t, name) if name in {*FIELD_ERRORS, *listed} else t for name, t in texts.items()}
+        as_json = {*FIELD_ERRORS, *(["scene"] if texts.get("scene", "").startswith("[") else [])}
+        as_json -= {"gps"} if texts.get("gps") == "exif" else set()
+        fields = {name: parsed_json(text, name) if name in as_json else text for name, text in texts.items()}
         files = [(p.filename or "", await p.read()) for p in photos if isinstance(p, UploadFile)]
         # Packing may take a second for many photos: not on the event loop.
         return await to_thread.run_sync(body_of, files, fields)

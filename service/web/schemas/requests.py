@@ -56,6 +56,41 @@ class PriorIn(PoseIn):
     """Lower and upper corner of an axis-aligned box in the world that contains the camera centre."""
 
 
+class UpIn(Model):
+    """Which way is up, as the device's accelerometer has it. Used in scenes that know their own up."""
+
+    direction: Annotated[list[float], Len(3, 3)]
+    """Up in the camera of the upright photo, in OpenCV axes (+x right, +y down, +z forward), of any length: `[0, -1, 0]`
+    for a level camera."""
+    sigma_deg: float = Field(default=1.0, ge=0.01, le=90, allow_inf_nan=False)
+    """Standard deviation."""
+
+
+class GpsIn(Model):
+    """Where the device was on Earth (WGS84). Used in scenes that are registered there, or have a `geo_anchor`."""
+
+    latitude: float = Field(ge=-90, le=90, allow_inf_nan=False)
+    """Degrees."""
+    longitude: float = Field(ge=-180, le=180, allow_inf_nan=False)
+    """Degrees."""
+    sigma_m: float = Field(ge=0.001, le=1e5, allow_inf_nan=False)
+    """Standard deviation to the east, and to the north, in metres: of a radius that holds 68 %, as phones state it,
+    two thirds."""
+    height: float | None = Field(default=None, ge=-1e5, le=1e5, allow_inf_nan=False)
+    """Metres above the ellipsoid, not above the sea."""
+    height_sigma_m: float = Field(default=10.0, ge=0.001, le=1e5, allow_inf_nan=False)
+    """Standard deviation of the height."""
+
+
+class HeadingIn(Model):
+    """Which way the camera looked, as the device's compass has it. Used in scenes that know where they are on Earth."""
+
+    degrees: float = Field(ge=-360, le=360, allow_inf_nan=False)
+    """Of the camera's axis, clockwise from true north."""
+    sigma_deg: float = Field(default=15.0, ge=0.01, le=180, allow_inf_nan=False)
+    """Standard deviation, of a level camera."""
+
+
 class AccuracyIn(Model):
     """How accurate a pose must be to be `localized`: `deg`, and at most one of `units`, `metres` and `share`."""
 
@@ -122,6 +157,15 @@ class LocalizeFields(Model):
     """A name of yours for the camera: the lens as estimated from its earlier photos is the prior of this one's, even
     without EXIF data. Of a phone name the phone: EXIF data distinguish its lenses; without these name the lens."""
     prior: PriorIn | None = None
+    up_in_camera: UpIn | None = None
+    """Gravity, measured beside the photo; of several photos, like `gps` and `heading`, beside the first. Each of the
+    three is tested against the photo: one that contradicts it is left out, and a warning of the result names both
+    values. Those that agree decide between places that look alike, and take part in pose and covariance."""
+    gps: GpsIn | Literal["exif"] | None = None
+    """Position of the device. `exif`: position and heading of the photo's EXIF data, which are not used else; of a
+    sequence, of each photo that is searched for."""
+    heading: HeadingIn | None = None
+    """Compass heading of the camera."""
     accuracy: AccuracyIn | None = None
     """Default: within 5 degrees and 2 % of the distance to what is seen."""
     truth: PoseIn | None = None
@@ -147,6 +191,9 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
     "options": InvalidOptions,
     "intrinsics": InvalidIntrinsics,
     "prior": InvalidPrior,
+    "up_in_camera": InvalidPrior,
+    "gps": InvalidPrior,
+    "heading": InvalidPrior,
     "accuracy": InvalidAccuracy,
     "truth": InvalidPrior,
     "times_s": InvalidRequest,
@@ -158,8 +205,9 @@ FIELD_ERRORS: dict[str, type[BadInput]] = {
 class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same fields.
 
-    In a form, `options`, `intrinsics`, `prior`, `accuracy`, `truth`, `times_s` and `rig` are JSON text, and `photo` is
-    a file, or several of one camera, in the order in which they were taken, or of a rig.
+    In a form, `options`, `intrinsics`, `prior`, `up_in_camera`, `gps`, `heading`, `accuracy`, `truth`, `times_s` and
+    `rig` are JSON text (or `gps` is `exif`), and `photo` is a file, or several of one camera, in the order in which they
+    were taken, or of a rig.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})

@@ -125,7 +125,7 @@ export class Client {
    * Localize a photo, a video, or several photos of one camera in their order; resolves to the job with its result. A
    * photo that is not localized is a result. Raises ServiceError.
    * @param {Blob | Blob[]} photos
-   * @param {Record<string, any>} [fields]  of docs/api.md: scene, intrinsics, prior, ...; objects are sent as JSON
+   * @param {Record<string, any>} [fields]  of docs/api.md: scene, intrinsics, prior, gps, ...; objects are sent as JSON
    * @param {Watch} [watch]
    * @returns {Promise<FinishedJob>}
    */
