@@ -55,7 +55,7 @@ def write_room(
         quats, colours = (np.concatenate([part[one]] * 2) for part in (quats, colours))
     poses = training_poses(cameras)
     if apart:
-        means = np.concatenate([means, means + [apart, 0, 0]])
+        means = np.concatenate([means, means + np.array([apart, 0, 0])])
         quats, colours = np.concatenate([quats] * 2), np.concatenate([colours] * 2)
         shift = np.eye(4)
         shift[0, 3] = apart

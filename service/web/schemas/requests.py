@@ -60,8 +60,8 @@ class UpIn(Model):
     """Which way is up, as the device's accelerometer has it. Used in scenes that know their own up."""
 
     direction: Annotated[list[float], Len(3, 3)]
-    """Up in the camera of the upright photo, in OpenCV axes (+x right, +y down, +z forward), of any length: `[0, -1, 0]`
-    for a level camera."""
+    """Up in the camera of the upright photo, in OpenCV axes (+x right, +y down, +z forward), of any length; of a level
+    camera `[0, -1, 0]`."""
     sigma_deg: float = Field(default=1.0, ge=0.01, le=90, allow_inf_nan=False)
     """Standard deviation."""
 
@@ -206,8 +206,8 @@ class LocalizeIn(LocalizeFields):
     """A request to localize a photo, as a JSON body; a multipart form has the same fields.
 
     In a form, `options`, `intrinsics`, `prior`, `up_in_camera`, `gps`, `heading`, `accuracy`, `truth`, `times_s` and
-    `rig` are JSON text (or `gps` is `exif`), and `photo` is a file, or several of one camera, in the order in which they
-    were taken, or of a rig.
+    `rig` are JSON text (or `gps` is `exif`), and `photo` is a file, or several of one camera, in the order in which
+    they were taken, or of a rig.
     """
 
     photo: str = Field(json_schema_extra={"contentEncoding": "base64"})
