@@ -185,6 +185,17 @@ def test_a_job_tells_its_region(shared):
     assert again["prior_region"]["covariance"] == covariance
 
 
+def test_readings_of_a_device_reach_the_photo_and_what_the_scene_can_not_use_is_said(shared):
+    """The stand-in's scene says which way is up, and not where on Earth it is."""
+    gps, heading = {"latitude": 47.3, "longitude": 8.5, "sigma_m": 5}, {"degrees": 120}
+    job = post(shared, gps=gps, heading=heading).json()
+    said = [warning for warning in job["result"]["warnings"] if "not used" in warning]
+    assert [warning.split(" was")[0] for warning in said] == ["the GPS position", "the heading"]
+    by_exif = post(shared, gps="exif").json()["result"]["warnings"]
+    assert any("no position in its EXIF data" in warning for warning in by_exif)
+    assert not any("EXIF" in warning for warning in post(shared).json()["result"]["warnings"])
+
+
 def test_events_come_live_from_the_first_and_end_with_the_result(client, stepping):
     path = post(client, prefer="", options={"hold": True}).headers["location"]
     with client.stream("GET", f"{path}/events") as stream:
@@ -555,6 +566,13 @@ BAD_FIELDS = [
     ({"truth": {"box": [[0, 0, 0], [1, 1, 1]]}}, 422, "invalid_prior", "truth.box"),
     ({"truth": {"world_from_camera": SHEARED}}, 422, "invalid_prior", "truth.world_from_camera"),
     ({"prior": {"convention": "blender"}}, 422, "invalid_prior", "prior.convention"),
+    ({"up_in_camera": {"direction": [0, 0, 0]}}, 422, "invalid_prior", "up_in_camera.direction"),
+    ({"up_in_camera": {"direction": [0, -1]}}, 422, "invalid_prior", "up_in_camera.direction"),
+    ({"up_in_camera": {"direction": [0, -1, 0], "sigma_deg": 0}}, 422, "invalid_prior", "up_in_camera.sigma_deg"),
+    ({"gps": {"latitude": 91, "longitude": 8, "sigma_m": 5}}, 422, "invalid_prior", "gps.latitude"),
+    ({"gps": {"latitude": 47, "longitude": 8}}, 422, "invalid_prior", "gps.sigma_m"),
+    ({"gps": "here"}, 422, "invalid_prior", "gps"),
+    ({"heading": {"degrees": 120, "sigma_deg": 0}}, 422, "invalid_prior", "heading.sigma_deg"),
     ({"accuracy": {"metres": 0.1}}, 422, "invalid_accuracy", "accuracy.metres"),
     ({"accuracy": {"metres": 0.1, "share": 0.1}}, 422, "invalid_accuracy", "accuracy.share"),
     ({"accuracy": {"deg": 0}}, 422, "invalid_accuracy", "accuracy.deg"),
@@ -576,6 +594,7 @@ def test_a_refusal_names_what_is_allowed_with_an_example_that_is_right(shared):
         **{"seed": "x", "budget_s": "0", "deadline_s": "0", "camera_id": "/", "every": "0", "keep_photo": "maybe"},
         **{"options": "{", "prior": {"pose": 1}, "truth": {"pose": 1}, "intrinsics": {"fov": 60}, "times_s": "[1]"},
         "accuracy": {"cm": 3},
+        **{"up_in_camera": {"down": 1}, "gps": {"lat": 1}, "heading": {"north": 1}},
     }
     assert wrong.keys() <= hints.EXAMPLES.keys()
     for field, value in wrong.items():

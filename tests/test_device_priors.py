@@ -13,7 +13,7 @@ from service.device_readings import DeviceReadings, GpsPosition, Gravity, Headin
 from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geodesy import geographic
-from service.geometry import look_at, moved, pose_distance
+from service.geometry import look_at, moved, se3_log
 from service.localize import Request
 from service.pose.absolute_pose.device_priors import contradicts, prefers, residuals, with_readings
 from service.readings_in_scene import scene_priors
@@ -110,20 +110,20 @@ def test_the_covariance_by_photo_and_readings_holds() -> None:
     rng = np.random.default_rng(2)
     covariance = np.diag(np.r_[np.full(3, 0.02), np.full(3, 0.4)] ** 2)
     squared = []
+    # The scene's own errors, 2 degrees and 1 m, are drawn with the device's.
+    known = scene_priors(DeviceReadings(gps=gps_at(TRUTH, 1.0)), INFO).position
+    assert known is not None
     for _ in range(300):
         start = moved(TRUTH, rng.multivariate_normal(np.zeros(6), covariance))
-        east, up = (
-            rng.normal(0, np.hypot(1.0, 1.0)),
-            moved(TRUTH, np.r_[rng.normal(0, np.hypot(1, 2), 3), 0, 0, 0] / 57.3),
-        )
-        priors = scene_priors(DeviceReadings(gravity_at(up), gps_at(TRUTH, 1.0, east)), INFO)
+        tilted = moved(TRUTH, np.r_[np.radians(rng.normal(0, np.hypot(1, 2), 3)), 0, 0, 0])
+        off = np.linalg.solve(ANCHOR.enu_from_world[:3, :3], np.r_[rng.normal(0, np.hypot(1, 1), 2), 0])
+        priors = scene_priors(DeviceReadings(gravity_at(tilted)), INFO)
+        priors = replace(priors, position=replace(known, position_in_world=known.position_in_world + off))
         pose, fused = with_readings(priors, start, covariance)
-        from service.geometry import se3_log
-
         twist = se3_log(pose.camera_from_world @ TRUTH.world_from_camera)
         squared.append(twist @ np.linalg.solve(fused, twist))
-    # North is without an error here, hence a little less than 6.
-    assert 5.2 < np.mean(squared) < 6.4
+    # 6, with a standard error of 0.2.
+    assert 5.4 < np.mean(squared) < 6.6
 
 
 def test_what_is_far_from_a_reading_contradicts_it() -> None:
@@ -144,9 +144,8 @@ def test_readings_that_differ_too_little_or_contradict_both_decide_nothing() -> 
     def decide(readings: DeviceReadings) -> bool:
         return prefers(scene_priors(readings, INFO), TRUTH, None, TWIN, None)
 
-    apart = pose_distance(TRUTH, TWIN)[1] * 2.5
-    assert decide(DeviceReadings(gps=gps_at(TRUTH, 0.1 * apart))) is (apart**2 / (0.01 * apart**2 + 1.0) > 10.83)
-    assert not decide(DeviceReadings(gps=gps_at(TRUTH, apart)))
+    # The twin is 3 m away: nothing against a sigma of as much, and the scene's own 1 m.
+    assert not decide(DeviceReadings(gps=gps_at(TRUTH, 3.0)))
     assert not decide(DeviceReadings(gps=gps_at(TRUTH, 2.0, 300.0)))
     assert decide(DeviceReadings(heading=heading_at(TRUTH)))
     # Gravity that only the other one agrees with outweighs whatever else there is.
@@ -174,9 +173,8 @@ def test_a_registration_counts_before_the_files_and_adds_its_own_uncertainty() -
     assert priors.position is not None
     arm = similarity()[:3, :3] @ TRUTH.position_in_world
     # A turn by 0.05 rad moves what is an arm away, too.
-    assert priors.position.covariance[0, 0] == pytest.approx(
-        1 + 9 + (0.05 * arm[1]) ** 2 + (0.02 * arm[2]) ** 2, rel=1e-3
-    )
+    by_turns = (0.05 * arm[1]) ** 2 + (0.02 * arm[2]) ** 2
+    assert priors.position.covariance[0, 0] == pytest.approx(1 + 9 + by_turns, rel=1e-3)
 
 
 def test_a_scene_without_up_or_place_says_what_it_can_not_use() -> None:

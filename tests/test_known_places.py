@@ -10,10 +10,12 @@ import pytest
 from PIL import Image
 from small_room import pose_at
 
+from service.device_readings import DeviceReadings, GpsPosition, Heading
 from service.errors import InvalidRequest
 from service.geodesy import enu_from_geographic
 from service.geometry import look_at, quat_from_rotation, so3_exp
-from service.photos.images import open_photo
+from service.photos.exif_gps import with_readings
+from service.photos.images import open_photo, query_of
 from service.registration.gathering import GatherOptions, LocalizedPhoto, gathered
 from service.registration.known_places import exif_places, place_table, scene_points, trajectory_places
 from service.registration.known_places.known_place import KnownPlace, KnownPlaces, in_metres, observation_of
@@ -170,6 +172,21 @@ def test_gps_in_exif_with_altitude_and_heading():
     hostile = {1: "N", 2: "x", 3: "E", 4: (1, 2), 6: b"?"}
     assert exif_places.read([("a", hostile)], 0.0).places == ()
     assert exif_places.read([("a", {2: (0, 0, 0), 4: (0, 0, 0)})], 0.0).places == ()
+
+
+def test_a_photo_s_own_place_counts_only_where_it_is_asked_for():
+    tags = {1: "N", 2: (47.0, 0.0, 0.0), 3: "E", 4: (8.0, 30.0, 0.0), 5: b"\x00", 6: 408.5, 16: "M", 17: 90.0}
+    opened = open_photo(with_gps(tags))
+    query = query_of(np.zeros((240, 320, 3), np.uint8))
+    assert with_readings(query, None).readings is None
+    found = with_readings(query, DeviceReadings(heading=Heading(10.0)), opened).readings
+    # By magnetic north 25 degrees, unless the request has a heading of its own; the geoid isn't known.
+    assert found.gps == GpsPosition(47.0, 8.5, 5.0, 408.5, pytest.approx(np.hypot(10, 30)))
+    assert found.heading == Heading(10.0)
+    assert with_readings(query, None, opened).readings.heading == Heading(90.0, 25.0)
+    nowhere = with_readings(query, None, open_photo(with_gps({6: 1e7})))
+    assert nowhere.readings.gps is None
+    assert "no position" in nowhere.warnings[-1]
 
 
 def test_geographic_places_become_metres_east_north_up():

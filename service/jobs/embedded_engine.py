@@ -234,8 +234,8 @@ def run_task(
 ) -> tuple[JobResult, LoadedScene]:
     """Localize on this thread, in one scene or in the one of several that the photo shows; return that scene, too.
 
-    A sequence, or a rig, is localized in the first scene. `registrations` are the scenes': they place the result's pose,
-    and what the device measured.
+    A sequence, or a rig, is localized in the first scene. `registrations` are the scenes': they place the result's
+    pose, and what the device measured.
     """
     options = ESTIMATORS.load(task.estimator).Options(**task.options)
     known = {one.scene_sha256: one for one in registrations if one is not None}
