@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from small_room import HALF_TURN
-from test_estimators import unseen_pose
+from small_room import HALF_TURN, UPSIDE_DOWN, pose_at, write_room
+from test_estimators import assert_near, photo_at, unseen_pose
 
 from service.device_readings import DeviceReadings, GpsPosition, Gravity, Heading
 from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geodesy import geographic
-from service.geometry import look_at, moved, se3_log
-from service.localize import Request
+from service.geometry import look_at, moved, pose_distance, se3_log
+from service.loaded_scene import LoadedScene
+from service.localize import Request, localize
 from service.pose.absolute_pose.device_priors import contradicts, prefers, residuals, with_readings
 from service.readings_in_scene import scene_priors
 from service.registration.registration import PARTS, Origin, Registration
+from service.results import PoseEstimate, Reason, Status
+from service.scene_origin import shifted
 from service.types import GeoAnchor, Pose, SceneInfo
 
 FAST = Request(options=Options(effort="fast"))
@@ -25,8 +29,12 @@ TRUTH = unseen_pose()
 TWIN = Pose(HALF_TURN @ TRUTH.world_from_camera)
 
 
-def similarity(turn: float = 0.7, scale: float = 2.5) -> np.ndarray:
-    """Metres east, north and up of a scene whose z is up: turned, and 2.5 m a unit."""
+APART = 6.0
+"""Units between two rooms like one another: 10 m."""
+
+
+def similarity(turn: float = 0.7, scale: float = 10 / APART) -> np.ndarray:
+    """Metres east, north and up of a scene whose z is up: turned, and scaled."""
     matrix = np.eye(4)
     matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     matrix[:3, :3] *= scale
@@ -144,7 +152,7 @@ def test_readings_that_differ_too_little_or_contradict_both_decide_nothing() -> 
     def decide(readings: DeviceReadings) -> bool:
         return prefers(scene_priors(readings, INFO), TRUTH, None, TWIN, None)
 
-    # The twin is 3 m away: nothing against a sigma of as much, and the scene's own 1 m.
+    # The twin is 2 m away: nothing against a sigma of as much, and the scene's own 1 m.
     assert not decide(DeviceReadings(gps=gps_at(TRUTH, 3.0)))
     assert not decide(DeviceReadings(gps=gps_at(TRUTH, 2.0, 300.0)))
     assert decide(DeviceReadings(heading=heading_at(TRUTH)))
@@ -207,3 +215,78 @@ def test_what_is_no_reading_is_refused(make, where: str) -> None:
     with pytest.raises(InvalidPrior) as error:
         make()
     assert error.value.where == where
+
+
+# ---------------------------------------------------------------------- in scenes
+
+
+def on_earth(folder: Path, **kind) -> LoadedScene:
+    """A room of `small_room` that says where it is, and which way is up."""
+    loaded = LoadedScene.load(write_room(folder / "room", 12, **kind), cache_dir=folder / "cache")
+    info = replace(loaded.scene.info, up_in_world=(0.0, 0.0, 1.0), geo_anchor=ANCHOR)
+    return replace(loaded, scene=replace(loaded.scene, info=info))
+
+
+ALONG_Y = moved(pose_at(0.5 * np.pi, 0.1), np.array([0.05, 0.03, -0.04, 0.1, -0.05, 0.1]))
+"""Looks past the other room, which shines through the walls a little."""
+IN_OTHER_ROOM = shifted(ALONG_Y, np.array([APART, 0, 0]))
+FLIPPED = Pose(UPSIDE_DOWN @ TRUTH.world_from_camera)
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    return on_earth(tmp_path_factory.mktemp("rooms"), apart=APART)
+
+
+@pytest.fixture(scope="module")
+def tumbled(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+    return on_earth(tmp_path_factory.mktemp("tumbled"), upside_down=True)
+
+
+def found_with(loaded: LoadedScene, pose: Pose, readings: DeviceReadings | None) -> PoseEstimate:
+    return localize(replace(photo_at(loaded, pose), readings=readings), loaded, FAST)
+
+
+def against(found: PoseEstimate) -> list[str]:
+    return [warning.split()[1] for warning in found.warnings if "not used" in warning]
+
+
+def test_gps_tells_two_rooms_apart_that_are_the_same(rooms: LoadedScene) -> None:
+    """10 m: by a sigma of 2 m, not by one of 10 m."""
+    without = found_with(rooms, ALONG_Y, None)
+    assert without.verdict.reason is Reason.AMBIGUOUS
+    for place in (ALONG_Y, IN_OTHER_ROOM):
+        found = found_with(rooms, ALONG_Y, DeviceReadings(gps=gps_at(place, 2.0)))
+        assert found.verdict.status is Status.LOCALIZED
+        assert_near(found.pose, place)
+        assert not against(found)
+        vague = found_with(rooms, ALONG_Y, DeviceReadings(gps=gps_at(place, 10.0)))
+        assert vague.verdict.reason is Reason.AMBIGUOUS
+
+
+def test_gravity_tells_a_room_from_itself_upside_down(tumbled: LoadedScene) -> None:
+    """A camera that is held upside down sees there what an upright one does."""
+    assert_near(found_with(tumbled, FLIPPED, None).pose, TRUTH)
+    for place in (TRUTH, FLIPPED):
+        found = found_with(tumbled, place, DeviceReadings(gravity=gravity_at(place)))
+        assert found.verdict.status is Status.LOCALIZED
+        assert_near(found.pose, place)
+        assert not against(found)
+
+
+WRONG = {
+    "gravity": lambda pose: DeviceReadings(gravity=gravity_at(moved(pose, np.array([0, 0, np.pi / 2, 0, 0, 0])))),
+    "position": lambda pose: DeviceReadings(gps=gps_at(pose, 2.0, 50.0)),
+    "heading": lambda pose: DeviceReadings(heading=heading_at(pose, 120.0)),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_what_is_wrong_is_left_out_and_named_and_the_photo_alone_counts(
+    kind: str, rooms: LoadedScene, tumbled: LoadedScene
+) -> None:
+    for loaded, pose, reason in ((rooms, ALONG_Y, Reason.AMBIGUOUS), (tumbled, TRUTH, Reason.VERIFIED)):
+        found = found_with(loaded, pose, WRONG[kind](pose))
+        assert found.verdict.reason is reason
+        assert min(pose_distance(found.pose, place)[1] for place in (pose, IN_OTHER_ROOM)) < 0.01
+        assert against(found) == [kind]

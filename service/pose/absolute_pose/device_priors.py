@@ -29,7 +29,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 
 from service.device_readings import HeadingPrior, PositionPrior, ScenePriors, UpPrior
 from service.geometry import hat, moved
@@ -46,14 +46,12 @@ class DevicePriorConfig:
     """Difference of squared distances from which on readings decide between two poses."""
     least_level: float = 0.2
     """Share of the camera's axis that is level below which it has no heading: steeper than 78 degrees."""
-    view_pitch: float = 0.9
-    view_turn: float = 1.1
-    """rad, by which the axis of a view may differ from the photo's, up or down and seen from above: the field of view
-    of a phone and what features tolerate,"""
-    view_way: float = 1.0
-    """and by how far a view may be away, relative to the distance to what it sees."""
-    view_sigmas: float = 3.0
-    """Standard deviations of the reading that are added to these."""
+    view_pitch: float = 0.5
+    view_turn: float = 0.6
+    """Standard deviations, rad, by which the axis of a view that shows the same differs from the photo's, up or down
+    and seen from above: half of a phone's field of view,"""
+    view_way: float = 0.5
+    """and of its place, relative to the distance to what it sees."""
 
 
 DEVICE_PRIORS = DevicePriorConfig()
@@ -172,37 +170,39 @@ def prefers(
     return difference >= config.preferred
 
 
-def compatible(
+def agreement(
     priors: ScenePriors | None,
     poses: Float64[np.ndarray, "n 4 4"],
     reaches: Float64[np.ndarray, "n"],
     config: DevicePriorConfig = DEVICE_PRIORS,
-) -> Bool[np.ndarray, "n"]:
-    """Return which views may show what a photo with these readings shows: by pitch, heading and place of each.
+) -> Float64[np.ndarray, "n"]:
+    """Return how well each view agrees with the readings of a photo, 0 to 1: exp(-d^2 / 2), summed over the readings.
 
-    `poses` are the views' world_from_camera, `reaches` their distances to what they see, in scene units.
+    `poses` are the views' world_from_camera, `reaches` their distances to what they see, in scene units. A view shows
+    what the photo does from elsewhere: d^2 is by pitch, heading and place of its camera, with how far these may differ
+    (`view_pitch`, `view_turn`, `view_way`) added to the reading's variance.
     """
-    keep = np.ones(len(poses), bool)
+    squared = np.zeros(len(poses))
     if priors is None:
-        return keep
+        return np.exp(squared)
     axes, positions = poses[:, :3, 2], poses[:, :3, 3]
     if priors.up is not None:
         pitch = np.arcsin(np.clip(axes @ priors.up.up_in_world, -1, 1))
         measured = np.arcsin(np.clip(priors.up.up_in_camera[2], -1, 1))
-        keep &= np.abs(pitch - measured) < config.view_pitch + config.view_sigmas * priors.up.sigma
+        squared += (pitch - measured) ** 2 / (config.view_pitch**2 + priors.up.sigma**2)
     if priors.heading is not None:
         east, north = axes @ priors.heading.east_in_world, axes @ priors.heading.north_in_world
-        turn = np.abs((np.arctan2(east, north) - priors.heading.radians + np.pi) % (2 * np.pi) - np.pi)
+        turn = (np.arctan2(east, north) - priors.heading.radians + np.pi) % (2 * np.pi) - np.pi
         steep = np.hypot(east, north) < config.least_level
-        keep &= steep | (turn < config.view_turn + config.view_sigmas * priors.heading.sigma)
+        squared += np.where(steep, 0.0, turn**2 / (config.view_turn**2 + priors.heading.sigma**2))
     if priors.position is not None:
         rows = priors.position.metres_from_world
-        metres = np.linalg.norm((positions - priors.position.position_in_world) @ rows.T, axis=1)
-        sigma = float(np.sqrt(np.linalg.eigvalsh(priors.position.covariance)[-1]))
+        metres = (positions - priors.position.position_in_world) @ rows.T
         # Along each axis a unit has as many metres: the scale of a similarity.
         reach = config.view_way * reaches * float(np.linalg.norm(rows[0]))
-        keep &= metres < reach + config.view_sigmas * sigma
-    return keep
+        spread = priors.position.covariance + (reach**2)[:, None, None] * np.eye(len(rows))
+        squared += (metres * np.linalg.solve(spread, metres[..., None])[..., 0]).sum(1)
+    return np.exp(-0.5 * squared)
 
 
 # ---------------------------------------------------------------------- photo and readings together

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from service.interfaces import Features
-from service.pose.absolute_pose.device_priors import compatible
+from service.pose.absolute_pose.device_priors import agreement
 from service.pose.absolute_pose.prior_region import distance_outside
 from service.pose.features.image_sizes import PHOTO_PX
 from service.pose.features.in_plane_rotation import rolls_to_upright
@@ -39,6 +39,8 @@ class RetrievalConfig:
     and more, of those rotated by 90 degrees 1.3 at most."""
     least_level: float = 0.3
     """Share of up by gravity that lies in the image plane from which on it tells the photo's rotation."""
+    least_agreement: float = 0.01
+    """Of a view with the device's readings below which it isn't compared because of them: three standard deviations."""
     oblique_shrink: float = 0.8
     """Size of a photo rotated by an odd multiple of 45 degrees, which needs twice the canvas."""
     views_outside_prior: int = 16
@@ -141,14 +143,16 @@ class Retrieval:
     ) -> Int64[np.ndarray, "k"]:
         """Return the views most like the variant, best first; `support` is added to their scores.
 
-        Of a photo with readings of the device those that agree with these come first, `count` of them, then of the
-        `count` best ones the others, unless it is `only_agreeing`: the readings may be wrong.
+        Of a photo with readings of the device those come first, `count` of them, whose scores are best with the weight
+        that their agreement with the readings gives them, then the others of the `count` best, unless it is
+        `only_agreeing`: the readings may be wrong.
         """
-        scores, agree = self.scores(variant) + support, self._agreeing()
+        scores, weights = self.scores(variant) + support, self._agreement()
         best = top_indices(scores, count)
-        if agree.all():
+        if weights is None:
             return best
-        first = top_indices(np.where(agree, scores, -np.inf), min(count, int(agree.sum())))
+        agree = weights >= self.config.least_agreement
+        first = top_indices(np.where(agree, weights * scores, -np.inf), min(count, int(agree.sum())))
         return first if only_agreeing else np.concatenate([first, best[~np.isin(best, first)]])
 
     def roll_by_gravity(self) -> int | None:
@@ -162,15 +166,15 @@ class Retrieval:
             return None
         return round(np.degrees(np.arctan2(x, -y)) / 45) % 8
 
-    def _agreeing(self) -> Bool[np.ndarray, "views"]:
-        """Return which views may show what the photo does by the device's readings."""
+    def _agreement(self) -> Float64[np.ndarray, "views"] | None:
+        """Return how well the views agree with the device's readings, 0 to 1; None: it has none."""
         priors, views = self.images.query.scene_priors, self.index.views
         if priors is None:
-            return np.ones(len(views), bool)
+            return None
         poses = np.stack([view.camera.pose.world_from_camera for view in views])
         # A sample is enough for a median; a view without points sees nothing.
         away = [np.linalg.norm(v.points_in_world[::8] - v.camera.pose.position_in_world, axis=1) for v in views]
-        return compatible(priors, poses, np.array([np.median(d) if len(d) else 0.0 for d in away]))
+        return agreement(priors, poses, np.array([np.median(d) if len(d) else 0.0 for d in away]))
 
     def _demoted_outside_prior(self, scores: Float64[np.ndarray, "views"]) -> Float64[np.ndarray, "views"]:
         region = self.images.query.region
