@@ -251,6 +251,7 @@ def against(found: PoseEstimate) -> list[str]:
     return [warning.split()[1] for warning in found.warnings if "not used" in warning]
 
 
+@pytest.mark.ci
 def test_gps_tells_two_rooms_apart_that_are_the_same(rooms: LoadedScene) -> None:
     """10 m: by a sigma of 2 m, not by one of 10 m."""
     without = found_with(rooms, ALONG_Y, None)
@@ -270,6 +271,7 @@ def test_gravity_tells_a_room_from_itself_upside_down(tumbled: LoadedScene) -> N
     for place in (TRUTH, FLIPPED):
         found = found_with(tumbled, place, DeviceReadings(gravity=gravity_at(place)))
         assert found.verdict.status is Status.LOCALIZED
+        assert found.records[-1].stage == "fuse_readings"
         assert_near(found.pose, place)
         assert not against(found)
 
@@ -281,6 +283,7 @@ WRONG = {
 }
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("kind", WRONG)
 def test_what_is_wrong_is_left_out_and_named_and_the_photo_alone_counts(
     kind: str, rooms: LoadedScene, tumbled: LoadedScene

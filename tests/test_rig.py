@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from api_server import assert_problem, fake_estimators, ready_service
 from api_server import photo as any_photo
-from small_room import FOCAL, HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
+from small_room import FOCAL, HALF_TURN, HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 from typer.testing import CliRunner
 
 from service.cli.app import app
+from service.device_readings import DeviceReadings, Heading
 from service.errors import InvalidRequest
 from service.estimators.view_index import Options
 from service.geometry import moved, pose_distance
@@ -21,7 +23,7 @@ from service.localize import Request, localize
 from service.photos.images import encode_image, query_of
 from service.results import Reason, Status
 from service.rig import RigPhoto, localize_rig
-from service.types import Camera, Intrinsics, Pose
+from service.types import Camera, GeoAnchor, Intrinsics, Pose
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
 TILT = np.array([0.15, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -87,11 +89,25 @@ def test_wrong_relative_poses_are_never_localized(room):
 
 
 @pytest.mark.ci
-def test_a_rig_in_a_room_that_repeats_itself_is_ambiguous(tmp_path):
-    """Each of its photos, and so the rig, has two places."""
+def test_a_rig_in_a_room_that_repeats_itself_is_ambiguous_unless_a_heading_decides(tmp_path):
+    """Each of its photos, and so the rig, has two places, half a turn apart."""
     twice = LoadedScene.load(write_room(tmp_path / "room", 12, repeated=True), cache_dir=tmp_path)
-    found = localize_rig(photos(twice, hidden=0.0), twice)
+    info = replace(twice.scene.info, geo_anchor=GeoAnchor(47.3, 8.5, 450.0, np.eye(4)))
+    twice = replace(twice, scene=replace(twice.scene, info=info))
+    first, *others = photos(twice, hidden=0.0)
+    found = localize_rig([first, *others], twice)
     assert (found.estimate.verdict.status, found.estimate.verdict.reason) == (Status.UNCERTAIN, Reason.AMBIGUOUS)
+    # The world's y is north.
+    heading = float(np.degrees(np.arctan2(*POSES[0].axis_in_world[:2])))
+    for off, truth in ((5.0, WORLD_FROM_RIG), (185.0, Pose(HALF_TURN @ WORLD_FROM_RIG.world_from_camera))):
+        readings = DeviceReadings(heading=Heading((heading + off) % 360))
+        found = localize_rig([replace(first, query=replace(first.query, readings=readings)), *others], twice)
+        assert found.estimate.verdict.status is Status.LOCALIZED
+        assert pose_distance(found.world_from_rig, truth)[1] < 0.01
+    readings = DeviceReadings(heading=Heading((heading + 90) % 360))
+    found = localize_rig([replace(first, query=replace(first.query, readings=readings)), *others], twice)
+    assert found.estimate.verdict.reason is Reason.AMBIGUOUS
+    assert any("heading" in warning for warning in found.estimate.warnings)
 
 
 def test_a_rig_in_metres_needs_a_scene_in_metres(room):
