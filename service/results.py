@@ -163,7 +163,7 @@ HINTS: dict[Reason, str] = {
     ),
     Reason.AMBIGUOUS: (
         "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
-        "or a Gaussian."
+        "or a Gaussian, or the device's `gps`, `heading` and `up_in_camera`."
     ),
     Reason.MIRRORED: (
         "The photo's mirror image fits the scene better: send it as it was taken; front cameras often mirror."

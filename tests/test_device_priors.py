@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from small_room import HALF_TURN, UPSIDE_DOWN, pose_at, write_room
-from test_estimators import assert_near, photo_at, unseen_pose
+from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
 from service.device_readings import DeviceReadings, GpsPosition, Gravity, Heading
 from service.errors import InvalidPrior
 from service.estimators.view_index import Options
 from service.geodesy import geographic
 from service.geometry import look_at, moved, pose_distance, se3_log
+from service.live.live_tracker import LiveTracker
+from service.live.live_values import LiveFrame, LiveTask
 from service.loaded_scene import LoadedScene
 from service.localize import Request, localize
+from service.photos.images import encode_image
 from service.pose.absolute_pose.device_priors import contradicts, prefers, residuals, with_readings
 from service.readings_in_scene import scene_priors
 from service.registration.registration import PARTS, Origin, Registration
@@ -293,3 +298,20 @@ def test_what_is_wrong_is_left_out_and_named_and_the_photo_alone_counts(
         assert found.verdict.reason is reason
         assert min(pose_distance(found.pose, place)[1] for place in (pose, IN_OTHER_ROOM)) < 0.01
         assert against(found) == [kind]
+
+
+@pytest.mark.ci
+def test_a_live_session_searches_with_the_frames_gravity(tumbled: LoadedScene) -> None:
+    """A camera held upside down: without gravity it is found upright."""
+    jpeg = encode_image(photo_at(tumbled, FLIPPED).rgb)
+    for up, truth in ((None, TRUTH), (gravity_at(FLIPPED).direction, FLIPPED)):
+        with closing(LiveTracker(LiveTask("", "view_index", intrinsics=LENS), tumbled)) as tracker:
+            for number in range(400):
+                answer = tracker.use(LiveFrame(number, 0.05 * number, jpeg, up_in_camera=up))
+                if answer.pose is not None:
+                    break
+                time.sleep(0.05)
+        assert answer.verdict is not None
+        assert answer.verdict.status is Status.LOCALIZED
+        assert answer.pose is not None
+        assert_near(answer.pose, truth)
