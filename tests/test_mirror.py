@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from small_room import write_room
 from test_estimators import LENS, assert_near, photo_at, unseen_pose
 
+from service.device_readings import DeviceReadings, Gravity
 from service.estimators.search_config import SEARCH
-from service.geometry import project, transformed
+from service.geometry import moved, project, transformed
 from service.loaded_scene import LoadedScene
 from service.localize import Request, localize
 from service.pose.features.mirrored_query import mirrored_query
@@ -73,6 +74,19 @@ def test_a_region_that_excludes_the_mirrored_place_changes_nothing(symmetric: Lo
     there = (MIRROR @ truth.world_from_camera @ MIRROR)[:3, 3]
     query = replace(mirrored_query(photo_at(symmetric, truth)), region=BoxPrior(there - 0.2, there + 0.2))
     assert localize(query, symmetric).verdict.reason is Reason.MIRRORED
+
+
+@pytest.mark.ci
+def test_gravity_of_a_rolled_camera_tells_whether_its_photo_is_mirrored(symmetric: LoadedScene) -> None:
+    """Measured in the camera: mirroring the photo afterwards rolls what it shows to the other side."""
+    truth = moved(unseen_pose(), np.array([0, 0, 0.4, 0, 0, 0]))
+    info = replace(symmetric.scene.info, up_in_world=(0.0, 0.0, 1.0))
+    upright = replace(symmetric, scene=replace(symmetric.scene, info=info))
+    mirrored = mirrored_query(photo_at(upright, truth))
+    x, y, z = truth.world_from_camera[2, :3].tolist()
+    for up, is_mirrored in (((x, y, z), True), ((-x, y, z), False)):
+        found = localize(replace(mirrored, readings=DeviceReadings(gravity=Gravity(up))), upright)
+        assert (found.verdict.reason is Reason.MIRRORED) is is_mirrored
 
 
 @pytest.mark.parametrize("kind", ["ordinary", "repeated", "symmetric"])

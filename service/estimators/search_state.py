@@ -306,6 +306,9 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     )
     if found is None:
         return False
+    # A camera that was rolled, by gravity: its mirror image is rolled to the other side.
+    if prefers(state.images.query.scene_priors, best.refined.pose, best.verdict.covariance, found.pose, None):
+        return False
     # Both may be wrong: a poor answer is no evidence for the mirror image.
     if not state.finished and mirrored.verify(found).status is not Status.LOCALIZED:
         return False
