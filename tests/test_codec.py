@@ -10,6 +10,7 @@ import pytest
 
 from service.accuracy import Accuracy
 from service.codec import VERSION, decode, encode
+from service.device_readings import DeviceReadings, GpsPosition, Gravity
 from service.errors import Failure
 from service.jobs.model import JobRecord, JobSpec, SequenceFrame
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
@@ -79,6 +80,15 @@ STORED_SPEC = {
             "prior": {"world_from_camera": IDENTITY},
             "region": {"lower_in_world": [0, 0, 0], "upper_in_world": [1, 2, 3]},
         },
+        "readings": {
+            "gravity": {"direction": [0.0, -1.0, 0.0], "sigma_deg": 1.0},
+            "gps": {
+                **{"latitude_deg": 47.0, "longitude_deg": 8.0, "sigma_m": 5.0, "height_m": None},
+                "height_sigma_m": 10.0,
+            },
+            "heading": None,
+        },
+        "exif_gps": False,
         **{"truth": None, "every": 2, "times_s": [0.5, 1.0], "seed": 7, "budget_s": 0.1, "deadline_s": None},
         "keep_photo": True,
         "accuracy": {"deg": 2.0, "units": 0.5, "metres": None, "share": None},
@@ -118,6 +128,7 @@ def test_a_stored_spec_is_read():
     assert (spec.scene, spec.options, spec.times_s, spec.seed) == (("a", "b"), {"candidates": 3}, (0.5, 1.0), 7)
     assert isinstance(spec.region, BoxPrior)
     assert spec.region.upper_in_world.tolist() == [1, 2, 3]
+    assert spec.readings == DeviceReadings(Gravity((0.0, -2.0, 0.0)), GpsPosition(47.0, 8.0, 5.0))
     assert spec.lens
     assert spec.lens.recalled
     assert spec.lens.recalled.prior == LensPrior(0.01, 0.004, 0.006)

@@ -181,7 +181,7 @@ def test_a_photo_s_own_place_counts_only_where_it_is_asked_for():
     assert with_readings(query, None).readings is None
     found = with_readings(query, DeviceReadings(heading=Heading(10.0)), opened).readings
     # By magnetic north 25 degrees, unless the request has a heading of its own; the geoid isn't known.
-    assert found.gps == GpsPosition(47.0, 8.5, 5.0, 408.5, pytest.approx(np.hypot(10, 30)))
+    assert found.gps == GpsPosition(47.0, 8.5, 5.0, 408.5, float(np.hypot(10, 30)))
     assert found.heading == Heading(10.0)
     assert with_readings(query, None, opened).readings.heading == Heading(90.0, 25.0)
     nowhere = with_readings(query, None, open_photo(with_gps({6: 1e7})))
