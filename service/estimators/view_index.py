@@ -132,7 +132,7 @@ def _check_readings(state: SearchState, options: Options) -> Generator[Iteration
     other = VerifiedPose(found, state.verify(found), variant)
     if other.verdict.status is Status.LOCALIZED and (not state.finished or state.readings_prefer(other, answer)):
         state.best, state.finished = other, True
-    yield state.best.record("check_readings")
+    yield (state.best or answer).record("check_readings")
 
 
 def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
