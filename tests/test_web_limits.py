@@ -404,7 +404,7 @@ def test_a_session_ends_without_frames_for_a_minute_or_with_its_key(monkeypatch,
         if len(slept) > 1:
             raise _End(0)
 
-    one._state.keys = SimpleNamespace(lives=lambda caller: key_lives)
+    one._state.keys = SimpleNamespace(still_valid=lambda caller: key_lives)
     watching = one._watch()
     monkeypatch.setattr("service.web.routes.live.asyncio", SimpleNamespace(sleep=sleep))
     with pytest.raises(_End) as caught:
