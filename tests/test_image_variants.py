@@ -47,7 +47,7 @@ def retrieval(
         for pose in poses
     ]
     lens = Intrinsics(640, 480, focal, focal, 320.0, 240.0)
-    query = SimpleNamespace(intrinsics=lens, intrinsics_source=source, region=region)
+    query = SimpleNamespace(intrinsics=lens, intrinsics_source=source, region=region, scene_priors=None)
     images: Any = SimpleNamespace(query=query, features=features, corners=lambda: None)
     found = Retrieval(images, SimpleNamespace(views=views, corners=None))  # type: ignore[arg-type]
     found._suggested.extend(suggested)

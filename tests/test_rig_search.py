@@ -27,7 +27,7 @@ def at(x: float = 0.0, *, turn: float = 0.0) -> Pose:
 
 
 def photo(mount: Pose) -> RigPhoto:
-    query: Any = SimpleNamespace(intrinsics=LENS)
+    query: Any = SimpleNamespace(intrinsics=LENS, scene_priors=None)
     return RigPhoto(query, mount)
 
 
