@@ -162,6 +162,7 @@ def test_a_doubt_limits_the_part_that_it_is_about(room: LoadedScene) -> None:
     assert sure.rank > about_lens.rank > about_place.rank
 
 
+@pytest.mark.ci
 def test_the_request_decides_through_search_and_tracking(room: LoadedScene) -> None:
     photo, strict = photo_at(room, TRUTH), replace(FAST, accuracy=Accuracy(units=1e-5))
     assert localize(photo, room, FAST).verdict.status is Status.LOCALIZED

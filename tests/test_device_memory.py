@@ -117,6 +117,7 @@ def scene():
 CAMERAS = [make_camera(32, 24, seed=seed) for seed in range(5)]
 
 
+@pytest.mark.ci
 def test_five_poses_are_one_call_and_equal_five_calls(scene, memory):
     counting = Counting()
     rasterizer = counting.put(scene)
@@ -138,6 +139,7 @@ def test_five_poses_are_one_call_and_equal_five_calls(scene, memory):
     )
 
 
+@pytest.mark.ci
 def test_calls_are_as_large_as_the_budget_allows(scene, memory):
     counting = Counting()
     rasterizer = counting.put(scene)
@@ -155,6 +157,7 @@ def test_calls_are_as_large_as_the_budget_allows(scene, memory):
     assert counting.calls[3:] == [1] * 5
 
 
+@pytest.mark.ci
 def test_a_call_without_memory_is_made_again_in_parts(scene, memory):
     full, counting = Counting(room=2), Counting()
     found = full.put(scene).render(CAMERAS)
@@ -195,6 +198,7 @@ def test_a_setting_is_the_budget(monkeypatch):
     assert told == [12, None]
 
 
+@pytest.mark.ci
 def test_features_of_renders_are_those_of_their_pixels(scene, memory, monkeypatch):
     """The GPU's matcher on the CPU: several renders at once, and halves of them where memory is short."""
     matcher = MATCHERS.load("xfeat").create_on("cpu")

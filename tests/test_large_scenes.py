@@ -78,6 +78,7 @@ def test_the_most_contributing_gaussians_are_kept(room: GaussianScene) -> None:
     assert np.abs(whole.rgb - part.rgb).mean() < 0.03
 
 
+@pytest.mark.ci
 @pytest.mark.parametrize("compressed", [False, True])
 def test_a_written_folder_is_the_scene(room: GaussianScene, tmp_path: Path, compressed: bool) -> None:
     source = tmp_path / "source"

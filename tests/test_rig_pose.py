@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from service.geometry import moved, pose_distance, transformed
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
@@ -32,6 +33,7 @@ def rig(seed: int, right: int, wrong: int, cameras: int = 4, noise_px: float = 0
     return found
 
 
+@pytest.mark.ci
 def test_cameras_that_fail_alone_find_the_pose_together():
     """Six right matches among 90 in each of four cameras: one in fifteen."""
     right, alone = 0, 0

@@ -77,6 +77,7 @@ def test_what_tells_the_places_apart_decides(repeated: LoadedScene) -> None:
     assert_near(found.pose, truth)
 
 
+@pytest.mark.ci
 def test_a_camera_is_not_followed_from_where_it_may_not_be(repeated: LoadedScene) -> None:
     tracker = Tracker(repeated, Request())
     for _ in range(2):
@@ -113,6 +114,7 @@ def stages(found: PoseEstimate) -> set[str]:
     return {record.stage for record in found.records}
 
 
+@pytest.mark.ci
 def test_other_colours_are_accepted_where_the_mirror_image_fits_less(symmetric: LoadedScene) -> None:
     truth = unseen_pose()
     photo = recoloured(photo_at(symmetric, truth))
@@ -136,6 +138,7 @@ def lit_by_lamps(photo: Query) -> Query:
     return replace(photo, rgb=np.clip(light * photo.rgb, 0, 255).astype(np.uint8))
 
 
+@pytest.mark.ci
 def test_colours_whose_edges_agree_are_accepted_in_any_light(symmetric: LoadedScene) -> None:
     truth = unseen_pose()
     photo = photo_at(symmetric, truth)
@@ -154,6 +157,7 @@ def test_colours_whose_edges_agree_are_accepted_in_any_light(symmetric: LoadedSc
     assert "check_rivals" not in stages(painted)
 
 
+@pytest.mark.ci
 def test_accepted_colours_need_edges_in_colour_unless_they_are_sure(symmetric: LoadedScene) -> None:
     photo = recoloured(photo_at(symmetric, unseen_pose()), 0.4)
 

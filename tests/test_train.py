@@ -111,6 +111,7 @@ def mean_psnr(scene: GaussianScene, photos: list[Photo]) -> float:
     return float(np.mean(-10 * np.log10(errors)))
 
 
+@pytest.mark.ci
 def test_a_planted_scene_comes_back_from_random_points(folder, tmp_path, monkeypatch, capsys):
     out = tmp_path / "retrained" / "scene.ply"
     options = ["--gaussians", "300", "--iterations", "400", "--random", "--cameras", "--every", "2"]
