@@ -100,7 +100,7 @@ export class RegistrationPart {
       ["Origin", origin && `${origin.latitude.toFixed(6)}°, ${origin.longitude.toFixed(6)}°, ${origin.height.toFixed(1)} m`],
       ["Largest residual", used.length ? `${Math.max(...used.map(({ metres }) => metres)).toFixed(3)} m` : null],
       ["Outliers", residuals.filter(residual => !residual.used).map(({ name }) => name).join(", ") || null],
-    ]), ...[found.reason, ...warnings, found.applies ? "" : "The scene has changed since: register again."].filter(Boolean)
+    ]), ...[...new Set([found.reason, ...warnings, found.applies ? "" : "The scene has changed since: register again."])].filter(Boolean)
       .map(text => h("p", { class: "quiet" }, text)), h("p", { class: "buttons" }, undo));
     say("The registration is shown");
   }
