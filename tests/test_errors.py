@@ -118,8 +118,9 @@ def troubled(stepping, tmp_path_factory) -> Iterator[SimpleNamespace]:
 
 def on_scene(s: SimpleNamespace, scene: str) -> str:
     """Return the ended job, as if it had been on another scene."""
-    writer = s.app.state.app_state.jobs._store._database._writer
-    writer.execute("UPDATE jobs SET scene = ? WHERE id = ?", (scene, s.done))
+    # In a transaction of its own: inside of the service's nobody would see it before that ends.
+    with s.app.state.app_state.jobs._store._database.transaction() as writer:
+        writer.execute("UPDATE jobs SET scene = ? WHERE id = ?", (scene, s.done))
     return s.done
 
 

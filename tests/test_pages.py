@@ -768,9 +768,12 @@ def level_at(x: float, degrees: float) -> Pose:
 
 
 def box_of(page: Page, kind: str) -> dict:
-    box = page.locator(f"path.cell.{kind}").first.bounding_box()
-    assert box
-    return dict(box)
+    cell = page.locator(f"path.cell.{kind}").first
+    for _ in range(100):  # the plan is drawn anew now and then, and what is replaced has no box
+        if box := cell.bounding_box():
+            return dict(box)
+        page.wait_for_timeout(50)
+    raise AssertionError(f"no {kind} cell is drawn")
 
 
 def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -> None:

@@ -53,9 +53,8 @@ def job_at(service: SimpleNamespace, pose: Pose, seed: int) -> str:
     result = store.result(job)
     verdict = replace(result.estimate.verdict, status=Status.LOCALIZED, covariance=np.eye(6) * 1e-8)
     changed = replace(result, estimate=replace(result.estimate, pose=pose, verdict=verdict))
-    store._database._writer.execute(
-        "UPDATE jobs SET result = ?, status = 'localized' WHERE id = ?", (encode(changed), job)
-    )
+    with store._database.transaction() as writer:
+        writer.execute("UPDATE jobs SET result = ?, status = 'localized' WHERE id = ?", (encode(changed), job))
     return job
 
 
