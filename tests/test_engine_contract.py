@@ -419,7 +419,7 @@ def test_a_service_whose_engine_dies_makes_the_attempt_again(stepping):
         until_ready(client)
         job = post(client, prefer="", options=SLOW).json()
         path = job["links"]["self"]
-        until(lambda: client.get(path).json()["records"] == 2)
+        until(lambda: client.get(path).json()["records"] >= 2)
         with client.stream("GET", job["links"]["events"], timeout=60) as stream:
             app.state.app_state.engine.child.kill()
             told = events("".join(stream.iter_text()))
@@ -436,7 +436,7 @@ def test_a_job_that_kills_its_engine_is_given_up(stepping):
     with serving(app) as client:
         until_ready(client)
         path = post(client, prefer="", options=SLOW).headers["location"]
-        until(lambda: client.get(path).json()["records"] == 2)
+        until(lambda: client.get(path).json()["records"] >= 2)
         engine, seen = app.state.app_state.engine, []
 
         def kill(answer: LiveAnswer) -> None:

@@ -73,7 +73,7 @@ def ended(jobs: Jobs, job: StoredJob, seconds: float = 20) -> StoredJob:
 def test_any_front_follows_and_cancels_any_job(fronts):
     first, second = fronts
     job = first.accept(order(hold=True))
-    until(lambda: first.get(job.id).records == 1)
+    until(lambda: first.get(job.id).records >= 1)
     with pytest.raises(PhotoGone):
         second._photos.kept(job.id)
     assert second.photo(job)[:2] == b"\xff\xd8"  # it is read again
@@ -106,7 +106,7 @@ def test_a_job_that_waits_elsewhere_is_cancelled_at_once(fronts):
 def test_an_idle_front_takes_what_waits_elsewhere(fronts):
     first, second = fronts
     blocking = first.accept(order(hold=True))
-    until(lambda: first.get(blocking.id).records == 1)
+    until(lambda: first.get(blocking.id).records >= 1)
     job = first.accept(order(steps=4))
     live = first.live(job)
     assert ended(first, job).state == "succeeded"

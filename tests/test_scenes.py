@@ -205,7 +205,7 @@ def test_a_restart_brings_back_a_scene_that_a_waiting_job_needs(stepping, folder
     with service_on(folder, preload=["attic"], data_dir=tmp_path / "first") as client:
         ready(client)
         path = post(client, prefer="", scene="attic", options={"hold": True}).headers["location"]
-        until(lambda: client.get(path).json()["records"] == 1)
+        until(lambda: client.get(path).json()["records"] >= 1)
         shutil.copytree(tmp_path / "first", tmp_path / "copy")
         stepping.GO_ON.set()
     with service_on(folder, preload=["hall"], data_dir=tmp_path / "copy") as client:
