@@ -14,7 +14,7 @@ from service.geometry import look_at, moved, pose_distance
 from service.interfaces import Frame
 from service.loaded_scene import LoadedScene
 from service.localize import localize
-from service.pose.verification.captured_volume import CAPTURE, _is_beside_a_view, captured_share, is_outside
+from service.pose.verification.captured_volume import CAPTURE, _in_image, _is_beside_a_view, captured_share, is_outside
 from service.results import Reason, Status
 from service.types import Camera, Intrinsics, Pose, Query
 
@@ -101,6 +101,14 @@ def test_only_opaque_surface_counts_and_only_what_lies_in_the_view() -> None:
     assert share_seen(Pose(np.eye(4)), alpha=0.51) == 1.0
     away = look_at(np.zeros(3), np.array([4.0, 0.0, 0.5]), np.array([0.0, -1.0, 0.0]))
     assert share_seen(away) == 0.0
+
+
+def test_the_edge_of_an_image_lies_in_the_view_and_what_is_behind_does_not() -> None:
+    """Points half a pixel inside of each edge, half a pixel outside of it, and behind."""
+    view = Camera(Intrinsics(40, 30, 20.0, 20.0, 20.0, 15.0), Pose(np.eye(4)))
+    px = [(0.5, 15), (39.5, 15), (20, 0.5), (20, 29.5), (-0.5, 15), (40.5, 15), (20, -0.5), (20, 30.5)]
+    points = np.array([[(u - 20) / 20, (v - 15) / 20, 1.0] for u, v in px] + [[0.0, 0.0, -1.0], [0.0, 0.0, 0.5]])
+    assert _in_image(points, view).tolist() == [True] * 4 + [False] * 5 + [True]
 
 
 @pytest.mark.parametrize(

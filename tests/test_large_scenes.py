@@ -61,6 +61,16 @@ def test_other_scenes_are_put_around(room: GaussianScene) -> None:
         large_scenes.surround_with_copies(room, 10)
 
 
+def test_a_copy_stands_in_the_middle_of_its_cell(room: GaussianScene) -> None:
+    """A scene whose own centre is far from the origin; cells are a tenth larger than the scene in the middle."""
+    shifted = replace(room, means=room.means + np.float32([50, 20, 5]), cameras=())
+    large = large_scenes.surround_with_copies(room, 2 * COUNT, [shifted])
+    (low, high), opaque = large_scenes._extent(room), room.opacities > 0.3
+    copy = np.quantile(large.means[COUNT:][opaque].astype(np.float64), [0.005, 0.995], axis=0)
+    away = copy.mean(0) - 0.5 * (low + high)
+    assert np.abs(away / (high - low)) == pytest.approx([1.1, 1.1, 0.0], abs=0.01)
+
+
 def test_a_scene_of_just_the_count_gets_no_copies(room: GaussianScene) -> None:
     alone = large_scenes.surround_with_copies(room, COUNT)
     assert np.array_equal(alone.means, room.means)
@@ -86,6 +96,8 @@ def test_a_written_folder_is_the_scene(room: GaussianScene, tmp_path: Path, comp
     (source / "photos" / "day" / "a.jpg").write_bytes(b"a photo")
     (source / "truth.json").write_text("[7]")
     (source / "other.txt").write_text("stays")
+    told = {"background_rgb": (0.25, 0.5, 0.75), "up_in_world": (0.0, 1.0, 0.0), "render_mode": "antialiased"}
+    room = replace(room, info=replace(room.info, **told, training_long_side_px=640))
     file = large_scenes.write_folder(room, tmp_path / "out", source, cameras=not compressed, compressed=compressed)
     # It has the same test photos.
     assert (tmp_path / "out" / "photos" / "day" / "a.jpg").read_bytes() == b"a photo"
@@ -93,6 +105,9 @@ def test_a_written_folder_is_the_scene(room: GaussianScene, tmp_path: Path, comp
     assert not (tmp_path / "out" / "other.txt").exists()
     scene = load_scene(tmp_path / "out")
     assert scene.count == COUNT
+    assert {name: getattr(scene.info, name) for name in told} == told
+    if compressed:  # else the cameras say it
+        assert scene.info.training_long_side_px == 640
     assert len(scene.cameras) == (0 if compressed else 6)
     if compressed:
         assert file.stat().st_size < 0.4 * 4 * 59 * COUNT

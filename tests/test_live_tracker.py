@@ -140,6 +140,7 @@ def test_where_odometry_tells_the_place_it_is_looked_for_all_the_time(tracker, c
         (False, 0.0, 0.0, None, "search"),
         (True, 0.14, 0.9, None, None),
         (True, 0.16, 0.9, None, "search"),
+        (True, 0.14, 1.0, None, None),
         (True, 0.14, 1.1, None, "check"),
         (True, 0.14, 0.9, Reason.FEW_INLIERS, "search"),
     ],

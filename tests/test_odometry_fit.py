@@ -62,9 +62,9 @@ def test_differences_are_rotation_vectors_and_ways_in_the_worlds_axes(vector):
 
 
 def test_drift_grows_with_the_way_and_with_its_square():
-    """Over two units: (2 + 4) times the variance of a share of the way; of the position in the scene's units."""
-    assert np.diag(drift(2.0, 0.5)) == pytest.approx([6 * 0.002**2] * 3 + [6 * (0.01 * 0.5) ** 2] * 3)
-    assert np.count_nonzero(drift(2.0, 0.5)) == 6
+    """Over three units: (3 + 9) times the variance of a share of the way; of the position in the scene's units."""
+    assert np.diag(drift(3.0, 0.5)) == pytest.approx([12 * 0.002**2] * 3 + [12 * (0.01 * 0.5) ** 2] * 3)
+    assert np.count_nonzero(drift(3.0, 0.5)) == 6
 
 
 def stack(*fixes: Fix) -> _Stack:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import gc
 import re
 import signal
 import socket
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -229,6 +231,22 @@ def test_browsers_do_not_disturb_one_another_and_leave_nothing(fake: FakeService
     until(lambda: not any(threads(name) for name in names), "the end of all threads")
     assert not viewer._sessions
     until(lambda: len(viewer._shared) == 0, "the end of what its browsers shared")
+
+
+def test_what_a_browser_showed_is_freed_when_the_next_one_leaves(fake: FakeService, viewer: Viewer) -> None:
+    """Widgets form cycles, which Python by itself collects some time."""
+    fake.job("j", 2)
+    left = []
+    gc.disable()
+    try:
+        for _ in range(2):
+            with _browser(viewer, "/jobs/j") as browser:
+                browser.wait(lambda: "agree" in browser.text(), "the job")
+                left.extend(weakref.ref(session) for session, _ in viewer._sessions.values())
+            until(lambda: not viewer._sessions and not any(map(threads, ("browser-0", "browser-1"))), "the end")
+        until(lambda: left[0]() is None, "the end of the first browser's session")
+    finally:
+        gc.enable()
 
 
 def test_a_chosen_job_is_kept_when_another_one_comes(fake: FakeService, viewer: Viewer) -> None:
