@@ -280,6 +280,8 @@ class PlantedScene:
         self.tested, self.reference = self.loaded(2.0), self.loaded(1.0)
         self.both = ("a", self.tested), ("b", self.reference)
         self.localized: list[str] = []
+        self.prepared: list[tuple[float, int]] = []
+        """How slow the renderer is, and how many photos had been localized before."""
 
     def loaded(self, slow: float) -> SimpleNamespace:
         def render(cameras):
@@ -287,7 +289,11 @@ class PlantedScene:
 
         rasterizer = SimpleNamespace(render=render)
         return SimpleNamespace(
-            slow=slow, prepare=lambda estimator: None, rasterizer=rasterizer, scene=None, matcher=None
+            slow=slow,
+            prepare=lambda _: self.prepared.append((slow, len(self.localized))),
+            rasterizer=rasterizer,
+            scene=None,
+            matcher=None,
         )
 
     def localize(self, photo: str, loaded: SimpleNamespace) -> SimpleNamespace:
@@ -316,7 +322,9 @@ def test_latency_is_the_median_of_the_photos_and_of_each_stage(clock):
 
 
 def test_throughput_counts_the_jobs_that_began_in_time(clock):
-    of_a, of_b = gpu_speed.throughput(PlantedScene(clock, at_a_time=(1,), throughput_s=8.5))
+    shared = PlantedScene(clock, at_a_time=(1,), throughput_s=8.5)
+    of_a, of_b = gpu_speed.throughput(shared)
+    assert shared.prepared == [(2.0, 0), (1.0, 3)]  # no job waits for the index
     # p, q, p, q, p end at 1, 4, 5, 8 and 9 s; twice as slow, p, q, p at 2, 8 and 10 s.
     assert of_b == {"renderer": "b", "at_a_time": 1, "jobs": 5, "jobs_per_s": pytest.approx(5 / 9)}
     assert (of_a["jobs"], of_a["jobs_per_s"]) == (3, pytest.approx(3 / 10))

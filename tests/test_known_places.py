@@ -245,6 +245,24 @@ def test_faulty_points_are_told(data, complaint):
         scene_points.read(data, "points")
 
 
+@pytest.mark.parametrize(
+    ("metres", "sigma", "taken"),
+    [
+        (9.9e6, None, True), (1.1e7, 1.0, False), (1.1e-6, 1e-6, True), (0.9e-6, 1e-6, False), (1.0, 9.9e6, True),
+        (1.0, 1.1e7, False), (1.0, 1.1e-7, True), (1.0, 0.9e-7, False), (1.0, "far", False),
+    ],
+)  # fmt: skip
+def test_a_length_is_taken_within_its_bounds(metres, sigma, taken):
+    told = {"from_in_world": [0, 0, 0], "to_in_world": [0, 0, 1e-9], "metres": metres}
+    data = {"lengths": [told | ({} if sigma is None else {"sigma_m": sigma})]}
+    if not taken:
+        with pytest.raises(InvalidRequest, match="lengths, 1: must be a positive length"):
+            scene_points.read(data, "points")
+        return
+    (length,) = scene_points.read(data, "points").lengths
+    assert (length.metres, length.sigma) == (metres, 0.01 * metres if sigma is None else sigma)
+
+
 def test_a_floor_on_a_line_is_refused():
     with pytest.raises(InvalidRequest, match="line"):
         scene_points.floor_evidence(np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), np.ones(3), (0, 0, 1))

@@ -15,6 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import httpx
 import pytest
@@ -26,7 +28,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.http11 import Response
 
-from service.web import problems
+from service.web import problems, viewer_process
 from service.web.api_keys import KeyRing
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
@@ -201,6 +203,68 @@ def test_a_viewer_that_dies_is_started_again_and_ends_with_its_supervisor(tmp_pa
     pids = asyncio.run(asyncio.wait_for(scenario(), 30))
     assert len(set(pids)) == 3
     assert not Path(f"/proc/{pids[-1]}").exists()
+
+
+def test_a_viewer_that_crashes_at_once_is_started_ever_more_slowly(monkeypatch):
+    """Up to once in half a minute; after a run of more than a minute soon again."""
+    runs, pauses = iter([0.0] * 7 + [60.0, 61.0, 0.0]), []
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+
+    async def run_once(self) -> None:
+        if (seconds := next(runs, None)) is None:
+            raise asyncio.CancelledError
+        clock.now += seconds
+
+    async def sleep(seconds: float) -> None:
+        pauses.append(seconds)
+
+    monkeypatch.setattr(viewer_process, "time", clock)
+    monkeypatch.setattr(viewer_process.asyncio, "sleep", sleep)
+    monkeypatch.setattr(ViewerChild, "_run_once", run_once)
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(ViewerChild("http://127.0.0.1:1").supervise())
+    assert pauses == [1, 2, 4, 8, 16, 30, 30, 30, 0.5, 1]
+
+
+@pytest.mark.parametrize(("ends_after_s", "killed"), [(2.9, False), (3.1, True)])
+def test_a_viewer_has_three_seconds_to_end(ends_after_s, killed):
+    class Child:
+        def __init__(self) -> None:
+            self.told: list[str] = []
+
+        def terminate(self) -> None:
+            self.told.append("terminate")
+
+        def kill(self) -> None:
+            self.told.append("kill")
+
+        async def wait(self) -> None:
+            if "kill" not in self.told:
+                await asyncio.sleep(ends_after_s)
+
+    child, loop = Child(), TimelessLoop()
+    try:
+        loop.run_until_complete(viewer_process._end(child))
+    finally:
+        loop.close()
+    assert child.told == ["terminate", "kill"][: 1 + killed]
+
+
+class TimelessLoop(asyncio.SelectorEventLoop):
+    """Its clock goes on to what is due next instead of waiting."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now, select = 0.0, self._selector.select
+
+        def selected(seconds: float | None) -> list[Any]:
+            self.now += seconds or 0.0
+            return select(0)
+
+        self._selector.select = selected
+
+    def time(self) -> float:
+        return self.now
 
 
 def test_the_viewer_ends_when_its_parent_is_killed(tmp_path):

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from service import tracking as track
 from service.bench import track as bench
 from service.bench.live import SessionLog, figures
 from service.bench.live_film import FilmConfig, Shot, make_film
-from service.bench.pose_metrics import Units
+from service.bench.pose_metrics import Outcome, Units
 from service.errors import InvalidImage, SceneNotFound
 from service.geometry import moved, pose_distance
 from service.live import live_tracker
@@ -233,6 +234,20 @@ class TestBench:
         assert 0 < outcome["rotation_deg_p50"] <= outcome["rotation_deg_p100"] < 0.2
         assert outcome["latency_ms_p50"] > outcome["decode_ms_p50"] > 0
         assert len(outcome["per_frame"]) == 8
+
+    def test_times_are_those_of_frames_that_can_be_tracked(self):
+        """The first of four frames takes a second; the errors grow by 0.1 degrees and 0.001 units a frame."""
+
+        def step(number: int, ms: float) -> bench.Step:
+            outcome = Outcome(Status.LOCALIZED, 0.1 * number, 0.001 * number, ms, ms / 2)
+            return bench.Step(SimpleNamespace(records=[SimpleNamespace(stage="track")]), outcome, 2.0, 6.0)
+
+        told = bench.summary([step(k, ms) for k, ms in enumerate([1000.0, 10.0, 40.0, 20.0])])
+        assert (told["first_ms"], told["latency_ms_p50"], told["latency_ms_p100"]) == (1000.0, 20.0, 40.0)
+        assert (told["cpu_ms_p50"], told["decode_ms_p50"], told["nees_mean"]) == (10.0, 2.0, 6.0)
+        assert (told["drift_deg"], told["drift_units"]) == (pytest.approx(0.3), pytest.approx(0.003))
+        assert (told["frames"], told["followed"], told["success_1deg_0p01"]) == (4, 4, 1.0)
+        assert bench.summary([step(0, 7.0)])["latency_ms_p50"] == 7.0
 
     def test_a_scene_without_cameras_has_no_path(self, folder, tmp_path):
         (tmp_path / "scene.ply").write_bytes((folder / "scene.ply").read_bytes())

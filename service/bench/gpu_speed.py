@@ -24,7 +24,6 @@ def latency(shared: Shared) -> Iterator[Row]:
     over the photos that came to it. The first localization isn't counted.
     """
     for renderer, loaded in shared.both:
-        loaded.prepare(DEFAULT_ESTIMATOR)
         shared.localize(shared.photos[0], loaded)
         whole: list[float] = []
         stages: dict[str, list[float]] = defaultdict(list)
