@@ -139,9 +139,7 @@ def test_what_is_not_determined_shows_no_motion() -> None:
 
 
 def answer(loss: float, motion: tuple[float, float] | None, status: str = "localized", turn: float = 0.0) -> Any:
-    verdict = replace(
-        estimate(Pose(np.eye(4)), Status(status)).verdict, shutter_motion=motion, covariance=np.eye(6)
-    )
+    verdict = replace(estimate(Pose(np.eye(4)), Status(status)).verdict, shutter_motion=motion, covariance=np.eye(6))
     pose = moved(Pose(np.eye(4)), np.array([0.0, turn, 0, 0, 0, 0]))
     refined: Any = SimpleNamespace(loss=loss, pose=pose, correction=None, num_inliers=9)
     return VerifiedPose(refined, verdict, ImageVariant(416))
