@@ -110,6 +110,16 @@ def test_playback_stays_within_the_records(moves: list[str | int]) -> None:
         assert not (playback.playing and count < 2)
 
 
+def test_of_an_attempt_with_fewer_records_the_last_one_is_shown() -> None:
+    playback = Playback()
+    playback.set_count(6)
+    playback.go(4)
+    playback.set_count(3)
+    assert (playback.index, playback.live) == (2, False)
+    playback.set_count(0)
+    assert playback.index == 0
+
+
 def test_playback_follows_a_live_job_until_someone_looks_back() -> None:
     playback = Playback()
     playback.set_count(5)
