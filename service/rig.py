@@ -42,7 +42,7 @@ from service.readings_in_scene import contradictions, fused
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, StageTiming, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world, shifted
-from service.types import Pose, Query
+from service.types import Camera, Pose, Query
 
 MOST_PHOTOS = 8
 
@@ -270,11 +270,20 @@ class _Search:
                 break
         if not tried:
             tried.append(_Hypothesis(self._likeliest(), 0, 0, np.zeros((6, 6))))
+        if any(map(self._is_sure, tried)):
+            tried += map(self._rematched, self._twins(max(tried, key=lambda one: one.inliers)))
         best = max(tried, key=lambda one: one.inliers)
         alike = [one for one in tried if one.inliers >= self._config.alike_share * best.inliers]
         best = next((one for one in alike if self._readings_prefer(one, best)), best)
         others = [one for one in tried if one is not best and not self._is_same(one, best)]
         return best, [one for one in others if not self._readings_prefer(best, one)]
+
+    def _twins(self, found: _Hypothesis) -> list[Pose]:
+        """Return where else the rig may be, by the motions that repeat what its first photo shows there."""
+        first = self._photos[0]
+        camera = Camera(first.query.intrinsics, _pose_of(found.world_from_rig, first))
+        twins = self._index.repetitions.twins(camera, self._reach)
+        return [Pose(twin.world_from_camera @ first.rig_from_camera.camera_from_world) for twin in twins]
 
     def _readings_prefer(self, one: _Hypothesis, other: _Hypothesis) -> bool:
         """Return whether what a device measured beside the first photo decides for the first of two hypotheses."""

@@ -110,6 +110,13 @@ def test_a_rig_in_a_room_that_repeats_itself_is_ambiguous_unless_a_heading_decid
     assert any("heading" in warning for warning in found.estimate.warnings)
 
 
+@pytest.mark.ci
+def test_a_rig_in_a_room_that_is_the_same_upside_down_is_ambiguous(tmp_path):
+    tumbled = LoadedScene.load(write_room(tmp_path / "room", 12, upside_down=True), cache_dir=tmp_path)
+    found = localize_rig(photos(tumbled, hidden=0.0), tumbled)
+    assert (found.estimate.verdict.status, found.estimate.verdict.reason) == (Status.UNCERTAIN, Reason.AMBIGUOUS)
+
+
 def test_a_rig_in_metres_needs_a_scene_in_metres(room):
     with pytest.raises(InvalidRequest, match="how long its unit is"):
         localize_rig(photos(room), room, metric=True)

@@ -26,6 +26,7 @@ from service.pose.retrieval.ambiguous_hypotheses import (
     ambiguous_hypotheses,
     shifted_hypotheses,
 )
+from service.pose.retrieval.scene_symmetries import Repetitions
 from service.pose.verification.ambiguity import rank_answers
 from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.tracking import Tracker
@@ -342,3 +343,35 @@ def test_poses_are_different_answers_beyond_five_degrees_or_a_fiftieth_of_the_di
 ) -> None:
     other = moved(ANSWER, np.array([0, np.radians(degrees), 0, units, 0, 0]))
     assert PoseAtDistance(ANSWER, 6.0).differs_from(other) is differs
+
+
+# ------------------------------------------------------------------ where the scene's repetitions lead to
+
+
+def planted_repetition(ahead: float = 6.0) -> tuple[np.ndarray, Repetitions]:
+    """A motion, 2 units up and a quarter about the vertical, of points around the middle of what the answer sees."""
+    motion = np.eye(4)
+    motion[:3] = [[0, 0, 1, 0], [0, 1, 0, 2], [-1, 0, 0, 0]]
+    points = np.random.default_rng(0).uniform((-1, -1, ahead - 1), (1, 1, ahead + 1), (32, 3))
+    return motion, Repetitions.of([motion], [points])
+
+
+def test_an_answer_has_a_twin_where_a_motion_carries_what_it_sees() -> None:
+    motion, repetitions = planted_repetition()
+    (twin,) = repetitions.twins(Camera(CAMERA, ANSWER), 6.0)
+    assert np.allclose(twin.world_from_camera, motion)
+    # The twin sees the part that the motion leads to, and is led back.
+    (back,) = repetitions.twins(Camera(CAMERA, twin), 6.0)
+    assert np.allclose(back.world_from_camera, ANSWER.world_from_camera)
+    # Behind the camera is none of it.
+    assert not planted_repetition(ahead=-6.0)[1].twins(Camera(CAMERA, ANSWER), 6.0)
+
+
+def test_several_views_that_find_the_same_motion_lead_to_one_twin() -> None:
+    motion, once = planted_repetition()
+    points = once.points_in_world[0]
+    nearly = moved(Pose(motion), np.array([0, 0.05, 0, 0.2, 0, 0])).world_from_camera
+    assert len(Repetitions.of([motion, nearly], [points, points]).twins(Camera(CAMERA, ANSWER), 6.0)) == 1
+    # One that leads back to where the camera is leads to none.
+    hardly = moved(ANSWER, np.array([0, 0.05, 0, 0.2, 0, 0])).world_from_camera
+    assert not Repetitions.of([hardly], [points]).twins(Camera(CAMERA, ANSWER), 6.0)

@@ -27,6 +27,7 @@ from service.estimators.search_state import (
     refined_in_other_light,
     rendered_ahead,
     seen_from,
+    twins_of,
 )
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.features.image_sizes import scaled_px
@@ -126,7 +127,8 @@ def _rivals(state: SearchState, answer: VerifiedPose, seen: PoseAtDistance) -> I
     alike = ambiguous_hypotheses(
         view.features, camera, seen, views, scores, images.matcher, error_px, config.min_inliers, config
     )
-    return chain(alike, hypotheses_of_photo(state, images, seen, whole=False), _shifted(state, images, seen))
+    twins = twins_of(state, images, seen)
+    return chain(twins, alike, hypotheses_of_photo(state, images, seen, whole=False), _shifted(state, images, seen))
 
 
 def _shifted(state: SearchState, images: QueryImages, seen: PoseAtDistance) -> Iterator[AbsolutePose]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -32,7 +33,7 @@ from service.pose.verification.appearance import LOCAL_COLOUR, appearance, colou
 from service.pose.verification.gate import doubted, downgraded, verify
 from service.pose.verification.mirror_images import dissimilarity, may_be_mirrored
 from service.results import Candidates, IterationRecord, Reason, Status, Verdict
-from service.types import IntrinsicsCorrection, Query
+from service.types import Camera, IntrinsicsCorrection, Query
 
 Result = TypeVar("Result")
 CONCLUSIVE_DOUBTS = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.INTRINSICS_CONTRADICTED)
@@ -353,7 +354,8 @@ def check_ambiguity(state: SearchState) -> Generator[IterationRecord, None, None
     images = state.images.corrected(answer.refined.correction)
     seen = seen_from(state, answer)
     answers = [answer]
-    for other in rendered_ahead(state, hypotheses_of_photo(state, images, seen, whole), answer):
+    hypotheses = chain(twins_of(state, images, seen), hypotheses_of_photo(state, images, seen, whole))
+    for other in rendered_ahead(state, hypotheses, answer):
         found = yield from refine_ambiguous(state, other, answer)
         ambiguity = state.config.ambiguity
         if found is None or not all(
@@ -374,6 +376,14 @@ def seen_from(state: SearchState, answer: VerifiedPose) -> PoseAtDistance:
     frame = state.renderer.at(images.query, answer.refined.pose).frame
     # The background has no distance.
     return PoseAtDistance(answer.refined.pose, float(np.median(frame.median_depth[frame.alpha > VIEWS.min_alpha])))
+
+
+def twins_of(state: SearchState, images: QueryImages, answer: PoseAtDistance) -> list[AbsolutePose]:
+    """Return the poses from which the scene may look as it does at the answer, by the motions that repeat it."""
+    camera = Camera(images.query.intrinsics, answer.pose)
+    # As many matches as the motion rests on, at least: enough for refinement to trust it.
+    support = np.ones(state.config.refinement.trusted_inliers, bool)
+    return [AbsolutePose(pose, support) for pose in state.tools.prepared.repetitions.twins(camera, answer.distance)]
 
 
 def hypotheses_of_photo(

@@ -1,6 +1,6 @@
 """The view index: renders of the scene from well spread places, made once, with which photos are compared.
 
-Each view keeps its local features with their scene points. The index also says whether the scene repeats itself and
+Each view keeps its local features with their scene points. The index also says how the scene repeats itself and
 whether it is like its mirror image (`scene_symmetries`).
 """
 
@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from service.interfaces import Tools
+from service.interfaces import Features, Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
 from service.pose.features.rendered_views import VIEWS, View, in_batches, to_uint8, views_of
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
@@ -25,13 +25,21 @@ from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_space import SPACE
 from service.pose.retrieval.free_views import FREE_VIEWS, FreeViews
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
-from service.pose.retrieval.scene_symmetries import SYMMETRY, like_its_mirror_image, repeats_itself
+from service.pose.retrieval.scene_symmetries import (
+    NO_REPETITIONS,
+    SYMMETRY,
+    Repetitions,
+    find_repetitions,
+    is_examined,
+    like_its_mirror_image,
+    turned_features,
+)
 from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera
 
-VERSION = 10
+VERSION = 11
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
@@ -47,6 +55,8 @@ class ViewIndex:
     """Whether a mirrored photo of the scene may pass for one of the scene."""
     repeats_itself: bool = True
     """Whether a photo that fits one pose may fit another one."""
+    repetitions: Repetitions = field(default_factory=lambda: NO_REPETITIONS, compare=False)
+    """Motions that lead from the one to the other."""
     free_views: FreeViews = field(default_factory=FreeViews, compare=False)
     """Views beside these, for photos that are like none of them."""
 
@@ -74,23 +84,29 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
         every = -(-len(cameras) * CORNERS.of_view // CORNERS.of_all_views)
         renderer = OccludedRenderer(tools.scene, tools.rasterizer, tools.rng, lod)
 
-        def seen(numbers: list[int]) -> list[tuple[View, Corners | None]]:
+        def seen(numbers: list[int]) -> list[tuple[View, Corners | None, list[Features]]]:
             some = [cameras[number] for number in numbers]
             frames = renderer.render(some)
+            images = [to_uint8(frame.rgb) for frame in frames]
             corners = [
-                detect_corners(to_uint8(frame.rgb), CORNERS.of_view) if number % every == 0 else None
-                for number, frame in zip(numbers, frames, strict=True)
+                detect_corners(image, CORNERS.of_view) if number % every == 0 else None
+                for number, image in zip(numbers, images, strict=True)
             ]
-            return list(zip(views_of(frames, some, tools.matcher), corners, strict=True))
+            turned = [
+                turned_features(image, camera, tools.matcher) if is_examined(number, len(cameras)) else []
+                for number, image, camera in zip(numbers, images, some, strict=True)
+            ]
+            return list(zip(views_of(frames, some, tools.matcher), corners, turned, strict=True))
 
         # In order: the index is the same whatever thread is first.
         batches = in_batches(range(len(cameras)), tools.rasterizer.cameras_at_once)
         found = list(chain.from_iterable(pool.map(seen, batches)))
-        views = tuple(view for view, _ in found)
+        views = tuple(view for view, _, _ in found)
         mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
-        repeated = repeats_itself(views, tools.matcher, pool)
+        repetitions, repeated = find_repetitions(views, [turned for *_, turned in found], tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
-    return ViewIndex(views, Corners.pooled([own for _, own in found if own]), mirrored, repeated)
+    corners = Corners.pooled([own for _, own, _ in found if own])
+    return ViewIndex(views, corners, mirrored, repeated, repetitions)
 
 
 def _key(tools: Tools[None], *more: object) -> str:
@@ -108,6 +124,8 @@ def _write(index: ViewIndex, path: Path) -> None:
     others = {
         "like_its_mirror_image": np.array(index.like_its_mirror_image),
         "repeats_itself": np.array(index.repeats_itself),
+        "repetition_motions": index.repetitions.motions,
+        "repetition_points": index.repetitions.points_in_world,
         "corner_directions_deg": index.corners.directions_deg,
         "corner_descriptors": index.corners.descriptors,
     }
@@ -121,6 +139,7 @@ def _read(path: Path | None, free_views: FreeViews) -> ViewIndex | None:
     try:
         pooled = Corners(stored["corner_directions_deg"], stored["corner_descriptors"])
         mirrored, repeated = bool(stored["like_its_mirror_image"]), bool(stored["repeats_itself"])
+        repetitions = Repetitions(stored["repetition_motions"], stored["repetition_points"])
     except KeyError:  # a whole file with other arrays
         return None
-    return ViewIndex(views, pooled, mirrored, repeated, free_views)
+    return ViewIndex(views, pooled, mirrored, repeated, repetitions, free_views)

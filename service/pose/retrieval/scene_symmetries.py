@@ -1,25 +1,33 @@
-"""Two facts about a scene, computed from its view index: does it repeat itself, and is it like its mirror image?
+"""Two facts about a scene, computed from its view index: how does it repeat itself, and is it like its mirror image?
 
-Only where it does has an answer to be compared with other places, only where it is can a mirrored photo pass for a
-photo of the scene.
+A photo that fits one pose fits another one, too, if a rigid motion carries what it shows onto something that looks the
+same. Only where a scene is like its mirror image can a mirrored photo pass for a photo of the scene.
+
+A view finds such a motion among the other views as a photo would: many of its matches agree on another pose. What a
+room that is the same upside down shows to a level camera it also shows to one held upside down, of which the index has
+none, and descriptors tolerate but little rotation: so views are turned by quarters, too.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from jaxtyping import Float32, Float64, UInt8
 
-from service.interfaces import Frame, Matcher, Rasterizer
+from service.geometry import pose_distance, project, transformed
+from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_intrinsics
+from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, View, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
 from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.types import Camera, Pose, Query
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +37,11 @@ class SymmetryConfig:
     max_views: int = 128
     """A larger scene is taken to repeat itself: examining it takes 10 ms a view, and more the more views there are."""
     every: int = 2
-    """Of the views, every second one is compared with the others."""
+    """Of the views, every second one is compared with the others..."""
+    turned_of_many: int = 24
+    """...of a larger scene only so many, turned: what a photo as it is shows elsewhere its own matches tell."""
+    turned_share: float = 0.77
+    """Size of turned images, relative to the views: features tolerate it, and take two thirds of the time."""
     min_repeated_inliers: int = 30
     """Matches of a view that agree on another pose, in a scene that repeats itself: chair, materials, templeRing and
     fountain have views with 35 to 124, studio, fox and fern none with more than 24."""
@@ -42,31 +54,140 @@ class SymmetryConfig:
     """Matches on which the median mirrored view must agree: of the test scenes chair, materials and fountain have 130
     to 250, templeRing has 42, those without a symmetry 10 to 20."""
 
+    part_points: int = 32
+    """Points that stand for what a view shows."""
+    min_seen_share: float = 0.3
+    """Share of them in an image, from which on it shows the same part."""
+    max_twins: int = 4
+    """Poses beside an answer that are compared with it, by a small render each..."""
+    same_twin_deg: float = 10.0
+    same_twin_share: float = 0.1
+    """...of which none are nearer to each other (degrees; share of the distance to what is seen): several views find
+    the same motion."""
+
 
 SYMMETRY = SymmetryConfig()
+ANYWHERE = replace(AMBIGUITY, same_view_deg=-1.0)
+"""A turned view has not the pose that its features seem to be seen from: no view shows the same."""
 
 
-def repeats_itself(views: Sequence[View], matcher: Matcher, pool: Executor, config: SymmetryConfig = SYMMETRY) -> bool:
-    """Return whether what some view of the scene shows is seen from another pose, too."""
-    if len(views) > config.max_views:
-        return True
+@dataclass(frozen=True, slots=True)
+class Repetitions:
+    """Rigid motions that carry some part of a scene onto another that looks like it."""
+
+    motions: Float64[np.ndarray, "k 4 4"]
+    points_in_world: Float32[np.ndarray, "k n 3"]
+    """Points of the part that each of them carries."""
+
+    @classmethod
+    def of(cls, motions: Sequence[np.ndarray], parts: Sequence[np.ndarray]) -> Repetitions:
+        """Return the motions and their inverses, which carry the parts back."""
+        if not motions:
+            return NO_REPETITIONS
+        there, back = np.stack(motions), np.linalg.inv(np.stack(motions))
+        points = np.stack(parts)
+        carried = np.stack([transformed(m, p) for m, p in zip(there, points, strict=True)])
+        return cls(np.concatenate([there, back]), np.concatenate([points, carried]).astype(np.float32))
+
+    def twins(self, camera: Camera, distance: float, config: SymmetryConfig = SYMMETRY) -> list[Pose]:
+        """Return the poses from which the scene may look as it does from this camera; those first whose parts it sees
+        the most of. `distance`: the median one to what it sees."""
+        seen = np.array([_share_in_image(points, camera) for points in self.points_in_world])
+        # A motion that leads back to the camera is none.
+        found = [camera.pose]
+        for i in np.argsort(-seen, kind="stable"):
+            if seen[i] < config.min_seen_share or len(found) > config.max_twins:
+                break
+            twin = Pose(self.motions[i] @ camera.pose.world_from_camera)
+            if not any(_is_near(twin, known, distance, config) for known in found):
+                found.append(twin)
+        return found[1:]
+
+
+NO_REPETITIONS = Repetitions(np.empty((0, 4, 4)), np.empty((0, 0, 3), np.float32))
+
+
+def _share_in_image(points: Float32[np.ndarray, "n 3"], camera: Camera) -> float:
+    in_camera = transformed(camera.pose.camera_from_world, points)
+    ahead = in_camera[in_camera[:, 2] > 0]
+    px, size = project(ahead, camera.intrinsics), camera.intrinsics
+    return float(((px > 0) & (px < [size.width, size.height])).all(1).sum() / len(points))
+
+
+def _is_near(pose: Pose, other: Pose, distance: float, config: SymmetryConfig) -> bool:
+    angle, way = pose_distance(pose, other)
+    return angle < config.same_twin_deg and way < config.same_twin_share * distance
+
+
+def is_examined(number: int, count: int, config: SymmetryConfig = SYMMETRY) -> bool:
+    """Return whether the view of this number, of so many, is compared with the others."""
     # Repetition is mutual: of two views that look alike at least one is likely among them.
-    examined = views[:: config.every]
-    return any(pool.map(lambda view: _is_seen_elsewhere(view, views, matcher, config), examined))
+    every = config.every if count <= config.max_views else -(-count // config.turned_of_many)
+    return number % every == 0
 
 
-def _is_seen_elsewhere(view: View, views: Sequence[View], matcher: Matcher, config: SymmetryConfig) -> bool:
+def turned_features(
+    rgb: UInt8[np.ndarray, "h w 3"], camera: Camera, matcher: Matcher, config: SymmetryConfig = SYMMETRY
+) -> list[Features]:
+    """Return a view's features as its image turned by one, two and three quarters has them, in pixels of the view."""
+    images = QueryImages(Query(rgb, camera.intrinsics, "given", camera.intrinsics), matcher)
+    size = round(config.turned_share * camera.intrinsics.long_side)
+    return [images.features(size, 2 * quarters) for quarters in (1, 2, 3)]
+
+
+def find_repetitions(
+    views: Sequence[View],
+    turned: Sequence[Sequence[Features]],
+    matcher: Matcher,
+    pool: Executor,
+    config: SymmetryConfig = SYMMETRY,
+) -> tuple[Repetitions, bool]:
+    """Return the motions that repeat the scene, and whether it repeats itself: what some view shows is seen elsewhere.
+
+    `turned` are the turned features of each view; empty where it isn't examined. A scene of too many views is taken to
+    repeat itself.
+    """
+    are_many = len(views) > config.max_views
+    examined = [i for i in range(len(views)) if is_examined(i, len(views), config)]
+
+    def seen_from(i: int) -> list[Pose]:
+        own: list[Features] = [] if are_many else [views[i].features]
+        return _seen_from_elsewhere(views[i], own, turned[i], views, matcher, config)
+
+    found = zip(examined, pool.map(seen_from, examined), strict=True)
+    pairs = [(views[i], pose) for i, poses in found for pose in poses]
+    motions = [pose.world_from_camera @ view.camera.pose.camera_from_world for view, pose in pairs]
+    return Repetitions.of(motions, [_sample(view, config) for view, _ in pairs]), are_many or bool(motions)
+
+
+def _sample(view: View, config: SymmetryConfig) -> Float32[np.ndarray, "n 3"]:
+    points = view.points_in_world
+    return points[np.linspace(0, len(points) - 1, config.part_points).astype(int)]
+
+
+def _seen_from_elsewhere(
+    view: View,
+    own: Sequence[Features],
+    turned: Sequence[Features],
+    views: Sequence[View],
+    matcher: Matcher,
+    config: SymmetryConfig,
+) -> list[Pose]:
+    """Return the other poses from which the scene looks as in a view, by its own features and by turned ones."""
     if len(view.points_in_world) == 0:
-        return False
-    intrinsics, pose = view.camera.intrinsics, view.camera.pose
-    scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
-    error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
+        return []
     # The view's own pose is the answer that others are compared with.
-    own = PoseAtDistance(pose, view.distance)
-    found = ambiguous_hypotheses(
-        view.features, intrinsics, own, views, scores, matcher, error_px, AMBIGUITY.min_inliers
-    )
-    return any(other.num_inliers >= config.min_repeated_inliers for other in found)
+    answer = PoseAtDistance(view.camera.pose, view.distance)
+    intrinsics = view.camera.intrinsics
+    error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
+    found = []
+    for features, ambiguity in [*((one, AMBIGUITY) for one in own), *((one, ANYWHERE) for one in turned)]:
+        scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
+        others = ambiguous_hypotheses(
+            features, intrinsics, answer, views, scores, matcher, error_px, config.min_repeated_inliers, ambiguity
+        )
+        found += [other.pose for other in others]
+    return found
 
 
 def like_its_mirror_image(
