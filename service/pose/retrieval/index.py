@@ -16,9 +16,11 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import UInt8
 
-from service.interfaces import Features, Tools
+from service.interfaces import Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
+from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import VIEWS, View, in_batches, to_uint8, views_of
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
 from service.pose.retrieval.floaters import FLOATERS
@@ -32,12 +34,11 @@ from service.pose.retrieval.scene_symmetries import (
     find_repetitions,
     is_examined,
     like_its_mirror_image,
-    turned_features,
 )
 from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
-from service.types import Camera
+from service.types import Camera, Query
 
 VERSION = 11
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
@@ -84,7 +85,7 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
         every = -(-len(cameras) * CORNERS.of_view // CORNERS.of_all_views)
         renderer = OccludedRenderer(tools.scene, tools.rasterizer, tools.rng, lod)
 
-        def seen(numbers: list[int]) -> list[tuple[View, Corners | None, list[Features]]]:
+        def seen(numbers: list[int]) -> list[tuple[View, Corners | None, QueryImages | None]]:
             some = [cameras[number] for number in numbers]
             frames = renderer.render(some)
             images = [to_uint8(frame.rgb) for frame in frames]
@@ -92,21 +93,26 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
                 detect_corners(image, CORNERS.of_view) if number % every == 0 else None
                 for number, image in zip(numbers, images, strict=True)
             ]
-            turned = [
-                turned_features(image, camera, tools.matcher) if is_examined(number, len(cameras)) else []
+            pictures = [
+                _picture(image, camera, tools) if is_examined(number, len(cameras)) else None
                 for number, image, camera in zip(numbers, images, some, strict=True)
             ]
-            return list(zip(views_of(frames, some, tools.matcher), corners, turned, strict=True))
+            return list(zip(views_of(frames, some, tools.matcher), corners, pictures, strict=True))
 
         # In order: the index is the same whatever thread is first.
         batches = in_batches(range(len(cameras)), tools.rasterizer.cameras_at_once)
         found = list(chain.from_iterable(pool.map(seen, batches)))
         views = tuple(view for view, _, _ in found)
         mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
-        repetitions, repeated = find_repetitions(views, [turned for *_, turned in found], tools.matcher, pool)
+        pictures = [picture for *_, picture in found]
+        repetitions, repeated = find_repetitions(views, pictures, tools.rasterizer, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
     corners = Corners.pooled([own for _, own, _ in found if own])
     return ViewIndex(views, corners, mirrored, repeated, repetitions)
+
+
+def _picture(rgb: UInt8[np.ndarray, "h w 3"], camera: Camera, tools: Tools[None]) -> QueryImages:
+    return QueryImages(Query(rgb, camera.intrinsics, "given", camera.intrinsics), tools.matcher)
 
 
 def _key(tools: Tools[None], *more: object) -> str:

@@ -3,19 +3,20 @@
 A photo that fits one pose fits another one, too, if a rigid motion carries what it shows onto something that looks the
 same. Only where a scene is like its mirror image can a mirrored photo pass for a photo of the scene.
 
-A view finds such a motion among the other views as a photo would: many of its matches agree on another pose. What a
-room that is the same upside down shows to a level camera it also shows to one held upside down, of which the index has
-none, and descriptors tolerate but little rotation: so views are turned by quarters, too.
+A view finds such a motion among the other views as a photo would: many of its matches agree on another pose, and a
+render there looks like the view. What a room that is the same upside down shows to a level camera it also shows to one
+held upside down, of which the index has none, and descriptors tolerate but little rotation: so views are turned by
+quarters, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64
 
 from service.geometry import pose_distance, project, transformed
 from service.interfaces import Features, Frame, Matcher, Rasterizer
@@ -23,11 +24,12 @@ from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.features.image_sizes import scaled_px
 from service.pose.features.mirrored_query import mirrored_intrinsics
 from service.pose.features.query_images import QueryImages
-from service.pose.features.rendered_views import VIEWS, View, to_uint8
+from service.pose.features.rendered_views import VIEWS, View, camera_of, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
-from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, PoseAtDistance, ambiguous_hypotheses
+from service.pose.refinement.photometric import refine_photometric
+from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, AmbiguityConfig, PoseAtDistance, ambiguous_hypotheses
 from service.pose.retrieval.scores import retrieval_scores, top_indices
-from service.types import Camera, Pose, Query
+from service.types import Camera, Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,13 @@ class SymmetryConfig:
     every: int = 2
     """Of the views, every second one is compared with the others..."""
     turned_of_many: int = 24
-    """...of a larger scene only so many, turned: what a photo as it is shows elsewhere its own matches tell."""
+    """...of a larger scene only so many, turned."""
+    compared_px: int = 256
+    """Long side of the render from where a view is seen elsewhere..."""
+    compared_levels: int = 3
+    max_residual: float = 0.03
+    """...and the mean residual, 0..1, after refinement on it, up to which that looks like the view: planted repetitions
+    have 0.001 to 0.017, what is but similar in fountain 0.032 and more, in chair 0.081 and more."""
     turned_share: float = 0.77
     """Size of turned images, relative to the views: features tolerate it, and take two thirds of the time."""
     min_repeated_inliers: int = 30
@@ -126,68 +134,75 @@ def is_examined(number: int, count: int, config: SymmetryConfig = SYMMETRY) -> b
     return number % every == 0
 
 
-def turned_features(
-    rgb: UInt8[np.ndarray, "h w 3"], camera: Camera, matcher: Matcher, config: SymmetryConfig = SYMMETRY
-) -> list[Features]:
-    """Return a view's features as its image turned by one, two and three quarters has them, in pixels of the view."""
-    images = QueryImages(Query(rgb, camera.intrinsics, "given", camera.intrinsics), matcher)
-    size = round(config.turned_share * camera.intrinsics.long_side)
-    return [images.features(size, 2 * quarters) for quarters in (1, 2, 3)]
-
-
 def find_repetitions(
     views: Sequence[View],
-    turned: Sequence[Sequence[Features]],
+    pictures: Sequence[QueryImages | None],
+    rasterizer: Rasterizer,
     matcher: Matcher,
     pool: Executor,
     config: SymmetryConfig = SYMMETRY,
 ) -> tuple[Repetitions, bool]:
     """Return the motions that repeat the scene, and whether it repeats itself: what some view shows is seen elsewhere.
 
-    `turned` are the turned features of each view; empty where it isn't examined. A scene of too many views is taken to
+    `pictures` are the renders of the views that are examined (`is_examined`). A scene of too many views is taken to
     repeat itself.
     """
     are_many = len(views) > config.max_views
-    examined = [i for i in range(len(views)) if is_examined(i, len(views), config)]
 
-    def seen_from(i: int) -> list[Pose]:
-        own: list[Features] = [] if are_many else [views[i].features]
-        return _seen_from_elsewhere(views[i], own, turned[i], views, matcher, config)
+    def examined(view: View, images: QueryImages | None) -> tuple[list[np.ndarray], bool]:
+        if images is None or len(view.points_in_world) == 0:
+            return [], False
+        # In a large scene a photo's own matches tell where it is seen as it is.
+        upright = [] if are_many else _seen_from_elsewhere(view, view.features, views, matcher, AMBIGUITY, config)
+        turned = [
+            pose
+            for features in _turned(images, config)
+            for pose in _seen_from_elsewhere(view, features, views, matcher, ANYWHERE, config)
+        ]
+        alike = [_if_alike(images, pose, rasterizer, config) for pose in (*upright, *turned)]
+        own = view.camera.pose.camera_from_world
+        return [pose.world_from_camera @ own for pose in alike if pose], bool(upright)
 
-    found = zip(examined, pool.map(seen_from, examined), strict=True)
-    pairs = [(views[i], pose) for i, poses in found for pose in poses]
-    motions = [pose.world_from_camera @ view.camera.pose.camera_from_world for view, pose in pairs]
-    return Repetitions.of(motions, [_sample(view, config) for view, _ in pairs]), are_many or bool(motions)
+    found = list(pool.map(examined, views, pictures))
+    motions = [(motion, _sample(view, config)) for view, (some, _) in zip(views, found, strict=True) for motion in some]
+    repetitions = Repetitions.of([motion for motion, _ in motions], [part for _, part in motions])
+    return repetitions, are_many or bool(motions) or any(is_repeated for _, is_repeated in found)
+
+
+def _turned(images: QueryImages, config: SymmetryConfig) -> Iterator[Features]:
+    """Yield a view's features as its image turned by one, two and three quarters has them, in pixels of the view."""
+    size = round(config.turned_share * images.query.intrinsics.long_side)
+    return (images.features(size, 2 * quarters) for quarters in (1, 2, 3))
+
+
+def _seen_from_elsewhere(
+    view: View,
+    features: Features,
+    views: Sequence[View],
+    matcher: Matcher,
+    ambiguity: AmbiguityConfig,
+    config: SymmetryConfig,
+) -> list[Pose]:
+    """Return the other poses that many of a view's matches agree on, with these features of it."""
+    # The view's own pose is the answer that others are compared with.
+    own, intrinsics = PoseAtDistance(view.camera.pose, view.distance), view.camera.intrinsics
+    scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
+    error_px, least = scaled_px(MATCH_ERROR_PX, intrinsics), config.min_repeated_inliers
+    found = ambiguous_hypotheses(features, intrinsics, own, views, scores, matcher, error_px, least, ambiguity)
+    return [other.pose for other in found]
+
+
+def _if_alike(images: QueryImages, pose: Pose, rasterizer: Rasterizer, config: SymmetryConfig) -> Pose | None:
+    """Return a pose from which the scene looks as in a view, refined; None if it looks otherwise from there."""
+    camera = camera_of(images.query, pose, config.compared_px)
+    (frame,) = rasterizer.render([camera])
+    found = refine_photometric(images.resized(camera.intrinsics), frame, camera, camera, config.compared_levels)
+    return found.pose if found.loss <= config.max_residual else None
 
 
 def _sample(view: View, config: SymmetryConfig) -> Float32[np.ndarray, "n 3"]:
     points = view.points_in_world
     return points[np.linspace(0, len(points) - 1, config.part_points).astype(int)]
-
-
-def _seen_from_elsewhere(
-    view: View,
-    own: Sequence[Features],
-    turned: Sequence[Features],
-    views: Sequence[View],
-    matcher: Matcher,
-    config: SymmetryConfig,
-) -> list[Pose]:
-    """Return the other poses from which the scene looks as in a view, by its own features and by turned ones."""
-    if len(view.points_in_world) == 0:
-        return []
-    # The view's own pose is the answer that others are compared with.
-    answer = PoseAtDistance(view.camera.pose, view.distance)
-    intrinsics = view.camera.intrinsics
-    error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
-    found = []
-    for features, ambiguity in [*((one, AMBIGUITY) for one in own), *((one, ANYWHERE) for one in turned)]:
-        scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
-        others = ambiguous_hypotheses(
-            features, intrinsics, answer, views, scores, matcher, error_px, config.min_repeated_inliers, ambiguity
-        )
-        found += [other.pose for other in others]
-    return found
 
 
 def like_its_mirror_image(
