@@ -31,7 +31,7 @@ RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
 DEFAULT_ESTIMATOR = "view_index"
 DEFAULT_MATCHER = "xfeat"
 WHITE_ASSUMED = (
-    "no file says which background the scene was trained on: white is assumed, for the photo's border is white; say "
+    "the scene's background colour is unknown: white is assumed, since the photo's border is white; set "
     '"background" in scene.json.'
 )
 
@@ -163,7 +163,7 @@ class LoadedScene:
         found = digest_of(photos, self.scene, self.rasterizer, progress)
         if found is None:
             raise SceneNotFound(
-                f"nothing is shown alike by three of the {len(photos)} training photos.",
+                f"no point was matched in three of the {len(photos)} training photos.",
                 where=str(folder),
                 hint="Check that the photos are those of the camera file, without distortion.",
             )

@@ -337,8 +337,8 @@ def _cautions(query: Query, verdict: Verdict) -> tuple[str, ...]:
         )
     if verdict.intrinsics_untested:
         cautions.append(
-            "the photo can't confirm its intrinsics: a focal length that is 1 % off moves the camera by about 1 % of "
-            "its distance, which the covariance allows for."
+            "the intrinsics could not be verified by the photo: a focal length that is 1 % off moves the camera by "
+            "about 1 % of its distance, which the covariance allows for."
         )
     if verdict.shutter_motion:
         shear, stretch = verdict.shutter_motion

@@ -48,11 +48,11 @@ def scene_priors(readings: DeviceReadings, info: SceneInfo, registration: Regist
         up = _axis(anchor, 2)
     warnings = []
     if readings.gravity is not None and up is None:
-        warnings.append(f"the gravity was not used: scene '{info.name}' doesn't say which way is up.")
+        warnings.append(f"the gravity was not used: the up direction of scene '{info.name}' is unknown.")
     for name, reading in (("GPS position", readings.gps), ("heading", readings.heading)):
         if reading is not None and anchor is None:
             warnings.append(
-                f"the {name} was not used: nobody has said where on Earth scene '{info.name}' is. Register it, or add "
+                f"the {name} was not used: scene '{info.name}' has no geo anchor. Register it, or add "
                 "geo_anchor to its scene.json."
             )
     return ScenePriors(

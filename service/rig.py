@@ -169,7 +169,7 @@ def _units_per_metre(loaded: LoadedScene) -> float:
     info = loaded.scene.info
     if info.metres_per_unit is None:
         raise InvalidRequest(
-            f"scene '{info.name}' doesn't say how long its unit is.",
+            f"the length of a unit of scene '{info.name}' is unknown.",
             where="rig.metric",
             hint="Send the rig in scene units, or register the scene.",
         )

@@ -227,7 +227,7 @@ def test_a_variable_that_is_no_setting_is_told():
     environment = dict.fromkeys(("SPLATFIX_WORKRES", "SPLATFIX_FOO", "SPLATFIX_WORKERS", "SPLATFIX_KEY", "HOME"), "1")
     kubernetes = dict.fromkeys(("SPLATFIX_SERVICE_HOST", "SPLATFIX_PORT_8000_TCP_ADDR"), "1")
     foo, workers = unknown_variables(environment | kubernetes)
-    assert foo.startswith("SPLATFIX_FOO is no setting")
+    assert foo.startswith("unknown setting SPLATFIX_FOO")
     assert workers.endswith("is SPLATFIX_WORKERS meant?")
 
 

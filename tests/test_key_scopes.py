@@ -326,7 +326,7 @@ def test_the_viewer_shows_what_its_user_may_see(site):
             }
             for who, browser in seen.items():
                 browser.wait(lambda who=who, at=browser: list(at.widget("scene")["options"]) == [who], "its scene", 60)
-            seen["room"].wait(lambda: "The service has no job" in seen["room"].text(), "the foreign job's error", 60)
+            seen["room"].wait(lambda: "not found or expired" in seen["room"].text(), "the foreign job's error", 60)
             seen["vault"].wait(lambda: "/splats/splats" in seen["vault"].nodes, "its own job's scene", 60)
             assert not any(name.startswith("/splats") for name in seen["room"].nodes)
             assert "vault" not in str(seen["room"].widgets).replace(site.jobs["vault"], "")

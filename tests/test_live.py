@@ -192,7 +192,7 @@ BAD = {
     "up that is nothing": ([json.dumps(HELLO | {"odometry": {"up_in_odom": [0, 0, 0]}})], 4400, "odometry.up_in_odom:"),
     "bytes first": ([b"x"], 4400, "hello: the first message is JSON"),
     "bad intrinsics": ([json.dumps(HELLO | {"intrinsics": {"width": 3}})], 4400, "intrinsics."),
-    "text later": ([json.dumps(HELLO), "{}"], 4400, "frame: after the hello"),
+    "text later": ([json.dumps(HELLO), "{}"], 4400, "frame: messages after the hello"),
     "a truncated header": ([json.dumps(HELLO), b"SFLV\1"], 4400, "frame: the header has 24 bytes or more"),
     "garbage": ([json.dumps(HELLO), b"x" * 999], 4400, "frame: a message begins with SFLV and version 1"),
     "an unknown flag": ([json.dumps(HELLO), frame(1, 1.0, flags=8)], 4400, "frame.flags: unknown flags"),
@@ -231,7 +231,7 @@ def test_scenes_and_places_that_are_not_there_are_told(service):
     with raw(service, json.dumps(HELLO), scene="attic") as socket:
         assert closed(socket)[0] == 4404
     with live(service), live(service), raw(service) as third:
-        assert closed(third) == (4429, "2 live sessions of yours go on already.")
+        assert closed(third) == (4429, "limit of live sessions for this key reached: 2.")
     until(lambda: sessions(service) == 0)
     with live(service) as again:
         assert again.welcome["scene"] == "room"
@@ -243,8 +243,8 @@ def test_an_idle_session_ends(stepping_module):
         until_ready(client)
         with live(client) as idle, pytest.raises(LiveClosed) as ended:
             idle.answer()
-        assert (ended.value.code, ended.value.reason) == (4408, "no frame came for 1 s.")
-        with live(client), pytest.raises(LiveClosed, match="4429 the service has 1 live sessions"):
+        assert (ended.value.code, ended.value.reason) == (4408, "no frame for 1 s.")
+        with live(client), pytest.raises(LiveClosed, match="4429 limit of live sessions of the service reached: 1"):
             live(client)
         until(lambda: sessions(client) == 0)
         # A shutdown closes sessions with a code that says: connect again.

@@ -339,7 +339,7 @@ def test_places_have_a_position_within_a_hundredth_of_the_wide_prior(monkeypatch
     ("places", "reason"),
     [
         ([], "no observation has a position in the target frame"),
-        ([[1.0, 2, 3]] * 3, "all 3 places are one within their noise"),
+        ([[1.0, 2, 3]] * 3, "all 3 places coincide within their noise"),
         ([[1.0, 2, 3], [2.0, 4, 6], [3.0, 6, 9]], "all 3 places lie on one line, about which the scene may turn"),
         ([[1.0, 2, 3], [2.0, 4, 7], [3.0, 7, 9]], "up is uncertain by 29 degrees, the heading by 57"),
     ],

@@ -361,7 +361,7 @@ def test_a_client_has_so_many_sessions_and_the_service_has():
         assert caught.value.code == TOO_MANY
     assert live == {}
     live["others"] = 3
-    with pytest.raises(_End, match="has 3 live sessions, its most"), one._place():
+    with pytest.raises(_End, match="limit of live sessions of the service reached: 3"), one._place():
         pass
     live["others"] = 2
     with pytest.raises(ValueError, match="torn"), one._place():

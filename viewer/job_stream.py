@@ -126,7 +126,7 @@ class JobStream:
             except (ServiceError, ValueError, KeyError) as error:
                 gone = isinstance(error, ServiceError) and error.status == 404
                 log.warning("job %s: %s", self.id, error)
-                self.error = f"The service has no job {self.id} (any more)." if gone else str(error)
+                self.error = f"Job {self.id} not found or expired." if gone else str(error)
                 self._notify()
                 if gone:
                     return

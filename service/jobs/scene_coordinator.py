@@ -101,7 +101,7 @@ class SceneCoordinator:
                     await self._asked(name, handle.ping.remote())
             late = time.monotonic() - _FRONT_S
             for front in [front for front, heard in self._fronts.items() if heard < late]:
-                _log.warning("front %s is gone: what it held is let go", front)
+                _log.warning("front %s has ended: the scenes that it used are released", front)
                 del self._fronts[front]
                 for token in [token for token, hold in self._holds.items() if hold.front == front]:
                     await self.release(token)

@@ -116,7 +116,7 @@ class SharedJobs:
             except SplatfixError as error:  # of the engine
                 _log.warning("the jobs of other fronts: %s", error)
             except Exception:  # a bug must not end the thread
-                _log.exception("the jobs of other fronts could not be looked at")
+                _log.exception("the jobs of other fronts could not be read")
                 self._closing.wait(_POLL_S)
 
     def _look(self, changed: set[str]) -> None:

@@ -138,7 +138,7 @@ def _reason(
     if not placed:
         why = "no observation has a position in the target frame"
     elif axes[0] == 0:
-        why = f"all {len(placed)} places are one within their noise"
+        why = f"all {len(placed)} places coincide within their noise"
     elif axes[1] == 0 and "heading" not in parts:
         why = f"all {len(placed)} places lie on one line, about which the scene may turn"
     else:

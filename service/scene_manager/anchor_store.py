@@ -104,5 +104,5 @@ def _read(file: SideFile) -> tuple[Anchor, ...]:
         return ()
     except (OSError, ValueError, KeyError, TypeError, AttributeError, InvalidRequest) as error:
         raise CorruptScene(
-            f"no anchors can be read: {str(error)[:200]}.", where=file.path.name, hint="Mend or delete it."
+            f"no anchors can be read: {str(error)[:200]}.", where=file.path.name, hint="Correct or delete it."
         ) from None

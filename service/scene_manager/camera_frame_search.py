@@ -74,7 +74,7 @@ class CameraFrameSearch:
             return
         found = found_camera_frame(loaded, path, go_on=lambda: not self._stopped and entry.loaded is loaded)
         if found is None:
-            _log.info("scene %s: its photos tell no frame of its cameras", entry.id)
+            _log.info("scene %s: the camera frame could not be determined by its photos", entry.id)
             return
         found.write(path)
         _log.info("scene %s: the camera frame was found by %d photos", entry.id, found.agreeing)

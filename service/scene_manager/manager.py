@@ -349,11 +349,11 @@ class Scenes:
         dropped = self._limit.to_drop(entry, needed, self.entries(), self._first_in_line)
         if entry.required and entry.awaited and not entry.used and dropped != []:
             # Of a preload list that is larger than the memory the first ones stay.
-            _log.warning("scene %s is not preloaded: the others take the memory that scenes may take", entry.id)
+            _log.warning("scene %s is not preloaded: the others reach the memory limit of scenes", entry.id)
             self._withdraw(entry)
             return False
         for other in dropped or ():
-            _log.info("scene %s: dropped to make room for %s", other.id, entry.id)
+            _log.info("scene %s: unloaded to free memory for %s", other.id, entry.id)
             other.drop()
         return dropped is not None
 

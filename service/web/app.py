@@ -161,7 +161,7 @@ async def _start(
     add_gauges(metrics, settings, engine, jobs, folder)
     anchors = FileAnchorStore(scene_store.find, settings.data_dir)
     state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
-    metrics.gauge("live_sessions", "Live sessions under way", (), lambda: {(): state.live.total()})
+    metrics.gauge("live_sessions", "Open live sessions", (), lambda: {(): state.live.total()})
     return state
 
 

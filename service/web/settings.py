@@ -42,7 +42,7 @@ def unknown_variables(environment: Mapping[str, str]) -> list[str]:
             continue
         near = difflib.get_close_matches(name, sorted(known), 1)
         meant = f"; is {_PREFIX}{near[0].upper()} meant?" if near else "; `splatfix doctor` lists them."
-        found.append(f"{variable} is no setting, and has no effect{meant}")
+        found.append(f"unknown setting {variable}, ignored{meant}")
     return found
 
 
@@ -74,7 +74,7 @@ class Settings(BaseSettings):
     preload: list[str] | None = None
     """Ids of the scenes to load at start; None: all. The others are loaded when a request needs them."""
     scene_memory_bytes: int | None = Field(default=None, ge=1)
-    """Memory limit of all loaded scenes; the least recently used one is dropped to make room. None: no limit."""
+    """Memory limit of all loaded scenes; the least recently used one is unloaded to free memory. None: no limit."""
     gpu_memory_bytes: int | None = Field(default=None, ge=1)
     """Limit of the GPU memory that renders and features of all jobs take at once, beside the scenes; jobs wait for each
     other. None: four fifths of what the scenes leave."""

@@ -232,5 +232,5 @@ def _what_tells_apart(
     means = [float(strip.mean()) for strip in strips]
     side = SIDES[int(np.argmax(means))]
     if max(means) < config.min_difference:
-        return ["Around the photo, too, the places that it fits look alike: take a second photo, farther away."]
+        return ["The surroundings of these places look alike, too: take a second photo, farther away."]
     return [f"The places that the photo fits differ most {_BESIDE[side]}: {_TURN[side]}, or step back."]

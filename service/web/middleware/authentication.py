@@ -79,7 +79,7 @@ class Authentication:
         # The port may be a proxy's or a forwarded one, so only the name is compared.
         if self._rules.hosts and re.sub(r":\d+$", "", host) not in (*self._rules.hosts, *_LOOPBACK):
             raise Forbidden(
-                f"the service isn't called '{host[:80]}'.", where="header.host", hint="Set SPLATFIX_ALLOWED_HOSTS."
+                f"unknown host name '{host[:80]}'.", where="header.host", hint="Set SPLATFIX_ALLOWED_HOSTS."
             )
         origin = headers.get("origin")
         # A browser lets no page read another site's answer to a GET, but it does send a POST, and opens WebSockets.
@@ -108,7 +108,7 @@ class Authentication:
             # An expired cookie counts as none: the browser sends it whether the page is public or not.
             return keys.bearer(connection.cookies.get(COOKIE, ""))
         if caller is None and not self._rules.open:
-            raise Unauthorized("the key or token is not valid, or not any more.", where="header.authorization")
+            raise Unauthorized("the key or token is not valid or has expired.", where="header.authorization")
         return caller
 
     def _check_role(self, needed: Role | None, caller: Caller | None) -> None:

@@ -90,7 +90,7 @@ class Limits:
         if not self._limiter.hit(limit, client):
             reset = self._limiter.get_window_stats(limit, client).reset_time
             raise RateLimited(
-                f"more than {rate} requests of yours.",
+                f"rate limit exceeded: {rate}.",
                 hint="Slow down.",
                 retry_after_s=max(1, math.ceil(reset - time.time())),
             )

@@ -110,9 +110,9 @@ class _Session:
         live, client = self._state.live, client_of(self._socket.scope)
         # Nothing is awaited between check and count, so no other session takes the place.
         if live[client] >= self._settings.live_sessions_of_client:
-            raise _End(TOO_MANY, f"{live[client]} live sessions of yours go on already.")
+            raise _End(TOO_MANY, f"limit of live sessions for this key reached: {live[client]}.")
         if live.total() >= self._settings.live_sessions:
-            raise _End(TOO_MANY, f"the service has {live.total()} live sessions, its most; try again later.")
+            raise _End(TOO_MANY, f"limit of live sessions of the service reached: {live.total()}; try again later.")
         live[client] += 1
         try:
             yield
@@ -141,7 +141,7 @@ class _Session:
             async with asyncio.timeout(_HELLO_S):
                 message = await self._receive()
         except TimeoutError:
-            raise _End(TIMEOUT, f"no hello came within {_HELLO_S:g} s.") from None
+            raise _End(TIMEOUT, f"no hello within {_HELLO_S:g} s.") from None
         if isinstance(message, bytes):
             raise InvalidRequest("the first message is JSON, as text.", where="hello")
         return read_hello(message)
@@ -198,7 +198,7 @@ class _Session:
             if allowed < 0:
                 raise _End(TOO_MANY, f"more than {rate:g} frames a second.")
             if isinstance(message, str):
-                raise InvalidRequest("after the hello come binary messages only.", where="frame")
+                raise InvalidRequest("messages after the hello must be binary.", where="frame")
             last = read_frame(message, last)
             self._mailbox.put(last)
 
@@ -218,7 +218,7 @@ class _Session:
         while True:
             await asyncio.sleep(min(1.0, self._settings.live_idle_s / 4))
             if self._loop.time() - self._heard_at > self._settings.live_idle_s:
-                raise _End(TIMEOUT, f"no frame came for {self._settings.live_idle_s:g} s.")
+                raise _End(TIMEOUT, f"no frame for {self._settings.live_idle_s:g} s.")
             if self._caller and not self._state.keys.still_valid(self._caller):
                 raise _End(KEY_GONE, "the session's key is not valid any more.")
 
@@ -238,7 +238,7 @@ class _Session:
             async with asyncio.timeout(self._settings.send_s):
                 await self._socket.send_text(message.model_dump_json())
         except TimeoutError:
-            raise _End(TIMEOUT, "what is sent is not read.") from None
+            raise _End(TIMEOUT, "the client does not read the answers.") from None
 
 
 def _end_of(error: Exception) -> _End:

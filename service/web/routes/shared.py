@@ -40,7 +40,7 @@ def share_job(job: JobOf, wanted: ShareIn, app_state: AppStateOf, caller: Caller
 def _shared(app_state: AppStateOf, token: Annotated[str, Path(max_length=1000)]) -> StoredJob:
     job_id = app_state.keys.shared_job(token)
     if job_id is None:
-        raise JobNotFound("the link is not valid, or not any more.", where="link", hint="Ask for a new one.")
+        raise JobNotFound("the link is not valid or has expired.", where="link", hint="Ask for a new one.")
     return app_state.jobs.get(job_id)
 
 

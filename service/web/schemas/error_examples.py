@@ -53,7 +53,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         "/localize",
     ),
     (e.QueueFull("the queue is full: 32 jobs.", hint=_AGAIN), "/localize"),
-    (e.RateLimited("more than 30/second requests of yours.", hint="Slow down.", retry_after_s=1), "/localize"),
+    (e.RateLimited("rate limit exceeded: 30/second.", hint="Slow down.", retry_after_s=1), "/localize"),
     (e.StorageFailed("the service can't write the photo to disk: No space left on device."), "/localize"),
     (e.BadInput("the scene has no file to reload it from.", where="scene"), f"{_SCENE}/unload"),
     (e.SceneNotFound("unknown scene 'attic'.", where="scene"), "/scenes/attic"),
@@ -97,7 +97,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
     (e.LensNotFound("lens '0123456789abcdef' not found.", where="lens"), "/lenses/0123456789abcdef"),
     (
         e.RegistrationFailed(
-            "scale, up, heading, position can't be determined: all 4 places are one within their noise.",
+            "scale, up, heading, position can't be determined: all 4 places coincide within their noise.",
             where="registration",
             hint="Add places elsewhere, photos with poses, a length, or what is up.",
         ),

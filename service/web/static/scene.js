@@ -63,7 +63,7 @@ function anchorParts(state) {
   });
   const parts = [h("h2", {}, "Anchors"), rows.length
     ? h("ul", { class: "anchors" }, rows)
-    : h("p", { class: "quiet" }, "Named points of the scene, which each result tells as its photo sees them. Tick “name a point” in the viewer and click one.")];
+    : h("p", { class: "quiet" }, "Named points of the scene; each result has their positions as seen from its camera. Tick “name a point” in the viewer and click one.")];
   return state.point ? [...parts, namingForm(state, change)] : parts;
 }
 
