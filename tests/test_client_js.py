@@ -11,7 +11,7 @@ from api_server import ROOT, create_app, fake_estimators, photo, serving, settin
 from fake_service import FakeService
 from node import node
 from stand_ins import make_scene
-from test_scenes import ply
+from test_scenes import TRANSFORMS, archive, ply
 
 from service.live.live_values import LiveFrame
 from service.types import Intrinsics
@@ -96,6 +96,52 @@ console.log(JSON.stringify({ point, anchors, left: (await service.anchors("attic
     assert told["own"] == own
     assert (told["job"], told["valid"], told["names"]) == (True, 60, ["boss", "robot 7"])
     assert (told["refused"], told["gone"], told["coverage"]) == (["scene_not_found", 404], "unauthorized", "none")
+
+
+@pytest.mark.ci
+def test_scenes_are_uploaded_loaded_and_deleted_in_node(tmp_path):
+    key = add_key(tmp_path / "keys.json", "boss", "admin")
+    module = (
+        IMPORT
+        + """
+const service = new Client(process.argv[2], { key: process.argv[3] }), shares = [], codes = [];
+const bytes = Buffer.from(process.argv[4], "base64"), onProgress = share => shares.push(share);
+const code = error => codes.push(error.code);
+const state = async () => (await service.scenes()).find(scene => scene.id === "cellar").state;
+const added = await service.uploadScene("cellar", new Blob([bytes]), { name: "cellar.zip", onProgress });
+const ready = await service.waitUntilReady("cellar"), { training_cameras } = await service.scene("cellar");
+await service.uploadScene("cellar", new Blob([bytes])).catch(code);
+await service.uploadScene("junk", new File(["no scene"], "junk.txt")).catch(code);
+await service.unloadScene("cellar");
+while (await state() !== "unloaded") await new Promise(resolve => setTimeout(resolve, 20));
+await service.waitUntilReady("cellar").catch(code);
+await service.loadScene("cellar");
+const again = (await service.waitUntilReady("cellar")).state;
+await service.deleteScene("cellar");
+await service.scene("cellar").catch(code);
+await service.deleteScene("room").catch(code);
+const photo = new File([Buffer.from(process.argv[5], "base64")], "a.jpg"), stop = new AbortController();
+const { id } = await service.localize(photo, { scene: "room" }, { onProgress });
+await service.deleteJob(id);
+await service.job(id).catch(code);
+stop.abort();
+await service.uploadScene("late", new Blob([bytes]), { signal: stop.signal }).catch(error => codes.push(error.name));
+console.log(JSON.stringify({ added, ready, again, training_cameras, shares, codes }));
+"""
+    )
+    changes = {"keys_file": tmp_path / "keys.json", "data_dir": tmp_path / "data", "cache_dir": None}
+    with fake_estimators() as stepping, serving(create_app(settings(**changes), {"room": make_scene()})) as http:
+        stepping.GO_ON.set()
+        until(lambda: http.get("/scenes/room", headers={"Authorization": f"Bearer {key}"}).json()["state"] == "ready")
+        folder = archive(cellar__scene_dot_ply=ply(), cellar__transforms_dot_json=json.dumps(TRANSFORMS))
+        sent = [base64.b64encode(data).decode() for data in (folder, photo())]
+        told = json.loads(node(module, str(http.base_url), key, *sent))
+    assert (told["added"]["uploaded"], told["ready"]["state"], told["again"]) == (True, "ready", "ready")
+    assert told["ready"]["gaussians"] > 0
+    assert len(told["training_cameras"]) == len(TRANSFORMS["frames"])
+    assert told["shares"] == [1, 1]  # a file and a photo: Node doesn't tell more
+    refused = ["scene_exists", "invalid_request", "scene_unloaded", "scene_not_found", "scene_in_use"]
+    assert told["codes"] == [*refused, "job_not_found", "AbortError"]
 
 
 def test_a_lost_connection_is_taken_up_where_it_broke():

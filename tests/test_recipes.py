@@ -12,6 +12,7 @@ import re
 import shutil
 import subprocess
 import sys
+from datetime import UTC, datetime
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,8 +23,11 @@ from api_server import ROOT
 from node import node
 
 from service.geometry import moved, rotation_from_quat, se3_log
-from service.types import Pose
-from service.web.schemas.conversion import pose_out
+from service.jobs.model import JobResult
+from service.results import PoseEstimate, Reason, StageTiming, Status, Verdict
+from service.types import Intrinsics, Pose
+from service.web.schemas.conversion import pose_out, result_out
+from service.web.schemas.exports import exported
 
 RECIPES = ROOT / "docs" / "recipes"
 BALL = np.array([2.42, 1.96, 0.847])
@@ -215,6 +219,23 @@ def test_gltf():
     pixel = np.array([(across + 1) / 2 * K["width"], (1 - up) / 2 * K["height"]])
     centre = np.array([K["width"] / 2, K["height"] / 2])
     assert np.allclose(pixel - centre + [K["cx"], K["cy"]], PIXEL, atol=0.05)
+
+
+def test_nerfstudio_and_colmap_exports():
+    """What the service writes: nerfstudio's cameras have OpenGL's axes, COLMAP's images have camera_from_world."""
+    k = Intrinsics(int(K["width"]), int(K["height"]), K["fx"], K["fy"], K["cx"], K["cy"])
+    verdict = Verdict(Status.LOCALIZED, Reason.VERIFIED, 0.9, 100, 0.8, 1.0, np.eye(6))
+    estimate = PoseEstimate(
+        Pose(WORLD_FROM_CAMERA), verdict, k, "given", "studio", "0" * 64, "e", "r", "m", 0, False, 0, (), (), ()
+    )  # fmt: skip
+    result = result_out(JobResult(estimate, StageTiming("decode", 0, 0), None, {}))
+    frame = json.loads(exported("nerfstudio", "a photo.jpg", datetime(2026, 1, 2, tzinfo=UTC), result))
+    x, y, z, _ = np.linalg.inv(np.array(frame["transform_matrix"])) @ [*BALL, 1]
+    pixel = frame["fl_x"] * x / -z + frame["cx"], frame["fl_y"] * -y / -z + frame["cy"]
+    assert np.allclose(pixel, PIXEL, atol=0.05)
+    lines = exported("colmap", "a photo.jpg", datetime(2026, 1, 2, tzinfo=UTC), result).splitlines()
+    numbers = np.array(next(line for line in lines if line[0] != "#").split()[1:8], float)
+    assert np.allclose(seen(*(rotation_from_quat(numbers[:4]) @ BALL + numbers[4:])), PIXEL, atol=0.05)
 
 
 def colmap_model(tmp_path: Path) -> Path:

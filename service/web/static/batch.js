@@ -166,7 +166,7 @@ function summed(entries) {
 async function refresh(entries) {
   await Promise.all(entries.filter(entry => entry.job && !done(entry)).slice(0, 8).map(async entry => {
     try {
-      const job = await service.ask(`jobs/${entry.job.id}`);
+      const job = await service.job(entry.job.id);
       entry.job = job;
       entry.name = job.photo.name || entry.name;
     } catch (error) {

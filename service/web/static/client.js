@@ -26,7 +26,8 @@
  * @typedef {Job & {result: Result}} FinishedJob
  * @typedef {{index: number, stage: string, elapsed_s: number, world_from_camera: number[][],
  *   frame: Frame | null}} Step
- * @typedef {{id: string, name: string, state: string, gaussians: number | null, cameras: number | null}} Scene
+ * @typedef {{id: string, name: string, state: string, uploaded: boolean, gaussians: number | null,
+ *   cameras: number | null, memory_bytes: number | null, error: Problem | null, links: Record<string, string>}} Scene
  * @typedef {{name: string, position: number[]}} Anchor
  * @typedef {{name: string | null, role: "read" | "localize" | "admin", scenes: string[] | null, rate: string | null,
  *   queue_share: number | null, expires: string | null}} OwnKey
@@ -36,7 +37,12 @@
  * @property {() => void} [onRestart]  the job is tried again: the steps before don't count any more
  * @property {(error: ServiceError) => void} [onLost]  the connection is lost, and tried again every second
  * @property {() => void} [onResumed]  and works again
+ * @property {(share: number) => void} [onProgress]  called with the share of the photos that is sent, as in Upload
  * @property {AbortSignal} [signal]  ends the call with an AbortError; the job goes on
+ * @typedef {object} Upload
+ * @property {(share: number) => void} [onProgress]  called with the share that is sent, 0 to 1; outside of browsers,
+ *   which alone can tell it, once, with 1
+ * @property {AbortSignal} [signal]  ends the call with an AbortError
  */
 
 /**
@@ -62,6 +68,7 @@ export const ENDED = ["succeeded", "failed", "cancelled", "interrupted"];
 const JSON_TYPE = { "Content-Type": "application/json" };
 const RETRY_MS = 1000;
 const SILENT_MS = 45_000;  // three of the service's pings
+const UNREACHABLE = { code: "unreachable", detail: "The service can't be reached.", hint: "Is it running?" };
 
 /** The service answered with an error, doesn't answer, or a job ended without a result. */
 export class ServiceError extends Error {
@@ -105,9 +112,9 @@ export class Client {
       response = await fetch(new URL(path, this.base), { ...init, headers: { ...this.headers, ...init.headers } });
     } catch (error) {
       if (init.signal?.aborted) throw error;
-      throw new ServiceError({ code: "unreachable", detail: "The service can't be reached.", hint: "Is it running?" }, 0);
+      throw new ServiceError(UNREACHABLE, 0);
     }
-    if (!response.ok) throw await failure(response);
+    if (!response.ok) throw failed(parsed(await response.text().catch(() => "")), response.status, response.headers.get("Retry-After"));
     return response;
   }
 
@@ -119,6 +126,48 @@ export class Client {
    */
   async ask(path, init) {
     return (await this.send(path, init)).json().catch(() => null);
+  }
+
+  /**
+   * Send a file or a form, and return the JSON that the service answers. Raises ServiceError.
+   * @param {string} method
+   * @param {string} path
+   * @param {Blob | FormData} body
+   * @param {Upload} [options]
+   * @returns {Promise<any>}
+   */
+  async upload(method, path, body, { onProgress, signal } = {}) {
+    if (onProgress && globalThis.XMLHttpRequest) return this.#uploadTold(method, path, body, onProgress, signal);
+    const answer = await this.ask(path, { method, body, signal });
+    onProgress?.(1);
+    return answer;
+  }
+
+  /**
+   * By XMLHttpRequest: fetch doesn't tell how much was sent.
+   * @param {string} method
+   * @param {string} path
+   * @param {Blob | FormData} body
+   * @param {(share: number) => void} onProgress
+   * @param {AbortSignal} [signal]
+   */
+  #uploadTold(method, path, body, onProgress, signal) {
+    return new Promise((resolve, reject) => {
+      const request = new XMLHttpRequest(), abort = () => request.abort();
+      const end = (/** @type {() => void} */ settle) => () => { signal?.removeEventListener("abort", abort); settle(); };
+      signal?.throwIfAborted();
+      signal?.addEventListener("abort", abort);
+      request.open(method, new URL(path, this.base));
+      for (const [name, value] of Object.entries(this.headers)) request.setRequestHeader(name, value);
+      request.upload.onprogress = ({ loaded, total }) => onProgress(total ? loaded / total : 1);
+      request.onload = end(() => {
+        const answer = parsed(request.responseText), { status } = request;
+        status < 300 ? resolve(answer) : reject(failed(answer, status, request.getResponseHeader("Retry-After")));
+      });
+      request.onerror = end(() => reject(new ServiceError(UNREACHABLE, 0)));
+      request.onabort = end(() => reject(signal?.reason ?? new DOMException("The upload was cancelled.", "AbortError")));
+      request.send(body);
+    });
   }
 
   /**
@@ -140,16 +189,16 @@ export class Client {
    * Queue a job. A full queue is not tried again: see `retryAfterS` of the error.
    * @param {Blob | Blob[]} photos
    * @param {Record<string, any>} [fields]
-   * @param {{signal?: AbortSignal}} [options]
+   * @param {Upload} [options]
    * @returns {Promise<Job>}
    */
-  submit(photos, fields = {}, { signal } = {}) {
+  submit(photos, fields = {}, { onProgress, signal } = {}) {
     const body = new FormData();
     for (const [name, value] of Object.entries(fields)) {
       if (value !== null && value !== undefined) body.append(name, typeof value === "string" ? value : JSON.stringify(value));
     }
     for (const photo of [photos].flat()) body.append("photo", photo, /** @type {File} */ (photo).name || "photo");
-    return this.ask("localize", { method: "POST", body, signal });
+    return this.upload("POST", "localize", body, { onProgress, signal });
   }
 
   /**
@@ -210,7 +259,7 @@ export class Client {
   }
 
   /** @param {string} id @returns {Promise<Job>} */
-  job(id) { return this.ask(`jobs/${encodeURIComponent(id)}`); }
+  job(id) { return this.ask(jobPath(id)); }
 
   /** @param {Record<string, string | number>} [filters]  scene, state, status, limit, ... */
   async jobs(filters = {}) {
@@ -219,16 +268,60 @@ export class Client {
   }
 
   /** @param {string} id @returns {Promise<Job>} */
-  cancel(id) { return this.ask(`jobs/${encodeURIComponent(id)}`, { method: "DELETE" }); }
+  cancel(id) { return this.ask(jobPath(id), { method: "DELETE" }); }
+
+  /** Delete an ended job with its result and photo. @param {string} id */
+  async deleteJob(id) { await this.send(`${jobPath(id)}?purge=true`, { method: "DELETE" }); }
 
   /** @param {string} id @param {"colmap" | "nerfstudio" | "tum" | "geopose"} format */
-  async exported(id, format) { return (await this.send(`jobs/${encodeURIComponent(id)}/export/${format}`)).text(); }
+  async exported(id, format) { return (await this.send(`${jobPath(id)}/export/${format}`)).text(); }
 
   /** @returns {Promise<Scene[]>} */
   async scenes() { return (await this.ask("scenes")).scenes; }
 
-  /** @param {string} id */
-  scene(id) { return this.ask(`scenes/${encodeURIComponent(id)}`); }
+  /**
+   * A scene, with its training cameras where it is in memory.
+   * @param {string} id
+   * @returns {Promise<Scene & {training_cameras: any[], metres_per_unit: number | null}>}
+   */
+  scene(id) { return this.ask(scenePath(id)); }
+
+  /**
+   * Add a scene, which is checked, stored, and then loaded; for which, as for the next three, the key has the role admin.
+   * @param {string} id
+   * @param {Blob} file  a scene file, or a ZIP of a scene folder
+   * @param {Upload & {name?: string}} [options]  `name`: that of the file, where it has none; its suffix is the format
+   * @returns {Promise<Scene>}
+   */
+  uploadScene(id, file, { name = /** @type {File} */ (file).name || "scene.ply", ...options } = {}) {
+    return this.upload("PUT", `${scenePath(id)}?file=${encodeURIComponent(name)}`, file, options);
+  }
+
+  /** Begin to load a scene into memory. @param {string} id @returns {Promise<Scene>} */
+  loadScene(id) { return this.ask(`${scenePath(id)}/load`, { method: "POST" }); }
+
+  /** Remove a scene from memory once its last job has ended. @param {string} id @returns {Promise<Scene>} */
+  unloadScene(id) { return this.ask(`${scenePath(id)}/unload`, { method: "POST" }); }
+
+  /** Delete an uploaded scene and its files. @param {string} id */
+  async deleteScene(id) { await this.send(scenePath(id), { method: "DELETE" }); }
+
+  /**
+   * Resolve once photos can be localized in a scene. Raises ServiceError, also where it can't be loaded or isn't.
+   * @param {string} id
+   * @param {{signal?: AbortSignal}} [options]
+   * @returns {Promise<Scene>}
+   */
+  async waitUntilReady(id, { signal } = {}) {
+    for (;;) {
+      const scene = await this.scene(id), { state, error } = scene;
+      if (state === "ready") return scene;
+      if (!["loading", "preparing"].includes(state)) {
+        throw new ServiceError(error ?? { code: `scene_${state}`, detail: `Scene '${id}' is ${state}.`, hint: "Load it first." }, error?.status ?? 0);
+      }
+      await pause(RETRY_MS, signal);
+    }
+  }
 
   /**
    * An image of a scene from any pose, as a JPEG.
@@ -238,7 +331,7 @@ export class Client {
    */
   async render(id, pose, intrinsics) {
     const body = JSON.stringify({ pose, intrinsics, format: "jpeg" });
-    return (await this.send(`scenes/${encodeURIComponent(id)}/render`, { method: "POST", headers: JSON_TYPE, body })).blob();
+    return (await this.send(`${scenePath(id)}/render`, { method: "POST", headers: JSON_TYPE, body })).blob();
   }
 
   /**
@@ -247,11 +340,11 @@ export class Client {
    * @param {{measure?: boolean}} [options]
    */
   coverage(id, { measure = false } = {}) {
-    return this.ask(`scenes/${encodeURIComponent(id)}/coverage`, { method: measure ? "POST" : "GET" });
+    return this.ask(`${scenePath(id)}/coverage`, { method: measure ? "POST" : "GET" });
   }
 
   /** The named points of a scene. @param {string} id @returns {Promise<Anchor[]>} */
-  async anchors(id) { return (await this.ask(`scenes/${encodeURIComponent(id)}/anchors`)).anchors; }
+  async anchors(id) { return (await this.ask(`${scenePath(id)}/anchors`)).anchors; }
 
   /**
    * Add a named point to a scene, or move the one of that name; for which the key has the role admin.
@@ -273,7 +366,7 @@ export class Client {
    */
   async share(id, { expiresInS } = {}) {
     const body = JSON.stringify({ expires_in_s: expiresInS });
-    const made = await this.ask(`jobs/${encodeURIComponent(id)}/share`, { method: "POST", headers: JSON_TYPE, body });
+    const made = await this.ask(`${jobPath(id)}/share`, { method: "POST", headers: JSON_TYPE, body });
     return { url: new URL(made.link, this.base).href, token: made.token, expires_in_s: made.expires_in_s };
   }
 
@@ -305,7 +398,7 @@ export class Client {
    * @returns {Promise<Live>}
    */
   async live(scene, options = {}) {
-    const address = new URL(`scenes/${encodeURIComponent(scene)}/live`, this.base);
+    const address = new URL(`${scenePath(scene)}/live`, this.base);
     address.protocol = address.protocol.replace("http", "ws");
     if (this.headers.Authorization) {  // no browser sends a header with a WebSocket
       address.searchParams.set("token", (await this.ask("tokens", { method: "POST" })).token);
@@ -345,7 +438,7 @@ export class Live {
    * @param {ArrayBuffer} jpeg
    * @param {number} timeS  when it was taken, by any clock
    * @param {number[]} [lens]  fx, fy, cx, cy of this frame, for lenses that change
-   * @param {number[][]} [odomFromCamera]  4x4, by the device's odometry, OpenCV camera axes
+   * @param {number[][]} [odomFromCamera]  a 4x4, by the device's odometry, OpenCV camera axes
    * @param {number[]} [upInCamera]  by gravity, OpenCV camera axes
    * @returns {number} its id
    */
@@ -376,7 +469,7 @@ export class Live {
  * @param {number} timeS
  * @param {ArrayBuffer} jpeg
  * @param {number[]} [lens]  fx, fy, cx, cy
- * @param {number[][]} [odomFromCamera]  4x4
+ * @param {number[][]} [odomFromCamera]  a 4x4
  * @param {number[]} [upInCamera]
  */
 export function liveMessage(id, timeS, jpeg, lens, odomFromCamera, upInCamera) {
@@ -392,14 +485,25 @@ export function liveMessage(id, timeS, jpeg, lens, odomFromCamera, upInCamera) {
   return message;
 }
 
+/** @param {string} id */
+const jobPath = id => `jobs/${encodeURIComponent(id)}`;
+/** @param {string} id */
+const scenePath = id => `scenes/${encodeURIComponent(id)}`;
 /** @param {string} id @param {string} name */
-const anchorPath = (id, name) => `scenes/${encodeURIComponent(id)}/anchors/${encodeURIComponent(name)}`;
+const anchorPath = (id, name) => `${scenePath(id)}/anchors/${encodeURIComponent(name)}`;
 
-/** @param {Response} response */
-async function failure(response) {
-  const problem = await response.json().catch(() => null);
-  const after = Number(response.headers.get("Retry-After")) || null;
-  return new ServiceError(problem ?? { detail: `The service answered HTTP ${response.status}.` }, response.status, after);
+/** The JSON of a text; null of any other. @param {string} text */
+function parsed(text) {
+  try {
+    return JSON.parse(text);
+  } catch {
+    return null;
+  }
+}
+
+/** @param {Partial<Problem> | null} problem @param {number} status @param {string | null} retryAfter */
+function failed(problem, status, retryAfter) {
+  return new ServiceError(problem ?? { detail: `The service answered HTTP ${status}.` }, status, Number(retryAfter) || null);
 }
 
 /**

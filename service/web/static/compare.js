@@ -9,13 +9,13 @@ import { photoOf } from "./result.js";
 export function show(main, first, second) {
   document.title = "comparison – splatfix";
   main.append(h("h1", {}, "Comparison"));
-  Promise.all([first, second].map(id => service.ask(`jobs/${id}`)))
+  Promise.all([first, second].map(id => service.job(id)))
     .then(async jobs => main.append(...compared(jobs, await scenes(jobs))))
     .catch(error => main.append(h("p", { class: "trouble", role: "alert" }, error.message)));
 }
 
 function scenes(jobs) {
-  return Promise.all(jobs.map(job => service.ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null)));
+  return Promise.all(jobs.map(job => service.scene(job.scene).catch(() => null)));
 }
 
 function compared(jobs, [sceneA, sceneB]) {

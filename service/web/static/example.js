@@ -8,8 +8,7 @@ const TURN = 0.25;  // rad, at most
 /** Render a view of a scene that has training cameras. Returns its file, and as fields its intrinsics and its true
  * pose, so that the answer's errors are shown. Raises ServiceError. */
 export async function viewOf(id) {
-  const path = `scenes/${encodeURIComponent(id)}`;
-  const { training_cameras: cameras } = await service.ask(path);
+  const { training_cameras: cameras } = await service.scene(id);
   const camera = cameras[Math.floor(Math.random() * cameras.length)];
   const intrinsics = pinhole(camera.intrinsics);
   const pose = { world_from_camera: turned(camera.world_from_camera, TURN * (2 * Math.random() - 1)) };

@@ -45,7 +45,7 @@ export function show(main) {
   for (const filter of [outcome, scene, estimator]) filter.addEventListener("change", reload);
   more.addEventListener("click", () => load(next));
   compare.addEventListener("click", () => { location.hash = `#/compare/${[...marked].join("/")}`; });
-  service.ask("scenes").then(({ scenes }) => scene.append(...scenes.map(s => h("option", { value: s.id }, s.name))), () => {});
+  service.scenes().then(scenes => scene.append(...scenes.map(s => h("option", { value: s.id }, s.name))), () => {});
   service.ask("capabilities").then(({ estimators }) => estimator.append(
     ...estimators.filter(e => e.available).map(e => h("option", { value: e.name }, e.name))), () => {});
 
@@ -94,7 +94,7 @@ function actions(job, name, marked, compare, note) {
     button("Run again", () => repeat(job.id)),
     button("Delete", async element => {
       if (!confirm(`Delete the job of ${name}, with its result and photo?`)) return;
-      await service.ask(`jobs/${job.id}?purge=true`, { method: "DELETE" });
+      await service.deleteJob(job.id);
       marked.delete(job.id);
       compare.disabled = marked.size !== 2;
       element.closest("tr").remove();

@@ -21,13 +21,13 @@ function refused({ main }, error) {
 }
 
 async function open(view, id) {
-  const job = await service.ask(`jobs/${id}`);
+  const job = await service.job(id);
   if (ENDED.includes(job.state)) finish(view, job);
   else progress(view, job);
 }
 
 async function finish(view, job) {
-  const scene = await service.ask(`scenes/${encodeURIComponent(job.scene)}`).catch(() => null);
+  const scene = await service.scene(job.scene).catch(() => null);
   const status = job.result?.status ?? job.state;
   document.title = `${words(status)} – splatfix`;
   const preview = view.main.querySelector("img.preview")?.src;
@@ -44,7 +44,7 @@ function progress(view, job) {
   const cancel = h("button", { type: "button", "data-needs": "localize" }, "Cancel");
   cancel.addEventListener("click", async () => {
     cancel.disabled = true;
-    await service.ask(job.links.self, { method: "DELETE" }).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
+    await service.cancel(job.id).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
   });
   view.main.replaceChildren(h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
     h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages,
@@ -90,7 +90,7 @@ function progress(view, job) {
 /** While there is no record, ask in which state the job and its scene are. */
 async function refresh(state) {
   const [job, scene] = await Promise.all([
-    service.ask(state.job.links.self).catch(() => null), service.ask(`scenes/${encodeURIComponent(state.job.scene)}`).catch(() => null)]);
+    service.job(state.job.id).catch(() => null), service.scene(state.job.scene).catch(() => null)]);
   if (job) state.job = job;
   state.scene = scene;
 }
@@ -113,7 +113,7 @@ function described(state) {
 
 /** The median time of the last jobs of this kind, in seconds; null if there are none. */
 async function usualTime(job) {
-  const { jobs } = await service.ask(`jobs?scene=${encodeURIComponent(job.scene)}&state=succeeded&limit=50`).catch(() => ({ jobs: [] }));
+  const { jobs } = await service.jobs({ scene: job.scene, state: "succeeded", limit: 50 }).catch(() => ({ jobs: [] }));
   const times = jobs
     .filter(other => other.estimator === job.estimator && other.finished && other.started)
     .map(other => (Date.parse(other.finished) - Date.parse(other.started)) / 1000)

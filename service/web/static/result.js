@@ -172,6 +172,6 @@ function asPrior({ result, scene, photo }) {
 
 /** Other jobs that have found a pose for the same photo. */
 async function others(job) {
-  const { jobs } = await service.ask(`jobs?photo=${job.photo.sha256}&limit=50`).catch(() => ({ jobs: [] }));
+  const { jobs } = await service.jobs({ photo: job.photo.sha256, limit: 50 }).catch(() => ({ jobs: [] }));
   return jobs.filter(other => other.id !== job.id && other.status);
 }

@@ -93,13 +93,12 @@ export class SceneList {
 
   #actions({ id, name, state, uploaded, gaussians }) {
     const loaded = gaussians !== null;
-    const path = `scenes/${encodeURIComponent(id)}`;
-    const button = (label, method, address, question = "") => {
+    const button = (label, act, question = "") => {
       const element = h("button", { type: "button", class: "plain", "data-needs": "admin", "aria-label": `${label} ${name}` }, label);
       element.addEventListener("click", async () => {
         if (question && !confirm(question)) return;
         element.disabled = true;
-        await service.send(address, { method }).then(() => say(`${label}: ${name}`), this.onError);
+        await act(id).then(() => say(`${label}: ${name}`), this.onError);
         element.disabled = false;
         this.poll();
       });
@@ -108,9 +107,9 @@ export class SceneList {
     const plan = h("a", { href: `#/scenes/${encodeURIComponent(id)}`, "aria-label": `Plan and coverage of ${name}` }, "Plan and coverage");
     return [
       loaded ? plan : null,
-      ["unloaded", "failed"].includes(state) ? button("Load", "POST", `${path}/load`) : null,
-      ["ready", "preparing"].includes(state) ? button("Unload", "POST", `${path}/unload`) : null,
-      uploaded ? button("Delete", "DELETE", path, `Delete the scene ${name} and its files?`) : null,
+      ["unloaded", "failed"].includes(state) ? button("Load", id => service.loadScene(id)) : null,
+      ["ready", "preparing"].includes(state) ? button("Unload", id => service.unloadScene(id)) : null,
+      uploaded ? button("Delete", id => service.deleteScene(id), `Delete the scene ${name} and its files?`) : null,
     ].filter(Boolean);
   }
 
@@ -136,12 +135,12 @@ export class SceneList {
     const box = h("section", { class: "sendbox", "aria-label": "Upload of a scene" },
       h("p", {}, h("strong", {}, file.name), " ", line), bar, h("p", { class: "buttons" }, cancel));
     this.element.before(box);
-    const progress = share => {
+    const onProgress = share => {
       line.textContent = share < 1 ? `Uploading, ${Math.round(100 * share)} % of ${bytes(file.size)}` : "Checking the file…";
       share < 1 ? bar.value = share : bar.removeAttribute("value");
     };
     try {
-      const scene = await service.upload("PUT", `scenes/${id}?file=${encodeURIComponent(file.name)}`, file, progress, abort.signal);
+      const scene = await service.uploadScene(id, file, { onProgress, signal: abort.signal });
       this.onChoose(scene.id, [scene], true);
       say(`${scene.name} was uploaded`);
       return true;

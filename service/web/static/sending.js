@@ -11,14 +11,11 @@ const POLL_MS = 1000;
  * waits and sends again; `told` gets a text, and the sent share where that is known. Raises ServiceError, AbortError.
  */
 export async function sendPhoto(file, fields, told, signal) {
-  const form = new FormData();
-  for (const [name, value] of Object.entries(fields)) form.append(name, value);
-  form.append("photo", file, file.name || "photo");
+  const onProgress = share => told(share < 1 ? `Uploading, ${Math.round(100 * share)} %` : "Reading the photo…", share);
   for (;;) {
     await untilLoaded(fields.scene, told, signal);
     try {
-      const progress = share => told(share < 1 ? `Uploading, ${Math.round(100 * share)} %` : "Reading the photo…", share);
-      const job = await service.upload("POST", "localize", form, progress, signal);
+      const job = await service.submit(file, fields, { onProgress, signal });
       remember(job.id, file, fields);
       return job;
     } catch (error) {
@@ -30,7 +27,7 @@ export async function sendPhoto(file, fields, told, signal) {
 async function untilLoaded(scene, told, signal) {
   if (!scene || scene === "auto") return;
   for (;;) {
-    const { state, gaussians } = await service.ask(`scenes/${encodeURIComponent(scene)}`);
+    const { state, gaussians } = await service.scene(scene);
     if (gaussians !== null || !["loading", "preparing"].includes(state)) return;
     told(`Waiting: the scene is ${words(state)}…`);
     await pause(POLL_MS, signal);
@@ -41,7 +38,7 @@ async function untilLoaded(scene, told, signal) {
 async function mayPass(error, scene, told, signal) {
   const { code } = error;
   if (code === "scene_unloaded") {
-    const load = service.ask(`scenes/${encodeURIComponent(scene)}/load`, { method: "POST" });
+    const load = service.loadScene(scene);
     await load.catch(refused => { throw refused.status === 403 ? error : refused; });  // what an admin has to do
   }
   else if (!["queue_full", "rate_limited"].includes(code)) throw error;

@@ -1,41 +1,22 @@
-// The service as this page speaks with it: the client of /client.js, a form for the key where one is needed, and uploads
-// that tell how much is sent.
+// The service as this page speaks with it: the client of /client.js, and a form for the key where one is needed.
 
 import { Client, ENDED, ServiceError } from "../client.js";
 
 export { ENDED, ServiceError };
 
-const UNREACHABLE = { code: "unreachable", detail: "The service can't be reached.", hint: "Is it running?" };
-
-/** Return an error; where a key is needed, the page that asks for it is opened, once. */
+/** Raise an error; where a key is needed, the page that asks for it is opened, once. */
 function refused(error) {
   if (error.status === 401 && !location.hash.startsWith("#/key")) location.hash = `#/key?back=${encodeURIComponent(location.hash)}`;
-  return error;
+  throw error;
 }
 
 class PageClient extends Client {
-  async send(path, init) {
-    try {
-      return await super.send(path, init);
-    } catch (error) {
-      throw refused(error);
-    }
+  send(path, init) {
+    return super.send(path, init).catch(refused);
   }
 
-  /** Send a form or a file; `onProgress` gets the sent share, 0 to 1. Raises ServiceError; `signal` aborts it. */
-  upload(method, path, body, onProgress, signal) {
-    return new Promise((resolve, reject) => {
-      const request = new XMLHttpRequest();  // fetch doesn't tell how much was sent
-      const refuse = problem => reject(refused(new ServiceError(problem ?? { detail: `The service answered HTTP ${request.status}.` }, request.status)));
-      request.open(method, new URL(path, this.base));
-      request.responseType = "json";
-      request.upload.addEventListener("progress", event => onProgress(event.loaded / event.total));
-      request.addEventListener("load", () => (request.status < 300 ? resolve(request.response) : refuse(request.response)));
-      request.addEventListener("error", () => refuse(UNREACHABLE));
-      request.addEventListener("abort", () => reject(new DOMException("The upload was cancelled.", "AbortError")));
-      signal?.addEventListener("abort", () => request.abort());
-      request.send(body);
-    });
+  upload(method, path, body, options) {
+    return super.upload(method, path, body, options).catch(refused);
   }
 }
 
@@ -46,12 +27,12 @@ export const service = new PageClient();
  * Returns what the key may do; null: not known.
  */
 export async function hideForbidden() {
-  const own = await fetch("key").then(answer => (answer.ok ? answer.json() : null), () => null);
+  const own = await service.ownKey().catch(() => null);
   if (own) document.documentElement.dataset.role = own.role;
   return own;
 }
 
 /** Tell whether the service answers only those who have a key: this page itself has a cookie instead. */
 export async function asksForKey() {
-  return fetch("version", { credentials: "omit" }).then(response => response.status === 401, () => false);
+  return new Client().send("version", { credentials: "omit" }).then(() => false, error => error.status === 401);
 }

@@ -1,21 +1,16 @@
 // One job, read-only, for who has its link: photo and render, pose, evidence, and the steps of the search.
 
+import { Client } from "../client.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
 import { poseFormats } from "./formats.js";
 
 const main = document.querySelector("#main");
 const token = location.pathname.split("/").filter(Boolean).at(-1);
-
-async function ask(path) {
-  const response = await fetch(`${token}/${path}`);
-  const answer = await response.json().catch(() => null);
-  if (!response.ok) throw new Error(answer ? `${answer.detail} ${answer.hint}` : `The service answered HTTP ${response.status}.`);
-  return answer;
-}
+const link = new Client(new URL(`${token}/`, location.href));
 
 async function show() {
-  const { job, metres_per_unit: scale } = await ask("job");
+  const { job, metres_per_unit: scale } = await link.ask("job");
   const { result } = job;
   const title = job.photo.name || "A photo";
   document.title = `${title} – splatfix`;
@@ -56,7 +51,7 @@ function anchors({ anchors: seen }, scale) {
 
 /** The steps of the search, one at a time: what the viewer shows, without 3D. */
 async function steps(job) {
-  const { records } = await ask("trace").catch(() => ({ records: [] }));
+  const { records } = await link.ask("trace").catch(() => ({ records: [] }));
   if (!records.length) return null;
   const picture = h("img", { class: "preview", alt: "The scene rendered at this step" });
   const line = h("div");
