@@ -175,9 +175,24 @@ def test_the_3d_view_has_most_of_the_window(
     box = page.locator("canvas").first.bounding_box()
     assert box
     assert box["width"] >= 0.6 * width
-    found = Axe().run(page, options={"runOnly": ["color-contrast"]})
-    assert not found.violations_count, found.generate_report()
+    page.wait_for_timeout(500)  # what has appeared is named with the next frame
+    assert not serious(page)
+    for tab in ("match vectors", "curves") if width > 1000 else ():
+        page.get_by_role("tab", name=tab).click()
+        page.wait_for_timeout(500)
+        assert not serious(page)
     page.close()
+
+
+def serious(page: Page) -> list[str]:
+    """Return what axe finds serious or critical. That viser's page has no heading and no landmarks is moderate."""
+    found = Axe().run(page).response["violations"]
+    return [
+        f"{rule['id']}: {node['html'][:200]}"
+        for rule in found
+        if rule["impact"] in ("serious", "critical")
+        for node in rule["nodes"]
+    ]
 
 
 def test_on_a_phone_the_panel_is_a_sheet_that_folds(browser: Browser, fake: FakeService, url: str) -> None:
@@ -216,8 +231,7 @@ def test_the_plan_view_shows_coverage_with_its_legend(browser: Browser, fake: Fa
     expect(page.get_by_role("checkbox", name="floor plan")).to_be_checked()
     expect(page.get_by_role("checkbox", name="poses of all jobs")).to_be_checked()
     expect(page.get_by_role("checkbox", name="splats")).not_to_be_checked()
-    found = Axe().run(page, options={"runOnly": ["color-contrast"]})
-    assert not found.violations_count, found.generate_report()
+    assert not serious(page)
     page.get_by_role("checkbox", name="plan view").uncheck()
     expect(page.get_by_role("checkbox", name="floor plan")).not_to_be_checked()
     page.close()

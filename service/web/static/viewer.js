@@ -66,6 +66,31 @@ async function compare() {
   bar.remove();
 }
 
+// viser gives no name to some of its controls and pictures, which a screen reader then can't tell apart, and no keyboard
+// reaches what has to be scrolled.
+const ICONS = { "list-search": "Commands", adjustments: "Configuration and diagnostics", "arrow-back": "Back to the panel" };
+const named = element => document.querySelector(`label[for="${CSS.escape(element.id)}"]`)?.textContent ?? "";
+const NAMES = {
+  ".mantine-Slider-root": slider => set(slider.querySelector("[role=slider]"), "aria-label", named(slider)),
+  ".mantine-Slider-root + * input": input => set(input, "aria-label", named(input.closest(".mantine-Slider-root + *").previousElementSibling)),
+  ".mantine-ActionIcon-root:has(svg)": icon => set(icon, "aria-label", Object.entries(ICONS).find(([name]) => icon.querySelector(`.tabler-icon-${name}`))?.[1]),
+  ".mantine-Notification-closeButton": button => set(button, "aria-label", "Close"),
+  "img:not([alt])": image => set(image, "alt", document.querySelector("[role=tab][aria-selected=true]")?.textContent),
+  ".mantine-ScrollArea-viewport:not([tabindex])": region => set(region, "tabindex", "0"),
+};
+
+function set(element, attribute, value) {
+  if (value && element.getAttribute(attribute) !== value) element.setAttribute(attribute, value);
+}
+
+let toName = 0;
+new MutationObserver(() => {
+  toName ||= requestAnimationFrame(() => {
+    toName = 0;
+    for (const [selector, name] of Object.entries(NAMES)) document.querySelectorAll(selector).forEach(name);
+  });
+}).observe(document.documentElement, { childList: true, subtree: true });
+
 // viser's labels have a contrast of 4.0 : 1. On narrow screens its panel, 20em wide, covers a half of the view: there it
 // is a sheet along the lower edge, which folds by its handle.
 const styles = document.createElement("style");
