@@ -118,7 +118,7 @@ def test_a_rig_in_a_room_that_is_the_same_upside_down_is_ambiguous(tmp_path):
 
 
 def test_a_rig_in_metres_needs_a_scene_in_metres(room):
-    with pytest.raises(InvalidRequest, match="how long its unit is"):
+    with pytest.raises(InvalidRequest, match="length of a unit"):
         localize_rig(photos(room), room, metric=True)
 
 

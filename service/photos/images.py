@@ -143,7 +143,7 @@ def _query(
         intrinsics, source, lens_prior = _assumed_intrinsics((decoded.width, decoded.height), identity)
         if source == "guessed":
             warnings.append(
-                "The photo's EXIF data has no focal length; it is estimated with the pose, starting from 28 mm "
+                "The photo's metadata has no focal length; it is estimated with the pose, starting from 28 mm "
                 "(35 mm equivalent). Send intrinsics for an exact pose."
             )
     camera = decoded.camera(intrinsics)
