@@ -639,8 +639,10 @@ def test_a_photo_for_a_scene_that_is_not_in_memory_loads_it(page: Page, url: str
     httpx.post(f"{url}/scenes/room/unload", trust_env=False).raise_for_status()
     until(lambda: httpx.get(f"{url}/scenes/room", trust_env=False).json()["state"] == "unloaded")
     page.set_input_files("#photo", PHOTO)
-    page.locator(".verdict .badge").wait_for()
+    expect(page.locator(".sendbox")).to_contain_text("Waiting: the scene is loading")
+    page.wait_for_url("**/#/jobs/*", timeout=2 * PATIENCE_MS)
     assert job_of(page, url)["scene"] == "room"
+    until(lambda: httpx.get(f"{url}/scenes/room", trust_env=False).json()["state"] == "ready", 200)
 
 
 def test_a_job_without_a_step_says_whether_it_waits_or_runs(page: Page, url: str) -> None:

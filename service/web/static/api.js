@@ -6,7 +6,9 @@ const page = document.querySelector("#swagger-ui");
 
 // What Swagger UI draws of an opened operation has no names for a screen reader, and examples that no keyboard scrolls.
 new MutationObserver(() => {
-  for (const select of page.querySelectorAll(".examples-select-element:not([aria-label])")) select.setAttribute("aria-label", "Example");
+  for (const [selector, name] of [[".examples-select-element", "Example"], [".body-param__text", "Request body"]]) {
+    for (const field of page.querySelectorAll(`${selector}:not([aria-label])`)) field.setAttribute("aria-label", name);
+  }
   for (const row of page.querySelectorAll("[data-param-name], [data-property-name]")) {
     const { paramName, propertyName } = row.dataset;
     for (const field of row.querySelectorAll(":is(input, select, textarea):not([aria-label])")) field.setAttribute("aria-label", paramName ?? propertyName);
