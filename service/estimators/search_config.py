@@ -30,8 +30,8 @@ class SearchConfig:
     patches: PatchPoseConfig = PATCH_POSE
     small_photo_factor: float = 0.77
     """Size of the photo in the stage `retrieve`, relative to `retrieve_full_size`: a whole, sharp photo is found in
-    half the time.
-    Each of the 58 clean test photos has 75 or more matches that agree with its likeliest view, foreign ones 12."""
+    half the time. Each of the 58 clean test photos has 75 or more matches that agree with its likeliest view, foreign
+    ones 12."""
     small_photo_views: int = 2
     """Views that the small photo is matched with."""
     large_photo_factor: float = 1.25

@@ -49,7 +49,7 @@ class StageOutcome:
     recognised: bool = False
     """Whether a render at some pose had more matches with the photo than chance: photos of other scenes never do."""
     unmatched: AbsolutePose | None = None
-    """The pose of few matches that was refined without matching a render there first; None: there is none."""
+    """The pose of few matches with views that was refined as it was, without a rematch; None: there is none."""
 
 
 StageResult = Generator[IterationRecord, None, StageOutcome]
@@ -62,7 +62,7 @@ class Stage:
     records: StageResult
     variant: ImageVariant
     """Size and rotation in which the photo is compared."""
-    expected: bool = False
+    from_prior: bool = False
     """Whether the pose is refined from a prior: then the pixels alone may decide."""
 
 
@@ -102,7 +102,7 @@ class SearchState:
     recognised: bool = False
     """Whether any stage so far recognised something (`StageOutcome`)."""
     unmatched: AbsolutePose | None = None
-    """That of the latest stage."""
+    """That of the latest stage's outcome: if the gate refuses what it led to, it is matched with a render there."""
     assumed: Query | None = None
     """The photo with the lens that was assumed, where that proved to be a fisheye; None: it is `images.query`'s."""
 
@@ -131,9 +131,18 @@ class SearchState:
             config = replace(config, refinement=refinement_config)
         images = self.images.corrected(found.correction)
         rendered, refinement = found.view_at_pose(images, self.renderer)
-        # A pose refined from a prior has no matches behind it.
-        matches, unique = found.num_inliers or 0, is_unique or not self.tools.prepared.repeats_itself
-        verdict = verify(images, found.pose, rendered, refinement, pixels_may_decide, matches, unique, config)
+        unique = is_unique or not self.tools.prepared.repeats_itself
+        verdict = verify(
+            images,
+            found.pose,
+            rendered,
+            refinement,
+            pixels_may_decide,
+            # A pose refined from a prior has no matches behind it.
+            supporting_matches=found.num_inliers or 0,
+            light_may_differ=unique,
+            config=config,
+        )
         if not unique and self._shows_other_colours(found, verdict):
             verdict = doubted(verdict, Reason.RENDER_MISMATCH)
         if found.settled:
@@ -200,7 +209,7 @@ class SearchState:
 def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, None, None]:
     """Yield a stage's records with the best answer so far, and verify what it led to.
 
-    Where the answer was expected, or many matches with a view led to it, the pixels alone may decide.
+    Where a prior pose, or many matches with a view, led to the answer, the pixels alone may decide.
     """
     outcome = yield from changed(stage.records, state.with_answer)
     state.recognised |= outcome.recognised
@@ -210,7 +219,7 @@ def run_stage(state: SearchState, stage: Stage) -> Generator[IterationRecord, No
         return
     config, free_lens = state.config, state.images.query.lens_prior is not None
     least = config.photometric_min_inliers_free_lens if free_lens else config.photometric_min_inliers
-    pixels_may_decide = stage.expected or (found.num_inliers or 0) >= least
+    pixels_may_decide = stage.from_prior or (found.num_inliers or 0) >= least
     verdict = state.verify(found, pixels_may_decide)
     if _may_be_in_other_light(state, verdict):
         again = yield from refined_in_other_light(state, found)
@@ -291,7 +300,7 @@ def changed(
 def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     """Where the scene is like its mirror image, find out whether the photo's mirror image fits better; return that.
 
-    For an answer that the gate refused the mirror image must be accepted.
+    Where the gate refused the answer, the mirror image counts only if the gate accepts it.
     """
     best, config = state.best, state.config
     if best is None or best.verdict.status is Status.NOT_LOCALIZED:

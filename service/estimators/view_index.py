@@ -80,14 +80,19 @@ class Options:
 
 
 def prepare(tools: Tools[None], cache_dir: Path | None) -> ViewIndex:
-    """Make or read the scene's view index: a second or two, once."""
+    """Make the scene's view index, or read it from the cache: once, 1 to 4 CPU seconds, more for large scenes."""
     return prepared_index(tools, cache_dir)
 
 
 def run(
     query: Query, tools: Tools[ViewIndex], options: Options, config: SearchConfig = SEARCH
 ) -> Generator[IterationRecord, None, Answer | None]:
-    """Search until the gate accepts an answer, then look for reasons to doubt it; see the module."""
+    """Search until the gate accepts an answer, then look for reasons to doubt it; see the module.
+
+    Yields a record for each hypothesis and check; returns the best answer with its verdict, accepted or not, or None
+    where no stage led to a pose. An answer that refinement from a prior pose leads to is compared neither with other
+    lenses nor with its mirror image and rivals, and with other hypotheses only without a prior region.
+    """
     state = SearchState.of(query, tools, config)
     if query.prior:
         yield from run_stage(state, _refine_from_prior(state))
@@ -136,7 +141,7 @@ def _check_readings(state: SearchState, options: Options) -> Generator[Iteration
 
 
 def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
-    """Look for reasons to doubt the answer of a search."""
+    """Compare the answer of a search with the photo's mirror image, with its rivals, and with other hypotheses."""
     mirrored = yield from check_mirror(state)
     if not state.finished or mirrored:
         return
@@ -189,7 +194,7 @@ def _refine_from_prior(state: SearchState) -> Stage:
         found = yield from refine_stage(start, state.images, state.renderer, config.refinement, config.max_prior_loss)
         return StageOutcome(found.refined)
 
-    return Stage(records(), ImageVariant(state.config.ambiguity_photo_px), expected=True)
+    return Stage(records(), ImageVariant(state.config.ambiguity_photo_px), from_prior=True)
 
 
 def _search_views(

@@ -53,6 +53,13 @@ class RefineStageConfig:
     max_divergence_deg: float = 10.0
     """Rotation away from a pose with that many inliers beyond which refinement diverges."""
 
+    def levels_of(self, round_number: int, trusted: bool, free_lens: bool) -> int:
+        """Return how many levels of the pyramid a render is refined on, of which 0 is the first: from nearby the coarse
+        ones change nothing. `trusted`: many matches led to the pose; `free_lens`: the intrinsics are estimated, too."""
+        if round_number == 0:
+            return self.levels if trusted else self.first_levels
+        return self.later_levels if trusted and not free_lens else self.levels
+
 
 REFINE_STAGE = RefineStageConfig()
 
@@ -130,10 +137,7 @@ def refine_stage(
         if following is None:
             return RefineOutcome(refined)
         rendered = following
-        # From nearby the coarse levels change nothing.
-        first_levels = config.levels if trusted else config.first_levels
-        later_levels = config.later_levels if trusted and not free_lens else config.levels
-        levels = later_levels if round_number else first_levels
+        levels = config.levels_of(round_number, trusted, free_lens)
         result = _refined_on(rendered, now, images, levels, bool(small_px), config)
         diverged = trusted and pose_distance(found.pose, result.pose)[0] > config.max_divergence_deg
         if diverged or result.loss > max_loss or not np.isfinite(result.loss):

@@ -251,8 +251,17 @@ def verdict_of(
     status = _status(place, reason, uncertainty, config)
     inliers, correlation = int(signals.get("inliers", 0)), signals["gradients"]
     verdict = Verdict(
-        *(status, reason, place * precise, inliers, correlation, signals["coverage"], None),
-        **{"signals": signals, "right_place": place, "precise": precise, "asked": (asked.deg, asked.units)},
+        status,
+        reason,
+        score=place * precise,
+        inliers=inliers,
+        gradient_correlation=correlation,
+        coverage=signals["coverage"],
+        covariance=None,
+        signals=signals,
+        right_place=place,
+        precise=precise,
+        asked=(asked.deg, asked.units),
     )
     return verdict if uncertainty is None else _with_uncertainty(verdict, uncertainty)
 
