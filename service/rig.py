@@ -44,8 +44,6 @@ from service.results import IterationRecord, PoseEstimate, StageTiming, Verdict
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world, shifted
 from service.types import Camera, Pose, Query
 
-MOST_PHOTOS = 8
-
 
 @dataclass(frozen=True, slots=True)
 class RigConfig:
@@ -129,7 +127,7 @@ def localize_rig(
     *,
     metric: bool = False,
 ) -> RigEstimate:
-    """Localize 2 to 8 photos together.
+    """Localize several photos together; the API takes 2 to 8.
 
     `rig_from_camera` is in scene units, or, `metric`, in metres. Poses are in the world. Raises InvalidRequest for a
     rig in metres in a scene without a scale, Cancelled, InvalidAccuracy.

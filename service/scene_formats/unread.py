@@ -7,7 +7,7 @@ from service.errors import UnsupportedFormat
 CONVERT = "npx @playcanvas/splat-transform"
 """The converter that hints name."""
 NO_CONVERTER = "No converter to plain 3DGS is known: train the scene with plain 3DGS."
-_NO_SHAPES = "Its points have no shapes: name the file that the trainer wrote."
+_NO_SHAPES = "Name the Gaussians' own file: point clouds have no shapes."
 UNREAD_SUFFIXES = {
     ".lcc": ("an XGRIDS scene", f"Convert it: {CONVERT} scene.lcc scene.ply"),
     ".lcc2": ("an XGRIDS scene", f"Convert it: {CONVERT} scene.lcc2 scene.ply"),
@@ -21,18 +21,8 @@ _LAYERS = (
     ("Scaffold-GS or Octree-GS anchors", {"f_offset_0", "f_anchor_feat_0"}, set(), NO_CONVERTER),
     ("4D Gaussians", {"motion_0"}, set(), NO_CONVERTER),
     ("4D Gaussians", {"t", "scale_t"}, set(), NO_CONVERTER),
-    (
-        "a point cloud or mesh",
-        {"x", "y", "z", "red"},
-        {"opacity"},
-        "Name the Gaussians' own file: point clouds have no shapes.",
-    ),
-    (
-        "a point cloud or mesh",
-        {"x", "y", "z"},
-        {"opacity", "scale_0"},
-        "Name the Gaussians' own file: point clouds have no shapes.",
-    ),
+    ("a point cloud or mesh", {"x", "y", "z", "red"}, {"opacity"}, _NO_SHAPES),
+    ("a point cloud or mesh", {"x", "y", "z"}, {"opacity", "scale_0"}, _NO_SHAPES),
 )
 """Name, properties that it has, properties that it lacks, hint."""
 
