@@ -16,7 +16,7 @@ How data flows, with the modules that take each step:
                        v  PoseEstimate
     jobs, web        --> JSON over HTTP --> viewer
 
-Read `localize.py` first, then `estimators/view_index.py`; CONTRIBUTING.md has the map of all modules.
+CONTRIBUTING.md has the order in which to read the code, under "Day one", and the map of all modules.
 """
 
 __version__ = "0.2.0"

@@ -1,4 +1,4 @@
-"""Read this first: from a photo and a scene to a pose with its trace and verdict.
+"""From a photo and a scene to a pose with its trace and verdict.
 
 This is the composition root, where names of plug-ins become objects. Its driver runs every estimator: it holds the
 clock, the budget and the cancel flag, stamps the records, and applies the same verification gate to every method. Jobs,
