@@ -278,7 +278,9 @@ def _with_prior(
 ) -> Float64[np.ndarray, "16 16"]:
     """Return the information of pixels and prior; `scale` is that of the pixels' variance."""
     information = hessian.copy()
-    information[CORRECTION, CORRECTION] += scale * np.diag(prior_precision(prior, correction))
+    # The diagonal alone: an infinite scale would make the rest of a matrix undefined.
+    of_lens = np.arange(CORRECTION.start, CORRECTION.stop)
+    information[of_lens, of_lens] += scale * prior_precision(prior, correction)
     return information
 
 
