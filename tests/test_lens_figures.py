@@ -283,7 +283,9 @@ def test_a_pose_is_doubted_by_its_colours_and_while_it_still_moves(
     monkeypatch, repeats, is_unique, other_colours, settled, free_lens, reason
 ) -> None:
     asked = []
-    monkeypatch.setattr(search_state, "verify", lambda *given: asked.append(given) or verdict("localized", "verified"))
+    monkeypatch.setattr(
+        search_state, "verify", lambda *given, **named: asked.append((given, named)) or verdict("localized", "verified")
+    )
     monkeypatch.setattr(SearchState, "_shows_other_colours", lambda *_: other_colours)
     searching = state(repeats, free_lens)
     images: Any = SimpleNamespace(query=SimpleNamespace(lens_prior=object() if free_lens else None))
@@ -296,8 +298,10 @@ def test_a_pose_is_doubted_by_its_colours_and_while_it_still_moves(
         told = searching.verify(found, True, OTHER if settled else None, is_unique)
         assert told.reason is reason
         assert (told.status is Status.LOCALIZED) is (reason is Reason.VERIFIED)
-        assert asked[-1][4:7] == (True, inliers or 0, is_unique or not repeats)
-        assert (asked[-1][7].refinement is OTHER) is settled
+        given, named = asked[-1]
+        assert given[4] is True
+        assert (named["supporting_matches"], named["light_may_differ"]) == (inliers or 0, is_unique or not repeats)
+        assert (named["config"].refinement is OTHER) is settled
 
 
 OTHER = replace(REFINEMENT, max_steps=7)
