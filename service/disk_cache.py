@@ -1,4 +1,5 @@
-"""The folder of what can be computed again: view indexes, coverage maps, scenes in mappable form. It has a size limit.
+"""The folder of what can be had again: view indexes, coverage maps, scenes in mappable form, and those
+fetched from an object store. It has a size limit.
 
 Whoever reads or writes an entry marks it as used; what was not used for longest goes first. Compiled kernels, which are
 in the same folder, are small and stay.
@@ -14,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-_PATTERNS = ("view-index-*.npz", "free-views-*.npz", "coverage-*.json", "scenes/*")
+_PATTERNS = ("view-index-*.npz", "free-views-*.npz", "coverage-*.json", "scenes/*", "fetched-scenes/*")
 _log = logging.getLogger(__name__)
 
 
@@ -57,7 +58,7 @@ def _entries(folder: Path) -> Iterator[_Entry]:
     for pattern in _PATTERNS:
         for path in folder.glob(pattern):
             with suppress(OSError):  # another process has deleted it meanwhile
-                files = list(path.iterdir()) if path.is_dir() else [path]
+                files = [file for file in path.rglob("*") if file.is_file()] if path.is_dir() else [path]
                 yield _Entry(path, sum(file.stat().st_size for file in files), path.stat().st_mtime)
 
 

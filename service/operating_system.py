@@ -33,14 +33,15 @@ _CHILD_ENVIRONMENT = ("PATH", "LD_LIBRARY_PATH", "DYLD_LIBRARY_PATH", "SYSTEMROO
 """What a process needs to find its libraries; without SYSTEMROOT Python doesn't start on Windows."""
 
 
-def locked(path: Path) -> BaseFileLock:
+def locked(path: Path, wait_s: float = 0.0) -> BaseFileLock:
     """Lock a file for this process until `release()`; the system releases it when the process is killed.
 
-    Raises BlockingIOError if another process, or another lock of this one, has it; OSError if it can't be opened.
+    Raises BlockingIOError if another process, or another lock of this one, has it for longer than `wait_s`; OSError if
+    it can't be opened.
     """
     from filelock import FileLock, Timeout
 
-    lock = FileLock(path, timeout=0)
+    lock = FileLock(path, timeout=wait_s)
     try:
         lock.acquire()
     except Timeout:

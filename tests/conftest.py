@@ -86,6 +86,15 @@ def postgres() -> Iterator:
         yield server
 
 
+@pytest.fixture(scope="session")
+def s3() -> Iterator:
+    """What makes a bucket of a server on loopback; skips what needs it where there is none."""
+    from object_stores import s3_server
+
+    with s3_server() as bucket:
+        yield bucket
+
+
 @pytest.fixture
 def database(postgres) -> Iterator:
     """An empty database in PostgreSQL."""

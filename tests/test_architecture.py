@@ -26,7 +26,8 @@ FLOORS = {
             *("client", "live_client"),
             *("disk_cache", "operating_system"),
         },
-        {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"},
+        {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"}
+        | {"object_store", "s3_objects"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
         {"estimators", "registration"},
         {"localize", "loaded_scene", "readings_in_scene"},
@@ -45,7 +46,8 @@ FLOORS = {
         {"retrieval", "descent", "verification", "training_photos"},
     ],
     "service/web": [
-        {"api_model", "hints", "key_file", "api_keys", "settings", "metrics", "viewer_process"},
+        {"api_model", "hints", "key_file", "api_keys", "settings", "metrics", "viewer_process"}
+        | {"shared_state", "postgres_state", "catalogue_watch"},
         {"problems", "route_policy"},
         {"schemas"},
         {"middleware"},
@@ -67,10 +69,11 @@ SAME_FLOOR = {
         ("results", "types"),
         ("plugins", "errors"),
         ("photos", "geometry"),
+        ("object_store", "s3_objects"),
         ("geodesy", "geometry"),
     },
     "service/pose": set(),
-    "service/web": {("api_keys", "key_file")},
+    "service/web": {("api_keys", "key_file"), ("shared_state", "key_file"), ("postgres_state", "shared_state")},
 }
 
 # Third-party package -> the only places that import it; numpy and jaxtyping may be anywhere.
@@ -110,7 +113,7 @@ WRAPPED = {
     "pydantic": {"service/web", "service/cli/terminal.py"},
     "pydantic_core": {"service/web/schemas/request_body.py"},
     "pydantic_settings": {"service/web/settings.py"},
-    "limits": {"service/web/middleware/limits.py"},
+    "limits": {"service/web/shared_state.py"},
     "prometheus_client": {"service/web/metrics.py"},
     "structlog": {"service/logs.py"},
     "pyproj": {"service/geodesy.py"},
@@ -123,6 +126,7 @@ WRAPPED = {
     "matplotlib": {"service/bench/paper/figures.py"},
     "ray": {"service/jobs/ray_engine.py"},
     "pycolmap": {"service/bench/peer/colmap.py"},
+    "obstore": {"service/s3_objects.py"},
     "psycopg": {"service/jobs/postgres_database.py"},
     "psycopg_pool": {"service/jobs/postgres_database.py"},
     "filelock": {"service/operating_system.py"},

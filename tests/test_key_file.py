@@ -14,6 +14,7 @@ from service.cli.app import app
 from service.errors import InvalidRequest, KeyNotFound
 from service.web.api_keys import KeyRing
 from service.web.key_file import UNLIMITED, KeyLimits, add_key, expiry, read_keys, remove_key
+from service.web.shared_state import LocalState
 
 
 @pytest.fixture
@@ -182,11 +183,11 @@ def test_a_secret_is_kept_and_one_of_another_length_is_replaced(file: Path, tmp_
     assert guest
     again, secret = KeyRing(file), tmp_path / "secret"
     secret.write_bytes(b"short")
-    ring.keep_sessions(secret)
+    ring.keep_sessions(LocalState(secret).secret())
     assert len(secret.read_bytes()) == 32
     token = ring.token(guest, 60)
     assert again.bearer(token) is None
-    again.keep_sessions(secret)
+    again.keep_sessions(LocalState(secret).secret())
     assert again.bearer(token)
     assert again.bearer(token[:-1] + ("0" if token[-1] != "0" else "1")) is None
     assert again.viewer_bearer(token) is again.shared_job(token) is None

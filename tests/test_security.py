@@ -33,6 +33,7 @@ from service.web.metrics import Metrics
 from service.web.middleware.limits import Limits
 from service.web.middleware.proxy import Proxy
 from service.web.route_policy import PHOTO_BODY, RoutePolicy
+from service.web.shared_state import LocalState
 from service.web.viewer_relay import Relay
 
 
@@ -233,7 +234,7 @@ def test_sessions_outlive_a_restart_and_end_with_their_key(tmp_path):
     key = add_key(keys, "a", "read")
     before, after = KeyRing(keys), KeyRing(keys)
     for ring in (before, after):
-        ring.keep_sessions(secret)
+        ring.keep_sessions(LocalState(secret).secret())
     ann = before.caller(key)
     assert ann
     token = before.token(ann, 60)
@@ -242,16 +243,16 @@ def test_sessions_outlive_a_restart_and_end_with_their_key(tmp_path):
     remove_key(keys, "a")
     key = add_key(keys, "a", "read")  # somebody else's, of the same name
     later = KeyRing(keys)
-    later.keep_sessions(secret)
+    later.keep_sessions(LocalState(secret).secret())
     assert later.bearer(token) is None
     secret.write_bytes(b"half")
-    later.keep_sessions(secret)
+    later.keep_sessions(LocalState(secret).secret())
     bob = later.caller(key)
     assert bob
     assert later.bearer(later.token(bob, 60)) == bob
     assert len(secret.read_bytes()) == 32
     with pytest.raises(StorageFailed, match="secret"):
-        later.keep_sessions(tmp_path)
+        later.keep_sessions(LocalState(tmp_path).secret())
 
 
 def test_a_session_goes_on_after_a_restart_of_the_service(stepping, ring, tmp_path):
@@ -422,7 +423,10 @@ def test_few_uploads_at_once():
             if key == "full":
                 raise QueueFull("full")
 
-        layer = Limits(app, settings(max_uploads=2), room)
+        async def hit(client, rate):
+            return None
+
+        layer = Limits(app, settings(max_uploads=2), room, hit)
         statuses: list[int] = []
 
         async def request() -> None:

@@ -13,6 +13,7 @@ from stand_ins import make_scene
 
 from service.web.api_keys import KeyRing
 from service.web.key_file import add_key, remove_key
+from service.web.shared_state import LocalState
 
 
 @pytest.fixture(scope="module")
@@ -79,12 +80,12 @@ def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path, 
     file = tmp_path / "keys.json"
     key = add_key(file, "ann", "localize")
     ring = KeyRing(file)
-    ring.keep_sessions(tmp_path / "sessions.key")
+    ring.keep_sessions(LocalState(tmp_path / "sessions.key").secret())
     ann = ring.caller(key)
     token, unowned = ring.share_token("one", 60, ann), ring.share_token("two", 60, None)
     again = KeyRing(file)
     assert again.shared_job(token) is None  # another secret
-    again.keep_sessions(tmp_path / "sessions.key")
+    again.keep_sessions(LocalState(tmp_path / "sessions.key").secret())
     assert (again.shared_job(token), again.shared_job(unowned)) == ("one", "two")
     remove_key(file, "ann")
     assert again.shared_job(token) is None

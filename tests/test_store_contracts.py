@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from memory_stores import MemoryJobStore, MemoryPhotoStore, MemorySceneStore
+from object_stores import S3, address_of
 from postgres_server import POSTGRES
 from test_scenes import ply
 
@@ -25,9 +26,11 @@ from service.errors import (
     SceneNotFound,
 )
 from service.jobs.model import Batch, Ending, JobFilter, JobRecord, JobResult, JobSpec, NewJob, PhotoInfo, Retention
+from service.jobs.object_photo_store import ObjectPhotoStore
 from service.jobs.photo_store import FolderPhotoStore, PhotoStore
 from service.jobs.sqlite_store import SqliteJobStore
 from service.jobs.store import JobStore
+from service.object_store import open_objects
 from service.results import (
     Candidates,
     IterationRecord,
@@ -38,6 +41,7 @@ from service.results import (
     Status,
     Verdict,
 )
+from service.scene_manager.object_scene_store import ObjectSceneStore
 from service.scene_manager.scene_store import FolderSceneStore, SceneStore
 from service.scene_manager.status import StoredScene
 from service.types import BoxPrior, Camera, Intrinsics, Pose
@@ -366,13 +370,15 @@ def test_photos_are_stale_when_their_time_is_over(store):
 # ------------------------------------------------------------------ photos
 
 
-@pytest.fixture(params=["folder", "memory", POSTGRES])
+@pytest.fixture(params=["folder", "memory", POSTGRES, "objects", S3])
 def photos(request, tmp_path) -> PhotoStore:
     if request.param == "postgres":
         database = request.getfixturevalue("database")
         from service.jobs.postgres_store import PostgresPhotoStore
 
         made: PhotoStore = PostgresPhotoStore(database)
+    elif request.param in ("objects", "s3"):
+        made = ObjectPhotoStore(open_objects(address_of(request.param, request, tmp_path)))
     else:
         made = FolderPhotoStore(tmp_path / "photos") if request.param == "folder" else MemoryPhotoStore()
     assert isinstance(made, PhotoStore)
@@ -401,13 +407,16 @@ def test_a_photo_is_kept_as_sent_then_as_shown_then_not_at_all(photos):
 # ------------------------------------------------------------------ scenes
 
 
-@pytest.fixture(params=["folder", "memory"])
+@pytest.fixture(params=["folder", "memory", "objects", S3])
 def make_scenes(request, tmp_path) -> Callable[[], SceneStore]:
     named = [StoredScene("zoo", tmp_path / "zoo"), StoredScene("attic", tmp_path / "attic")]
     (tmp_path / "uploads").mkdir()
     if request.param == "memory":
         kept = MemorySceneStore(named, tmp_path / "uploads")
         return lambda: kept
+    if request.param in ("objects", "s3"):
+        address = address_of(request.param, request, tmp_path)
+        return lambda: ObjectSceneStore(named, address, tmp_path / "cache", tmp_path / "uploads", 10**6)
     return lambda: FolderSceneStore(named, tmp_path / "uploads", 10**6)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
-from collections import Counter
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,14 +18,14 @@ from service.errors import InvalidPrior, InvalidRequest, QueueFull, RateLimited
 from service.live.live_values import LiveFrame
 from service.web.key_file import KeyLimits
 from service.web.metrics import Metrics
-from service.web.middleware import limits as module
 from service.web.middleware.limits import Limits, _Body, _check_length, _readable, _without_body, client_of, most_queued
 from service.web.middleware.proxy import Proxy, _request_id, _Response, _sub_path
 from service.web.route_policy import BodyLimit, RoutePolicy
-from service.web.routes.live import KEY_GONE, TIMEOUT, TOO_MANY, _End, _Session
+from service.web.routes.live import KEY_GONE, TIMEOUT, TOO_MANY, _End, _end_of, _Session
 from service.web.schemas.frame_message import read_frame
 from service.web.schemas.job_spec import prior_from, read_fields
 from service.web.settings import Settings
+from service.web.shared_state import LocalState, Rate
 
 
 def scope_of(*headers: tuple[str, str], path: str = "/jobs", method: str = "GET", **fields: Any) -> dict[str, Any]:
@@ -124,7 +124,12 @@ def limited(settings: Settings, policy: RoutePolicy, scope: dict[str, Any], queu
     async def check_queue(*given: Any) -> None:
         (queue if queue is not None else []).append(given)
 
-    made = Limits(None, settings, check_queue)  # type: ignore[arg-type]
+    shared = LocalState(Path("unused"))
+
+    async def hit(client: str, rate: Rate) -> float | None:
+        return shared.hit(client, rate)
+
+    made = Limits(None, settings, check_queue, hit)  # type: ignore[arg-type]
     asyncio.run(made._check_head(scope, policy))
     return made
 
@@ -152,26 +157,31 @@ def test_uploads_at_once_and_places_in_the_queue_are_checked_before_the_body():
 @pytest.mark.parametrize(
     ("own", "common", "allowed"), [(None, "2/minute", 2), ("1/minute", "2/minute", 1), (None, "", 5)]
 )
-def test_a_key_has_its_own_rate_or_the_common_one(monkeypatch, own, common, allowed):
+def test_a_key_has_its_own_rate_or_the_common_one(own, common, allowed):
     settings = Settings(rate_limit=common)
     scope = scope_of(client=("1.2.3.4", 5), state={"caller": caller(rate=own)})
     made = limited(settings, RoutePolicy(role="read"), scope)
     for number in range(5):
         if number < allowed:
-            made._check_rate(scope)
+            asyncio.run(made._check_rate(scope))
             continue
         with pytest.raises(RateLimited) as caught:
-            made._check_rate(scope)
-        assert 1 <= caught.value.retry_after_s <= 60
+            asyncio.run(made._check_rate(scope))
+        assert caught.value.retry_after_s in range(1, 61)
     if allowed < 5:
-        made._check_rate(scope_of(client=("9.9.9.9", 5)))  # somebody else
-        stats = SimpleNamespace(reset_time=1000.2)
-        monkeypatch.setattr(made._limiter, "get_window_stats", lambda *_: stats)
-        for now, wait in ((1000.0, 1), (990.1, 11), (2000.0, 1)):
-            monkeypatch.setattr(module, "time", SimpleNamespace(time=lambda now=now: now))
-            with pytest.raises(RateLimited) as caught:
-                made._check_rate(scope)
-            assert caught.value.retry_after_s == wait
+        asyncio.run(made._check_rate(scope_of(client=("9.9.9.9", 5))))  # somebody else
+
+
+@pytest.mark.parametrize(("left_s", "told_s"), [(0.2, 1), (10.1, 11), (-3.0, 1)])
+def test_a_refused_request_is_told_whole_seconds_to_wait(left_s, told_s):
+    async def hit(client: str, rate: Rate) -> float | None:
+        return left_s
+
+    made = limited(Settings(), RoutePolicy(role="read"), scope_of(client=("1.2.3.4", 5)))
+    made._hit = hit
+    with pytest.raises(RateLimited) as caught:
+        asyncio.run(made._check_rate(scope_of(client=("1.2.3.4", 5))))
+    assert caught.value.retry_after_s == told_s
 
 
 # ------------------------------------------------------------------ the proxy
@@ -346,27 +356,34 @@ def session(**settings: Any) -> Any:
     made: Any = _Session.__new__(_Session)
     made._settings, made._loop = Settings(**settings), Clock()
     made._heard_at, made._used, made._dropped = 100.0, 0, 0
-    made._state = SimpleNamespace(live=Counter(), metrics=Metrics())
-    made._socket = SimpleNamespace(scope=scope_of(client=("1.2.3.4", 5)))
+    made._state = SimpleNamespace(live=set(), metrics=Metrics(), shared=LocalState(Path("unused")))
+    made._client = "address:1.2.3.4"
     return made
 
 
 def test_a_client_has_so_many_sessions_and_the_service_has():
     one = session(live_sessions=3, live_sessions_of_client=2)
     live = one._state.live
-    with one._place(), one._place():
-        assert live == {"address:1.2.3.4": 2}
-        with pytest.raises(_End, match="2 live sessions of yours") as caught, one._place():
-            pass
-        assert caught.value.code == TOO_MANY
-    assert live == {}
-    live["others"] = 3
-    with pytest.raises(_End, match="limit of live sessions of the service reached: 3"), one._place():
-        pass
-    live["others"] = 2
-    with pytest.raises(ValueError, match="torn"), one._place():
-        raise ValueError("torn")
-    assert live == {"others": 2}
+
+    async def run() -> None:
+        async with one._place(), one._place():
+            assert len(live) == 2
+            with pytest.raises(RateLimited, match="for this key reached: 2") as caught:
+                await one._place().__aenter__()
+            assert _end_of(caught.value).code == TOO_MANY
+            one._client = "address:9.9.9.9"
+            async with one._place():
+                one._client = "address:5.5.5.5"
+                with pytest.raises(RateLimited, match="of the service reached: 3"):
+                    await one._place().__aenter__()
+        assert live == set()
+        with pytest.raises(ValueError, match="torn"):
+            async with one._place():
+                raise ValueError("torn")
+        async with one._place(), one._place():
+            assert len(live) == 2
+
+    asyncio.run(run())
 
 
 @pytest.mark.parametrize(("gap_s", "count"), [(0.0, 16), (0.125, None), (0.0625, 31)])

@@ -8,15 +8,18 @@ from importlib import metadata
 
 from service.cli.diagnostics import Finding
 from service.errors import SplatfixError
+from service.object_store import open_objects
 from service.web.settings import Settings
 
 
 def fleet_findings(settings: Settings) -> Iterator[Finding]:
-    """Examine the Ray engine and the shared database, where they are set."""
+    """Examine the Ray engine, the shared database and the object store, where they are set."""
     if settings.engine == "ray":
         yield from _ray_findings(settings.ray_address)
     if settings.database is not None:
         yield from _database_findings(settings.database.get_secret_value())
+    if settings.object_store is not None:
+        yield from _object_store_findings(settings.object_store)
 
 
 def _ray_findings(address: str | None) -> Iterator[Finding]:
@@ -47,3 +50,16 @@ def _database_findings(address: str) -> Iterator[Finding]:
         yield Finding("database", True, "PostgreSQL answers; jobs, photos and lenses are there")
     if warning := unprotected(address):
         yield Finding("database's privacy", False, warning, needed=False)
+
+
+def _object_store_findings(address: str) -> Iterator[Finding]:
+    try:
+        scenes = open_objects(address).versions("scenes/")
+    except SplatfixError as error:
+        yield Finding("object store", False, f"{error.message} {error.hint}".strip())
+        return
+    yield Finding("object store", True, f"{address} answers; it has {len(scenes)} uploaded scenes")
+    endpoint = os.environ.get("AWS_ENDPOINT_URL", "https:")
+    if address.startswith("s3:") and not endpoint.startswith("https:"):
+        told = f"photos and scenes go to {endpoint} unencrypted"
+        yield Finding("object store's privacy", False, told, needed=False)

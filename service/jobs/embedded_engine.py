@@ -109,7 +109,7 @@ class EmbeddedEngine:
     # ------------------------------------------------------------------ scenes
 
     def add(self, scene: StoredScene, *, required: bool = False) -> None:
-        self._manager.add(Entry(scene.id, scene.path, required=required, uploaded=scene.uploaded))
+        self._manager.add(Entry(scene.id, scene.path, required=required, remote=scene.remote, uploaded=scene.uploaded))
 
     def add_loaded(self, scene_id: str, loaded: LoadedScene) -> None:
         """Add a scene that is in memory already and has no file; it is required."""
@@ -129,7 +129,7 @@ class EmbeddedEngine:
 
     def require(self, scene_id: str) -> SceneInfo:
         info = self._manager.get(scene_id).scene.info
-        return registered_info(info, self._registrations.of(self._manager.entry(scene_id).path, info))
+        return registered_info(info, self._registration(self._manager.entry(scene_id), info))
 
     def readiness(self) -> SceneReadiness:
         return self._manager.readiness()
@@ -163,9 +163,9 @@ class EmbeddedEngine:
         # A token instead of the scenes, so that an engine in another process can have the same interface.
         token, scenes = secrets.token_hex(8), acquired.scenes
         try:
-            paths = [self._manager.entry(scene_id).path for scene_id in acquired.ids]
-            pairs = zip(paths, scenes, strict=True)
-            registrations = tuple(self._registrations.of(path, loaded.scene.info) for path, loaded in pairs)
+            entries = [self._manager.entry(scene_id) for scene_id in acquired.ids]
+            pairs = zip(entries, scenes, strict=True)
+            registrations = tuple(self._registration(entry, loaded.scene.info) for entry, loaded in pairs)
         except BaseException:
             self._manager.release(scenes)
             raise
@@ -194,7 +194,10 @@ class EmbeddedEngine:
         status = entry.status()
         if status.info is None:
             return status
-        return replace(status, info=registered_info(status.info, self._registrations.of(entry.path, status.info)))
+        return replace(status, info=registered_info(status.info, self._registration(entry, status.info)))
+
+    def _registration(self, entry: Entry, info: SceneInfo) -> Registration | None:
+        return self._registrations.of(entry.path, info, entry.remote)
 
     def cancel(self, task_id: str) -> None:
         if cancel := self._cancels.get(task_id):

@@ -21,7 +21,7 @@ import ray  # pyright: ignore[reportMissingImports]
 from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
 
 from service import __version__
-from service.errors import SceneNotReady, SplatfixError
+from service.errors import SceneNotFound, SceneNotReady, SplatfixError
 from service.jobs.embedded_engine import EngineConfig, with_left_out
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.jobs.placement import PlacementConfig
@@ -126,7 +126,11 @@ class RayEngine:
             self._ask("add", scene, required)
 
     def remove(self, scene_id: str) -> None:
-        self._ask("remove", scene_id)
+        try:
+            self._ask("remove", scene_id)
+        except SceneNotFound:  # another front was first; a new coordinator must not be told of it
+            self._scenes.pop(scene_id, None)
+            raise
         self._scenes.pop(scene_id, None)
 
     def scenes(self) -> list[SceneStatus]:

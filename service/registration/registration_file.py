@@ -13,6 +13,7 @@ from pathlib import Path
 from service.codec import decode, encode
 from service.errors import CorruptScene, RegistrationNotFound
 from service.registration.registration import Registration
+from service.scene_formats.remote_scene import RemoteScene
 from service.scene_formats.side_file import SideFile
 
 FILE = "registration.json"
@@ -40,6 +41,8 @@ class RegistrationFile:
     """Scene folder or scene file."""
     data_folder: Path | None = None
     """Where the file goes if it can't be written beside the scene."""
+    remote: RemoteScene | None = None
+    """Where the scene comes from, if it is in an object store."""
 
     @property
     def path(self) -> Path:
@@ -48,7 +51,7 @@ class RegistrationFile:
 
     @property
     def _file(self) -> SideFile:
-        return SideFile(self.scene, FILE, self.data_folder)
+        return SideFile(self.scene, FILE, self.data_folder, self.remote)
 
     def current(self) -> Registration | None:
         """Return the registration in force. Raises CorruptScene."""
@@ -72,6 +75,7 @@ class RegistrationFile:
     def add(self, registration: Registration) -> Registration:
         """Put a registration in force; return it with its revision. Raises StorageFailed, CorruptScene."""
         with _LOCK:
+            self._file.forget_copy()
             before = self.history()
             number = before.last_revision + 1
             added = replace(registration, revision=number)
@@ -84,6 +88,7 @@ class RegistrationFile:
         Raises RegistrationNotFound, CorruptScene.
         """
         with _LOCK:
+            self._file.forget_copy()
             before = self.history()
             if not before.revisions:
                 raise RegistrationNotFound("the scene is not registered.", where="scene")

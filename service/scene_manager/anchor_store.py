@@ -78,6 +78,7 @@ class FileAnchorStore:
         if file is None:
             raise BadInput("the scene has no file to keep anchors with.", where="scene")
         with self._lock:
+            file.forget_copy()
             others = tuple(other for other in _read(file) if other.name != anchor.name)
             if len(others) >= MAX_ANCHORS:
                 raise BadInput(f"a scene has at most {MAX_ANCHORS} anchors.", where="name", hint="Delete some first.")
@@ -86,6 +87,8 @@ class FileAnchorStore:
     def delete(self, scene_id: str, name: str) -> None:
         file = self._file(scene_id)
         with self._lock:
+            if file is not None:
+                file.forget_copy()
             before = () if file is None else _read(file)
             after = tuple(anchor for anchor in before if anchor.name != name)
             if file is None or len(after) == len(before):
@@ -94,7 +97,7 @@ class FileAnchorStore:
 
     def _file(self, scene_id: str) -> SideFile | None:
         scene = self._find(scene_id)
-        return None if scene is None else SideFile(scene.path, FILE, self._data_folder)
+        return None if scene is None else SideFile(scene.path, FILE, self._data_folder, scene.remote)
 
 
 def _read(file: SideFile) -> tuple[Anchor, ...]:

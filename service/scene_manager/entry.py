@@ -10,6 +10,7 @@ import numpy as np
 
 from service.errors import Failure
 from service.loaded_scene import LoadedScene
+from service.scene_formats.remote_scene import RemoteScene
 from service.scene_formats.size_estimate import estimated_bytes
 from service.scene_manager.status import MAX_RETRY_S, RETRY_S, SceneContents, SceneState, SceneStatus
 from service.scene_origin import shifted_camera
@@ -29,6 +30,8 @@ class Entry:
     """Load it when it is asked for."""
     required: bool = False
     """The service isn't ready before it has been loaded once, or failed to; then it is tried again unasked."""
+    remote: RemoteScene | None = None
+    """From where its files are fetched before it is loaded."""
     uploaded: bool = False
     """It came over HTTP, and may be deleted."""
     is_outdated: bool = False

@@ -366,6 +366,8 @@ class Scenes:
 
     def _load(self, entry: Entry) -> None:
         if entry.loaded is None and entry.path is not None:
+            if entry.remote is not None:
+                entry.remote.fetch(entry.path)
             self._limit.require(entry, entry.expected_bytes())
             tools = {"matcher": self._matcher, "rasterizer": self._rasterizer}
             loaded = LoadedScene.load(entry.path, cache_dir=self._cache_dir, **tools)

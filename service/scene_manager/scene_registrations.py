@@ -9,6 +9,7 @@ from pathlib import Path
 from service.errors import SplatfixError
 from service.registration.registration import Registration
 from service.registration.registration_file import RegistrationFile
+from service.scene_formats.remote_scene import RemoteScene
 from service.types import SceneInfo
 
 _log = logging.getLogger(__name__)
@@ -23,15 +24,15 @@ class SceneRegistrations:
         self._data_folder = data_folder
         self._read: dict[Path, tuple[_Stamp, Registration | None]] = {}
 
-    def of(self, scene: Path | None, info: SceneInfo) -> Registration | None:
+    def of(self, scene: Path | None, info: SceneInfo, remote: RemoteScene | None = None) -> Registration | None:
         """Return the registration in force, None if there is none, or only one of another version of the scene."""
-        found = self._current(scene) if scene is not None else None
+        found = self._current(scene, remote) if scene is not None else None
         if found is not None and found.scene_sha256 != info.sha256:
             return None
         return found
 
-    def _current(self, scene: Path) -> Registration | None:
-        file = RegistrationFile(scene, self._data_folder)
+    def _current(self, scene: Path, remote: RemoteScene | None) -> Registration | None:
+        file = RegistrationFile(scene, self._data_folder, remote)
         try:
             path = file.path
             facts = path.stat()

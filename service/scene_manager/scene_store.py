@@ -138,7 +138,7 @@ class FolderSceneStore:
     def draft(self, scene_id: str) -> FolderDraft:
         check_scene_id(scene_id)
         if scene_id in self._named or (self._folder / scene_id).exists():
-            raise _exists(scene_id)
+            raise scene_exists(scene_id)
         return FolderDraft(
             # Two uploads of one name may come at once; the first that is whole gets it.
             self._incoming / f"{scene_id}.{os.urandom(4).hex()}",
@@ -242,11 +242,12 @@ def _storing(target: Path) -> Iterator[None]:
         yield
     except OSError as error:
         if target.exists():
-            raise _exists(target.name) from error
+            raise scene_exists(target.name) from error
         raise StorageFailed(f"the service can't store the scene: {error.strerror}.") from error
 
 
-def _exists(scene_id: str) -> SceneExists:
+def scene_exists(scene_id: str) -> SceneExists:
+    """Return the error of every store for a name that another scene has."""
     return SceneExists(f"scene '{scene_id}' already exists.", where="scene", hint="Delete it first.")
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from service.coverage.coverage_map import CoverageMap
 from service.errors import Failure
+from service.scene_formats.remote_scene import RemoteScene
 from service.types import Intrinsics, NamedCamera, Pose, SceneInfo
 
 AUTO = "auto"
@@ -31,6 +32,8 @@ class StoredScene:
     """A scene folder or a scene file."""
     uploaded: bool = False
     """It came over HTTP, and may be deleted."""
+    remote: RemoteScene | None = None
+    """From where its files are fetched to `path` before it is loaded; None: they are there."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.errors import InvalidRequest, StorageFailed
+from service.errors import InvalidRequest
 from service.web.key_file import (
     ROLES,
     UNLIMITED,
@@ -25,10 +25,8 @@ from service.web.key_file import (
     new_key,
     read_keys,
     remove_key,
-    write_private,
 )
 
-_SECRET_BYTES = 32
 _SESSION, _SHARED, _VIEWER = "session:", "share:", "viewer:"
 """Kinds of tokens. They are signed with the kind before them, so that none passes for one of another kind."""
 _RECHECK_S = 1.0
@@ -66,7 +64,7 @@ class KeyRing:
         self._path = path
         self._temporary: list[StoredKey] = []
         # Until `keep_sessions`: tokens end with the process.
-        self._secret = secrets.token_bytes(_SECRET_BYTES)
+        self._secret = secrets.token_bytes()
         self._read_at, self._stamp = 0.0, (0, 0)
         self._stored: list[StoredKey] = []
         self._refresh()
@@ -76,18 +74,8 @@ class KeyRing:
         self._refresh()
         return bool(self._stored or self._temporary)
 
-    def keep_sessions(self, path: Path) -> None:
-        """Sign tokens with the secret in a file, made if it isn't there, so that they outlive a restart.
-
-        Raises StorageFailed.
-        """
-        try:
-            secret = path.read_bytes() if path.exists() else b""
-            if len(secret) != _SECRET_BYTES:
-                secret = secrets.token_bytes(_SECRET_BYTES)
-                write_private(path, secret)
-        except OSError as error:
-            raise StorageFailed(f"the secret of sessions can't be kept: {error.strerror}.", where=path.name) from error
+    def keep_sessions(self, secret: bytes) -> None:
+        """Sign tokens with a secret that is kept, so that they outlive a restart, and hold at all fronts."""
         self._secret = secret
 
     def make_temporary(self, name: str, role: Role, limits: KeyLimits = UNLIMITED) -> str:

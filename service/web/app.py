@@ -25,6 +25,7 @@ from service.errors import BackendMissing, InvalidRequest, SceneNotFound, Storag
 from service.estimators import ESTIMATORS
 from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.engine import Engine
+from service.jobs.object_photo_store import ObjectPhotoStore
 from service.jobs.photo_store import FolderPhotoStore, PhotoStore
 from service.jobs.service import Jobs
 from service.jobs.sqlite_lens_store import SqliteLensStore
@@ -33,14 +34,17 @@ from service.jobs.store import JobStore
 from service.lenses.lens_memory import LensMemory
 from service.lenses.lens_store import LensStore
 from service.matchers import MATCHERS
+from service.object_store import open_objects
 from service.operating_system import locked
 from service.render import RASTERIZERS
 from service.scene_formats import SCENE_FORMATS
 from service.scene_manager.anchor_store import FileAnchorStore
-from service.scene_manager.scene_store import FolderSceneStore, named_scenes
+from service.scene_manager.object_scene_store import ObjectSceneStore
+from service.scene_manager.scene_store import FolderSceneStore, SceneStore, named_scenes
 from service.scene_manager.status import StoredScene
 from service.web.api_keys import KeyRing
 from service.web.api_page import add_api_page
+from service.web.catalogue_watch import CatalogueWatch
 from service.web.gauges import add_gauges
 from service.web.metrics import Metrics
 from service.web.middleware.authentication import AccessRules, Authentication, allowed_hosts
@@ -55,6 +59,7 @@ from service.web.route_policy import RoutePolicy, declare, require_policies
 from service.web.routes import router
 from service.web.routes.dependencies import AppState
 from service.web.settings import Settings, is_loopback
+from service.web.shared_state import LocalState, Rate, SharedState
 from service.web.viewer_process import ViewerChild
 from service.web.viewer_relay import Relay
 
@@ -136,15 +141,13 @@ async def _start(
 ) -> AppState:
     """Open the stores, start engine and jobs; `stack` stops and closes them in reverse order."""
     folder = stack.enter_context(data_folder(settings.data_dir))
-    # On disk, so that browsers stay signed in after a restart.
-    keys.keep_sessions(folder / "sessions.key")
-    scene_store = FolderSceneStore(
-        named, folder / "scenes", settings.max_scene_bytes, allow_checkpoints=settings.upload_checkpoints
-    )
+    scene_store = await to_thread.run_sync(_scene_store, settings, folder, named)
     for scene in scene_store.scenes():
         if scene.uploaded:
             engine.add(scene)
-    store, photos, lenses = await to_thread.run_sync(_stores, settings, folder)
+    store, photos, lenses, shared = await to_thread.run_sync(_stores, settings, folder)
+    # Kept, so that browsers stay signed in after a restart.
+    keys.keep_sessions(await to_thread.run_sync(shared.secret))
     # Before jobs are listed: those of an earlier release belong to the name of a key alone.
     for by_name, client in keys.unnamed_clients():
         await to_thread.run_sync(store.reassign, by_name, client)
@@ -157,11 +160,15 @@ async def _start(
     # Registered after the engine's, hence called before: running jobs need it until they end.
     stack.push_async_callback(to_thread.run_sync, jobs.close)
     await to_thread.run_sync(jobs.start)
+    if isinstance(scene_store, ObjectSceneStore):
+        watch = CatalogueWatch(scene_store, engine)
+        watch.start()
+        stack.push_async_callback(to_thread.run_sync, watch.close)
     limits = anyio.CapacityLimiter(settings.jobs_at_once), anyio.CapacityLimiter(2)
     add_gauges(metrics, settings, engine, jobs, folder)
     anchors = FileAnchorStore(scene_store.find, settings.data_dir)
-    state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, metrics, *limits)
-    metrics.gauge("live_sessions", "Open live sessions", (), lambda: {(): state.live.total()})
+    state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, shared, metrics, *limits)
+    metrics.gauge("live_sessions", "Open live sessions", (), lambda: {(): len(state.live)})
     return state
 
 
@@ -177,15 +184,27 @@ def _engine(settings: Settings) -> Engine:
     return RayEngine(settings.engine_config, settings.ray)
 
 
-def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, LensStore]:
-    """Open the stores of jobs, photos and lenses. Raises StorageFailed, BackendMissing."""
+def _scene_store(settings: Settings, folder: Path, named: list[StoredScene]) -> SceneStore:
+    """Open the catalogue of scenes. Raises StorageFailed, BackendMissing, BadInput."""
+    limits = {"max_bytes": settings.max_scene_bytes, "allow_checkpoints": settings.upload_checkpoints}
+    if settings.object_store is None:
+        return FolderSceneStore(named, folder / "scenes", **limits)
+    cache = settings.cache_dir or folder
+    return ObjectSceneStore(named, settings.object_store, cache, folder / "incoming", **limits)
+
+
+def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, LensStore, SharedState]:
+    """Open the stores of jobs, photos and lenses, and what fronts share. Raises StorageFailed, BackendMissing."""
+    local = LocalState(folder / "sessions.key")
+    objects = settings.object_store and ObjectPhotoStore(open_objects(settings.object_store))
     if settings.database is None:
         lenses = SqliteLensStore(folder / "lenses.sqlite", settings.keep_lenses)
-        return SqliteJobStore(folder / "jobs.sqlite"), FolderPhotoStore(folder / "photos"), lenses
+        return SqliteJobStore(folder / "jobs.sqlite"), objects or FolderPhotoStore(folder / "photos"), lenses, local
     # Not above: the driver is there only where the extra is installed.
     try:
         from service.jobs.postgres_database import PostgresDatabase, unprotected
         from service.jobs.postgres_store import PostgresJobStore, PostgresLensStore, PostgresPhotoStore
+        from service.web.postgres_state import PostgresState
     except ImportError as error:
         raise BackendMissing(
             f"PostgreSQL: {error}.", where="database", hint="pip install 'splatfix[postgres]'"
@@ -195,7 +214,8 @@ def _stores(settings: Settings, folder: Path) -> tuple[JobStore, PhotoStore, Len
         _log.warning("%s", warning)
     database = PostgresDatabase(address)
     lenses = PostgresLensStore(database, settings.keep_lenses)
-    return PostgresJobStore(database), PostgresPhotoStore(database), lenses
+    photos = objects or PostgresPhotoStore(database)
+    return PostgresJobStore(database), photos, lenses, PostgresState(database, local)
 
 
 def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Metrics) -> None:
@@ -204,7 +224,10 @@ def _add_middleware(app: FastAPI, settings: Settings, keys: KeyRing, metrics: Me
     async def check_queue(client: str, most: int | None, idempotency_key: str | None) -> None:
         await to_thread.run_sync(app.state.app_state.jobs.require_queue_capacity, client, most, idempotency_key)
 
-    app.add_middleware(Limits, settings=settings, check_queue=check_queue)
+    async def hit(client: str, rate: Rate) -> float | None:
+        return await to_thread.run_sync(app.state.app_state.shared.hit, client, rate)
+
+    app.add_middleware(Limits, settings=settings, check_queue=check_queue, hit=hit)
     app.add_middleware(Authentication, rules=access_rules(settings, keys))
     app.add_middleware(RouteLookup, routes=app.routes)
     if settings.cors_origins:

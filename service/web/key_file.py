@@ -10,10 +10,9 @@ import json
 import os
 import re
 import secrets
-import threading
 import time
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -21,6 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from service.errors import InvalidRequest, KeyNotFound, StorageFailed
+from service.operating_system import locked
 
 Role = Literal["read", "localize", "admin"]
 ROLES: tuple[Role, ...] = get_args(Role)
@@ -32,8 +32,8 @@ RATE = r"[1-9]\d{0,5}/(second|minute|hour|day)"
 _PREFIX = "sfx_"
 """Marks a key for people and for secret scanners."""
 _ID_DIGITS = 16
-_CHANGING = threading.Lock()
-"""Two admins may add keys at once."""
+_LOCK_S = 10.0
+"""How long a change waits for another one."""
 _UNITS_S = {"m": 60, "h": 3600, "d": 86_400, "w": 7 * 86_400}
 
 
@@ -144,7 +144,7 @@ def read_keys(path: Path) -> list[StoredKey]:
 def add_key(path: Path, name: str, role: Role, limits: KeyLimits = UNLIMITED) -> str:
     """Make a key, store its hash, return the key, which the file doesn't have. Raises InvalidRequest, StorageFailed."""
     key, stored = new_key(name, role, limits)
-    with _CHANGING:
+    with _changing(path):
         keys = read_keys(path)
         if any(known.name == name for known in keys):
             raise key_exists(name)
@@ -160,13 +160,35 @@ def key_exists(name: str) -> InvalidRequest:
 
 
 def remove_key(path: Path, name: str) -> None:
-    """Remove a key; running services refuse it from the next second on. Raises KeyNotFound, InvalidRequest."""
-    with _CHANGING:
+    """Remove a key; running services refuse it from the next second on.
+
+    Raises KeyNotFound, InvalidRequest, StorageFailed.
+    """
+    with _changing(path):
         keys = read_keys(path)
         left = [key for key in keys if key.name != name]
         if len(left) == len(keys):
             raise KeyNotFound(f"key '{name[:64]}' not found.", where="name")
         _write(path, left)
+
+
+@contextmanager
+def _changing(path: Path) -> Iterator[None]:
+    """Let nobody else change the file: two admins may add keys at once, at two fronts. Raises StorageFailed."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = locked(path.with_name(f"{path.name}.lock"), _LOCK_S)
+    except OSError as error:
+        raise _unwritable(error) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _unwritable(error: OSError) -> StorageFailed:
+    reason = "it is being changed" if isinstance(error, BlockingIOError) else error.strerror
+    return StorageFailed(f"the file of keys can't be written: {reason}.", where="keys_file")
 
 
 def write_private(path: Path, content: bytes) -> None:
@@ -197,7 +219,6 @@ def _write(path: Path, keys: Sequence[StoredKey]) -> None:
         values |= values.pop("limits")
         entries.append({name: value for name, value in values.items() if value is not None})
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         write_private(path, json.dumps(entries, indent=1).encode())
     except OSError as error:
-        raise StorageFailed(f"the file of keys can't be written: {error.strerror}.", where="keys_file") from error
+        raise _unwritable(error) from error

@@ -123,8 +123,11 @@ class Settings(BaseSettings):
     data_dir: Path | None = None
     """Folder of the stored jobs and uploaded scenes; None: a temporary one. `splatfix serve` has its own default."""
     database: SecretStr | None = None
-    """PostgreSQL database of jobs, photos and lenses that several fronts share, e.g. postgresql://splatfix@db/splatfix;
+    """PostgreSQL database of jobs, photos, lenses, rates and sessions that several fronts share, e.g. postgresql://splatfix@db/splatfix;
     None: files in `data_dir`, of this process alone."""
+    object_store: str | None = None
+    """Where photos and uploaded scenes are that several fronts share: s3://bucket/prefix, with AWS_ENDPOINT_URL and the
+    other variables of S3, or a shared folder; None: photos where jobs are, scenes in `data_dir`."""
     keep_jobs: int = Field(default=10_000, ge=1)
     """Number of ended jobs that are kept."""
     keep_days: float = Field(default=30.0, gt=0)

@@ -9,12 +9,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections.abc import Awaitable, Callable
 
-from limits import parse
-from limits.storage import MemoryStorage
-from limits.strategies import SlidingWindowCounterRateLimiter
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -24,20 +20,25 @@ from service.web.api_keys import Caller
 from service.web.problems import problem_response, refuse
 from service.web.route_policy import RoutePolicy
 from service.web.settings import Settings
+from service.web.shared_state import Rate, parse_rate
 
 
 class Limits:
     """ASGI middleware. Needs the route's policy in the request's state, and the caller if there is one.
 
-    `check_queue(client, most queued, idempotency key)` raises QueueFull if one more job can't be queued.
+    `check_queue(client, most queued, idempotency key)` raises QueueFull if one more job can't be queued; `hit` counts
+    a request, as `SharedState.hit`.
     """
 
     def __init__(
-        self, app: ASGIApp, settings: Settings, check_queue: Callable[[str, int | None, str | None], Awaitable[None]]
+        self,
+        app: ASGIApp,
+        settings: Settings,
+        check_queue: Callable[[str, int | None, str | None], Awaitable[None]],
+        hit: Callable[[str, Rate], Awaitable[float | None]],
     ) -> None:
-        self._app, self._settings, self._check_queue = app, settings, check_queue
-        parse(settings.rate_limit or "1/second")  # raises for what is no rate
-        self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._app, self._settings, self._check_queue, self._hit = app, settings, check_queue, hit
+        parse_rate(settings.rate_limit or "1/second")  # raises for what is no rate
         self._uploads = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -70,7 +71,7 @@ class Limits:
         """Check all that is known before the body arrives. Raises RateLimited, QueueFull, HTTPException 413."""
         # The cheapest check first. The queue's is last but one, since it may read the store.
         if policy.rate_limited:
-            self._check_rate(scope)
+            await self._check_rate(scope)
         if policy.body:
             _check_length(scope, policy.body.max_bytes(self._settings))
         if policy.queues_job:
@@ -80,19 +81,16 @@ class Limits:
         if policy.body and self._uploads >= self._settings.max_uploads:
             raise QueueFull(f"too many uploads at once ({self._uploads}).", hint="Try again later.")
 
-    def _check_rate(self, scope: Scope) -> None:
+    async def _check_rate(self, scope: Scope) -> None:
         caller: Caller | None = scope["state"].get("caller")
         client, rate = client_of(scope), (caller and caller.limits.rate) or self._settings.rate_limit
         if not rate:
             return
         # Some microseconds each time; keys come and go, with their rates.
-        limit = parse(rate)
-        if not self._limiter.hit(limit, client):
-            reset = self._limiter.get_window_stats(limit, client).reset_time
+        wait_s = await self._hit(client, parse_rate(rate))
+        if wait_s is not None:
             raise RateLimited(
-                f"rate limit exceeded: {rate}.",
-                hint="Slow down.",
-                retry_after_s=max(1, math.ceil(reset - time.time())),
+                f"rate limit exceeded: {rate}.", hint="Slow down.", retry_after_s=max(1, math.ceil(wait_s))
             )
 
     def _release(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -28,6 +27,7 @@ from service.web.metrics import Metrics
 from service.web.schemas import resources
 from service.web.schemas.jobs import JobOut
 from service.web.settings import Settings
+from service.web.shared_state import SharedState
 
 _log = logging.getLogger(__name__)
 
@@ -43,13 +43,14 @@ class AppState:
     jobs: Jobs
     lenses: LensStore
     keys: KeyRing
+    shared: SharedState
     metrics: Metrics
     decoding: anyio.CapacityLimiter
     """Limits the photos that are decoded at once: one may take 450 MB."""
     rendering: anyio.CapacityLimiter
     """Limits the images that are rendered at once for clients: each thread of a renderer keeps working memory."""
-    live: Counter[str] = field(default_factory=Counter)
-    """Live sessions under way, by client."""
+    live: set[str] = field(default_factory=set)
+    """Live sessions under way at this front."""
 
     async def render_in_thread(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
         """Render an image for a client in a thread, and count it in the metrics."""

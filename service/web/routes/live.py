@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 
 import anyio
@@ -14,7 +14,7 @@ from anyio import to_thread
 from fastapi import APIRouter, WebSocket
 from starlette.websockets import WebSocketDisconnect
 
-from service.errors import BadInput, InvalidRequest, SceneError, SceneNotFound
+from service.errors import BadInput, InvalidRequest, RateLimited, SceneError, SceneNotFound, StorageFailed
 from service.jobs.engine import EngineLost
 from service.live.live_values import LiveAnswer, LiveFrame, LiveTask
 from service.live.mailbox import Mailbox
@@ -35,6 +35,7 @@ from service.web.schemas.live import (
     live_task,
     read_hello,
 )
+from service.web.shared_state import RENEW_S, SessionLimits
 
 _log = logging.getLogger(__name__)
 
@@ -75,6 +76,7 @@ class _Session:
         self._state: AppState = socket.app.state.app_state
         self._settings = self._state.settings
         self._caller: Caller | None = socket.state.caller
+        self._client, self._session = client_of(socket.scope), ""
         self._mailbox, self._pace = Mailbox(), Pace(self._settings.live_fps)
         self._answers: asyncio.Queue[tuple[LiveAnswer, float, tuple[int, ...]]] = asyncio.Queue()
         self._taken: tuple[float, tuple[int, ...]] = (0.0, ())
@@ -89,7 +91,7 @@ class _Session:
         began = self._loop.time()
         with bound(scene=self._scene):
             try:
-                with self._place():
+                async with self._place():
                     await self._serve()
                 end = _End(1000)
             except Exception as error:
@@ -104,22 +106,19 @@ class _Session:
                 async with asyncio.timeout(1.0):
                     await self._socket.close(end.code, end.reason)
 
-    @contextmanager
-    def _place(self) -> Iterator[None]:
-        """Take a place among the sessions. Raises _End if there is none."""
-        live, client = self._state.live, client_of(self._socket.scope)
-        # Nothing is awaited between check and count, so no other session takes the place.
-        if live[client] >= self._settings.live_sessions_of_client:
-            raise _End(TOO_MANY, f"limit of live sessions for this key reached: {live[client]}.")
-        if live.total() >= self._settings.live_sessions:
-            raise _End(TOO_MANY, f"limit of live sessions of the service reached: {live.total()}; try again later.")
-        live[client] += 1
+    @asynccontextmanager
+    async def _place(self) -> AsyncIterator[None]:
+        """Take a place among the sessions of all fronts. Raises RateLimited if there is none."""
+        live, shared = self._state.live, self._state.shared
+        limits = SessionLimits(self._settings.live_sessions, self._settings.live_sessions_of_client)
+        session = self._session = await to_thread.run_sync(shared.begin_session, self._client, limits)
+        live.add(session)
         try:
             yield
         finally:
-            live[client] -= 1
-            if not live[client]:
-                del live[client]
+            live.discard(session)
+            with anyio.CancelScope(shield=True), suppress(StorageFailed):  # then its lease ends
+                await to_thread.run_sync(shared.end_session, session)
 
     async def _serve(self) -> None:
         """Exchange hello and welcome, then frames and answers, with the scene held meanwhile."""
@@ -157,7 +156,7 @@ class _Session:
         follow = partial(self._state.engine.live, task, self._next_frame, self._on_answer)
         # A thread of its own for each session, beside those of other requests.
         followed = to_thread.run_sync(follow, limiter=anyio.CapacityLimiter(1))
-        duties = (followed, self._frames(), self._send_answers(), self._watch())
+        duties = (followed, self._frames(), self._send_answers(), self._watch(), self._keep_place())
         parts = [asyncio.ensure_future(duty) for duty in duties]
         try:
             ended, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
@@ -222,6 +221,14 @@ class _Session:
             if self._caller and not self._state.keys.still_valid(self._caller):
                 raise _End(KEY_GONE, "the session's key is not valid any more.")
 
+    async def _keep_place(self) -> None:
+        """Keep the session counted."""
+        while True:
+            await asyncio.sleep(RENEW_S)
+            # Without the database it goes on, and counts again as soon as that is back.
+            with suppress(StorageFailed):
+                await to_thread.run_sync(self._state.shared.renew_session, self._client, self._session)
+
     async def _receive(self) -> str | bytes:
         """Return the next message. Raises _End if it is too large, WebSocketDisconnect."""
         message = await self._socket.receive()
@@ -248,11 +255,13 @@ def _end_of(error: Exception) -> _End:
             end = error
         case WebSocketDisconnect():
             return _End(error.code)
+        case RateLimited():
+            end = _End(TOO_MANY, str(error))
         case BadInput():
             end = _End(BAD_MESSAGE, str(error))
         case SceneNotFound():
             end = _End(NO_SCENE, str(error))
-        case SceneError():
+        case SceneError() | StorageFailed():
             end = _End(UNAVAILABLE, str(error))
         case EngineLost():
             end = _End(UNAVAILABLE, "the engine ended and is started again; connect again.")

@@ -98,7 +98,7 @@ def _file(app_state: AppState, scene_id: str) -> RegistrationFile | None:
     """Return the scene's file of registrations; None for a scene without a file. Raises SceneNotFound."""
     app_state.engine.scene(scene_id)
     stored = app_state.scene_store.find(scene_id)
-    return None if stored is None else RegistrationFile(stored.path, app_state.settings.data_dir)
+    return None if stored is None else RegistrationFile(stored.path, app_state.settings.data_dir, stored.remote)
 
 
 def _answer(app_state: AppState, scene_id: str, registration: Registration) -> RegistrationOut:
