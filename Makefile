@@ -37,8 +37,8 @@ test: check
 # What several machines share, and the peer of `bench peer`, with the packages that only they need. PostgreSQL's server
 # is the system's.
 test-fleet: setup
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray,peer]"
-	$(BIN)/pytest -rs tests/test_fronts.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray,cloud,s3server,peer]"
+	$(BIN)/pytest -rs tests/test_fronts.py tests/test_shared_state.py tests/test_object_store.py tests/test_gateway.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
 		tests/test_bench_peer.py
 
 # All tests, and which lines they run in their own process.

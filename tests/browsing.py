@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import shutil
-import socket
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from pathlib import Path
+from contextlib import contextmanager
 
 import pytest
 import uvicorn
 from fastapi import FastAPI
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-ROOT = Path(__file__).parents[1]
 CHROMIUM = shutil.which("chromium") or ""
 # WebGL in software where there is no GPU, which has to be asked for; no services in the background.
 FLAGS = [
@@ -53,11 +49,6 @@ def opened(browser: Browser, address: str, width: int = 1100, height: int = 700)
     return page
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        return listener.getsockname()[1]
-
-
 @contextmanager
 def served(app: FastAPI, port: int = 0) -> Iterator[str]:
     """Serve an app in a thread; gives its URL."""
@@ -76,30 +67,3 @@ def served(app: FastAPI, port: int = 0) -> Iterator[str]:
     finally:
         server.should_exit = True
         thread.join()
-
-
-@contextmanager
-def behind_nginx(port: int, folder: Path) -> Iterator[str]:
-    """Run nginx, as docker/nginx configures it, before the service of a port, which may come and go; gives its URL."""
-    nginx = shutil.which("nginx")
-    if nginx is None:
-        pytest.skip("there is no nginx on this machine")
-    folder.mkdir()
-    given, front = ROOT / "docker" / "nginx", free_port()
-    gateway = (given / "gateway.conf").read_text("utf-8").replace("/etc/nginx", str(given))
-    gateway = gateway.replace("listen 8080", f"listen 127.0.0.1:{front}").replace("splatfix:8000", f"127.0.0.1:{port}")
-    kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    paths = " ".join(f"{kind}_temp_path {folder}/{kind};" for kind in kinds)
-    main = f"daemon off; master_process off; pid {folder}/pid; error_log {folder}/log; events {{}}"
-    (folder / "nginx.conf").write_text(f"{main} http {{ access_log off; {paths} {gateway} }}")
-    child = subprocess.Popen([nginx, "-p", folder, "-c", folder / "nginx.conf", "-e", folder / "log"])
-    try:
-        while True:
-            assert child.poll() is None, (folder / "log").read_text()
-            with suppress(OSError), socket.create_connection(("127.0.0.1", front), 1):
-                break
-            time.sleep(0.02)
-        yield f"http://127.0.0.1:{front}"
-    finally:
-        child.terminate()
-        child.wait(10)

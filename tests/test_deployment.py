@@ -194,3 +194,40 @@ def test_nginx_takes_the_gateways_configuration(tmp_path):
     main = f"pid {tmp_path}/pid; error_log stderr; events {{}} http {{ access_log off; {gateway} }}"
     (tmp_path / "nginx.conf").write_text(main)
     ran(nginx, "-t", "-p", tmp_path, "-c", tmp_path / "nginx.conf")
+
+
+def test_the_fleet_on_kubernetes_is_valid(tmp_path):
+    """As `kubectl` builds it; what is patched is what the fleet needs otherwise."""
+    kubectl = shutil.which("kubectl")
+    if not kubectl:
+        pytest.skip("there is no kubectl on this machine")
+    built = subprocess.run([kubectl, "kustomize", str(DOCKER)], capture_output=True, text=True, check=True).stdout
+    (tmp_path / "fleet.yaml").write_text(built)
+    ran(installed("kubernetes-validate"), "--strict", tmp_path / "fleet.yaml")
+    found = {(item["kind"], item["metadata"]["name"]): item for item in yaml.safe_load_all(built)}
+    front = found["Deployment", "splatfix"]["spec"]
+    assert (front["replicas"], front["strategy"]["type"]) == (2, "RollingUpdate")
+    volumes = {volume["name"]: volume for volume in front["template"]["spec"]["volumes"]}
+    assert volumes["jobs"] == {"name": "jobs", "emptyDir": {"sizeLimit": "4Gi"}}
+    assert ("PersistentVolumeClaim", "splatfix-jobs") not in found
+    images = set()
+    for (kind, name), item in found.items():
+        if kind != "Deployment":
+            continue
+        pod = item["spec"]["template"]
+        assert pod["metadata"]["labels"]["app.kubernetes.io/part-of"] == "splatfix-fleet", name
+        (container,) = pod["spec"]["containers"]
+        images.add(container["image"])
+        mounted = {mount["name"] for mount in container["volumeMounts"]}
+        assert mounted == {volume["name"] for volume in pod["spec"]["volumes"]}, name
+        assert container["securityContext"]["readOnlyRootFilesystem"], name
+    assert images == {"splatfix:fleet"}
+
+
+def test_processes_of_ray_run_the_kernels_of_the_image(entrypoint, tmp_path):
+    (tmp_path / "ray").write_text('#!/bin/sh\necho "ray $* $NUMBA_CPU_NAME"\n')
+    (tmp_path / "ray").chmod(0o755)
+    compiled = [line.split()[1] for line in entrypoint("compile").splitlines() if line.startswith("doctor")]
+    if not compiled:
+        pytest.skip("this processor has no AVX2")
+    assert entrypoint("ray", "start", "--head").split() == ["ray", "start", "--head", compiled[0]]

@@ -10,8 +10,9 @@ import httpx
 import numpy as np
 import pytest
 from api_server import until
-from browsing import free_port, served
+from browsing import served
 from firefox import FIREFOX, XVFB, Page, firefox
+from gateway import free_port
 from PIL import Image
 
 from service.web.app import create_app

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from api_server import until
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, free_port, launched, opened, served
+from browsing import NEEDS_CHROMIUM, launched, opened, served
+from gateway import free_port
 from playwright.sync_api import Browser, Page, expect
 from small_room import FOCAL, pose_at, write_room
 

@@ -17,7 +17,8 @@ import httpx
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, PATIENCE_MS, behind_nginx, free_port, launched, opened, served
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
+from gateway import behind_nginx, free_port
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
 from small_room import INTRINSICS, pose_at, write_room
@@ -695,7 +696,7 @@ def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path:
         keys_file=tmp_path / "keys.json",
         shutdown_s=0,
     )
-    front = behind_nginx(port, tmp_path / "nginx") if nginx else nullcontext(f"http://127.0.0.1:{port}")
+    front = behind_nginx([port], tmp_path / "nginx") if nginx else nullcontext(f"http://127.0.0.1:{port}")
     with front as url:
         _restarted(browser, chosen, url, key)
 

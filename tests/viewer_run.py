@@ -28,7 +28,8 @@ from pathlib import Path
 
 import httpx
 import numpy as np
-from browsing import free_port, launched, opened
+from browsing import launched, opened
+from gateway import free_port
 from playwright.sync_api import CDPSession, Page
 from small_room import INTRINSICS, pose_at, write_room
 
