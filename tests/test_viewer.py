@@ -682,7 +682,7 @@ def test_a_job_that_is_gone_is_reported_and_not_requested_again() -> None:
     stream = JobStream(Client("http://fake", transport=fake.transport), "gone")
     stream.start()
     until(lambda: stream.error and not threads("job-gone"), "the thread's end")
-    assert "no job gone" in stream.error
+    assert stream.error == "Job gone not found or expired."
     assert fake.asked == ["/jobs/gone"]
 
 
