@@ -608,7 +608,7 @@ def test_play_has_the_chosen_speed(fake: FakeService, viewer: Viewer) -> None:
 
 def test_an_unknown_job_is_reported(viewer: Viewer) -> None:
     with _browser(viewer, "/jobs/unknown") as browser:
-        browser.wait(lambda: "no job unknown" in browser.text(), "the message")
+        browser.wait(lambda: "Job unknown not found or expired." in browser.text(), "the message")
 
 
 @pytest.mark.parametrize("forbidden", [True, False])
