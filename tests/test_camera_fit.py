@@ -184,7 +184,13 @@ def decided(monkeypatch: pytest.MonkeyPatch, *, cameras: int = 4, gaussians: int
     PlantedTrial.flat, PlantedTrial.asked = set(flat), []
     monkeypatch.setattr(camera_fit, "_Trial", PlantedTrial)
     tried = [Candidate("")] + [
-        Candidate(name, is_normalization=name.startswith("n"), is_measured=name == "measured") for name in names
+        Candidate(
+            name,
+            is_normalization=name.startswith("n"),
+            is_measured=name == "measured",
+            is_model_frame=name.startswith("model"),
+        )
+        for name in names
     ]
     monkeypatch.setattr(camera_fit, "candidates", lambda file: tried)
     file: Any = SimpleNamespace(cameras=("camera",) * cameras, stated=())
@@ -228,6 +234,10 @@ def test_what_is_alike_is_compared_again_and_the_simpler_is_taken(monkeypatch: p
     many = {f"n{k}": 0.5 for k in range(1, 9)} | {"n9": 0.49, "n9__fine": 0.9}
     assert decided(monkeypatch, as_is=0.0, **many) == ("n1", True)
     assert sum(fineness == "fine" for _, fineness in PlantedTrial.asked) == 9
+    # But a normalization that places the cameras as the best one does: nothing coarse ranks the two.
+    near = many | {"n9__finest": 0.9}
+    assert decided(monkeypatch, as_is=0.0, **near) == ("n1", True)
+    assert decided(monkeypatch, as_is=0.0, **near, flat=["same"]) == ("n9", True)
 
 
 def test_a_correction_must_correlate_clearly_and_cameras_as_they_are_need_less(monkeypatch) -> None:
@@ -253,6 +263,13 @@ def test_without_photos_the_likeliest_of_the_best_geometries_is_taken(monkeypatc
     assert decided(monkeypatch, **nowhere, a=(0.82, None), b=(0.9, None), flat=["same"]) == ("a", True)
     assert decided(monkeypatch, **nowhere, a=(0.62, None), b=(0.9, None)) == ("b", True)
     assert decided(monkeypatch, **nowhere, a=(0.64, None), b=(0.9, None)) == ("b", False)
+
+
+def test_without_photos_two_readings_of_what_the_trainer_wrote_leave_a_doubt(monkeypatch) -> None:
+    nowhere = {"as_is": (0.1, None)}
+    assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.6, None)) == ("model1", False)
+    assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.6, None), flat=["same"]) == ("model1", True)
+    assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.29, None)) == ("model1", True)
 
 
 def test_placements_are_disturbed_by_five_degrees_and_fifteen_hundredths() -> None:

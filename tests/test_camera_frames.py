@@ -20,8 +20,18 @@ from service.photos.images import encode_image
 from service.pose.retrieval.viewpoints import index_cameras
 from service.scene_formats import load_scene
 from service.scene_formats.colmap import read_points
-from service.scene_formats.normalizations import gsplat_normalization, nerfstudio_normalization, rotation_between
+from service.scene_formats.manifest import Manifest
+from service.scene_formats.normalizations import (
+    COLMAP_TO_Z_UP,
+    as_nerfstudio_trained,
+    gsplat_normalization,
+    gsplat_normalizations,
+    nerfstudio_normalization,
+    nerfstudio_normalizations,
+    rotation_between,
+)
 from service.scene_formats.similarity import moved_pose
+from service.scene_formats.training_files import read_training
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneFrame, SceneInfo
 from service.web.schemas.conversion import result_pose_out
 
@@ -180,6 +190,78 @@ def test_nerfstudios_normalization_does_what_its_documentation_says():
 
 def _ns() -> np.ndarray:
     return nerfstudio_normalization(TURN @ POSES, "up", "poses", True)
+
+
+SIGNS = [np.diag([*signs, 1.0]) for signs in ([1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1])]
+
+
+def trained_by_pca(poses: np.ndarray, signs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What nerfstudio writes with orientation pca, and what its model has: turned about x where z comes out down."""
+    middle = poses[:, :3, 3].mean(0)
+    axes = np.linalg.svd(poses[:, :3, 3] - middle)[2].T
+    axes[:, 2] *= np.linalg.det(axes)
+    written = np.eye(4)
+    written[:3, :3] = axes @ signs[:3, :3]  # not transposed
+    written[:3, 3] = -written[:3, :3] @ middle
+    is_down = (written @ poses @ GL).mean(0)[2, 1] < 0
+    return written, GL @ written if is_down else written
+
+
+def test_nerfstudios_pca_is_turned_as_its_trainer_does_whatever_the_signs_of_eigenvectors():
+    """Its float32 gave other signs than numpy's float64 for the cameras of NeRF-Synthetic's chair."""
+    poses = TURN @ POSES * [[1], [0.9], [0.8], [1]]  # no two axes with the same spread
+    poses[:, :3, :3] = TURN[:3, :3] @ POSES[:, :3, :3]
+    turned = []
+    for signs in SIGNS:
+        written, trained = trained_by_pca(poses, signs)
+        turned.append(not np.allclose(written, trained))
+        assert np.allclose(as_nerfstudio_trained(poses, written), trained)
+        half = np.diag([0.5, 0.5, 0.5, 1.0])
+        assert np.allclose(as_nerfstudio_trained(poses, half @ written), half @ trained)
+        # Of COLMAP's world, which nerfstudio turns before.
+        data = COLMAP_TO_Z_UP.T @ poses
+        assert np.allclose(as_nerfstudio_trained(data, written @ COLMAP_TO_Z_UP), trained @ COLMAP_TO_Z_UP)
+        found = [n for name, n in nerfstudio_normalizations(poses) if name.endswith("centre poses)")]
+        assert any(np.allclose(n, trained) for n in found)
+    assert sorted(set(turned)) == [False, True]
+    upright = nerfstudio_normalization(poses, "up", "poses", True)
+    assert np.array_equal(as_nerfstudio_trained(poses, upright), upright)
+
+
+def test_what_nerfstudio_wrote_begins_with_the_world_before_applied_transform(tmp_path):
+    """It writes the product with `applied_transform` and of the scales, and centres in the unit of transforms.json."""
+    applied, applied_scale, scale = TURN.copy(), 4.0, 0.3
+    applied[:3, 3] = 1.0, -2.0, 0.5
+    normalization = nerfstudio_normalization(POSES, "up", "poses", False)
+    file = {
+        "applied_transform": applied[:3].tolist(),
+        "applied_scale": applied_scale,
+        "frames": [
+            {"file_path": f"{i}.png", "transform_matrix": (pose @ GL).tolist(), "w": 64, "h": 48, "fl_x": 50.0}
+            for i, pose in enumerate(POSES)
+        ],
+    }
+    (tmp_path / "transforms.json").write_text(json.dumps(file))
+    written = {"transform": (normalization @ applied)[:3].tolist(), "scale": scale * applied_scale}
+    (tmp_path / "dataparser_transforms.json").write_text(json.dumps(written))
+    stated = read_training(tmp_path, Manifest()).file.stated
+    expected = np.diag([scale, scale, scale, 1.0]) @ normalization
+    assert stated[0].is_model_frame
+    assert np.allclose(stated[0].file_from_cameras, expected)
+
+
+def test_gsplats_principal_axes_may_have_any_signs():
+    points = np.random.default_rng(0).normal(size=(500, 3)) * [3.0, 2.0, 1.0]
+    by_cameras = gsplat_normalization(POSES, "focus", False)
+    moved = points @ by_cameras[:3, :3].T + by_cameras[:3, 3]
+    middle = np.median(moved, axis=0)
+    axes = np.linalg.svd(moved - moved.mean(0))[2]
+    axes[0] *= np.linalg.det(axes)
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = axes, -axes @ middle
+    found = [n for name, n in gsplat_normalizations(POSES, points) if "(centre focus, principal axes" in name]
+    for signs in SIGNS:
+        assert any(np.allclose(n, signs @ turn @ by_cameras, atol=1e-6) for n in found)
 
 
 def test_gsplats_normalization_does_what_its_documentation_says():

@@ -113,14 +113,18 @@ def _by_photos(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config: 
     # In the order of the candidates, the likelier ones first.
     finalists = [coarse[i][1] for i in sorted({0, *order[: config.finalists]})]
     finer = [(trial.evidence(c, config.fine), c) for c in finalists]
-    best = max(found.score for found, _ in finer)
-    alike = [(trial.evidence(c, config.finest), c) for found, c in finer if found.score >= best - config.alike]
+    leading, leader = max(finer, key=lambda one: one[0].score)
+    best = leading.score
+    compared = {id(c) for found, c in finer if found.score >= best - config.alike}
+    # A coarse look can't rank normalizations that hardly differ: all of them are compared.
+    compared |= {id(c) for _, c in coarse if c.is_normalization and trial.same(c, leader)}
+    alike = [(trial.evidence(c, config.finest), c) for _, c in coarse if id(c) in compared]
     most = max(found.score for found, _ in alike)
     # Normalizations are many: one of them may be better by chance than what is simple and right.
     chosen = next(
         c for found, c in alike if found.score >= most - (config.same if c.is_normalization else config.simple)
     )
-    fine = next(found for found, c in finer if c is chosen)
+    fine = next((found for found, c in finer if c is chosen), None) or trial.evidence(chosen, config.fine)
     is_clear = not chosen.name or chosen.is_measured or fine.score >= config.clear_correlation
     if is_clear and trial.is_peak(chosen, fine, config.fine, config.tie):
         return trial.fit(chosen, fine, verified=True)
@@ -140,9 +144,10 @@ def _by_geometry(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config
         return trial.none("the Gaussians in front of them")
     # What the trainer itself wrote needs no better evidence than the rest.
     least = max(config.plausible, config.distinct * best)
-    wrote = next(((e, c) for e, c in found if c.is_model_frame and e.geometry >= least), None)
+    wrote = [(e, c) for e, c in found if c.is_model_frame and e.geometry >= least]
     if wrote:
-        return trial.fit(wrote[1], wrote[0], verified=True)
+        evidence, chosen = wrote[0]
+        return trial.fit(chosen, evidence, verified=all(trial.same(chosen, other) for _, other in wrote))
     evidence, chosen = next((e, c) for e, c in found if e.geometry >= config.alike_share * best)
     rivals = [c for e, c in found if e.geometry >= config.distinct * evidence.geometry]
     return trial.fit(chosen, evidence, verified=all(trial.same(chosen, rival) for rival in rivals))

@@ -14,7 +14,12 @@ from itertools import permutations, product
 import numpy as np
 from jaxtyping import Float64
 
-from service.scene_formats.normalizations import COLMAP_TO_Z_UP, gsplat_normalizations, nerfstudio_normalizations
+from service.scene_formats.normalizations import (
+    COLMAP_TO_Z_UP,
+    as_nerfstudio_trained,
+    gsplat_normalizations,
+    nerfstudio_normalizations,
+)
 from service.scene_formats.similarity import moved_pose
 from service.types import Camera, NamedCamera, Pose
 
@@ -134,14 +139,12 @@ def candidates(file: CameraFile) -> Iterator[Candidate]:
     """Yield all ways to understand a camera file, the likelier ones first; the first one changes nothing."""
     yield Candidate("")
     for axes in ("given", "flipped"):
+        poses = corrected(file.all_poses, axes, file.stored_from_opencv)
         for stated in file.stated:
-            yield Candidate(
-                _both(PLAIN[axes], stated.name),
-                axes,
-                stated.file_from_cameras,
-                stated.is_model_frame,
-                stated.is_measured,
-            )
+            matrix = stated.file_from_cameras
+            if stated.is_model_frame and len(poses):
+                matrix = as_nerfstudio_trained(poses, matrix)
+            yield Candidate(_both(PLAIN[axes], stated.name), axes, matrix, stated.is_model_frame, stated.is_measured)
     for axes, text in PLAIN.items():
         if axes != "given":
             yield Candidate(text, axes)

@@ -23,6 +23,16 @@ COLMAP_TO_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0
 _LEVEL = 0.17
 """The cameras' x axes span a plane if the second singular value is this, times the root of their number."""
 _ROUNDS = 20
+_UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
+_ALIKE = 0.01
+"""Of unit vectors: trainers compute in float32."""
+_SIGNS = {
+    "": np.eye(4),
+    ", upside down": _UPSIDE_DOWN,
+    ", turned about y": np.diag([-1.0, 1.0, -1.0, 1.0]),
+    ", turned about z": np.diag([-1.0, -1.0, 1.0, 1.0]),
+}
+"""Eigenvectors have no sign: which one a trainer got depends on its linear algebra library and precision."""
 
 
 def nerfstudio_normalizations(poses: Poses) -> Iterator[tuple[str, Similarity]]:
@@ -30,35 +40,64 @@ def nerfstudio_normalizations(poses: Poses) -> Iterator[tuple[str, Similarity]]:
     for scaled in (True, False):
         for turn in ("up", "vertical", "pca", "none"):
             for centre in ("poses", "focus", "none"):
-                if scaled or (turn, centre) != ("none", "none"):
-                    name = f"nerfstudio's normalization (orientation {turn}, centre {centre}"
-                    yield (
-                        f"{name}{', scaled' if scaled else ''})",
-                        nerfstudio_normalization(poses, turn, centre, scaled),
-                    )
+                if not scaled and (turn, centre) == ("none", "none"):
+                    continue
+                for turned, signs in _SIGNS.items() if turn == "pca" else [("", _SIGNS[""])]:
+                    name = f"orientation {turn}{turned}, centre {centre}{', scaled' if scaled else ''}"
+                    similarity = nerfstudio_normalization(poses, turn, centre, scaled, signs)
+                    yield f"nerfstudio's normalization ({name})", similarity
 
 
-def nerfstudio_normalization(poses: Poses, orientation: str, centre: str, scaled: bool) -> Similarity:
-    """Return nerfstudio's normalization with these options; `orientation` is up, vertical, pca or none."""
+def nerfstudio_normalization(
+    poses: Poses, orientation: str, centre: str, scaled: bool, signs: Similarity = _SIGNS[""]
+) -> Similarity:
+    """Return nerfstudio's normalization with these options; `orientation` is up, vertical, pca or none.
+
+    `signs` are those of pca's eigenvectors, relative to numpy's.
+    """
     positions = poses[:, :3, 3]
     middle = positions.mean(0)
     away = {"poses": middle, "focus": _focus(poses, middle), "none": np.zeros(3)}[centre]
-    rotation = _orientation(poses, orientation)
+    rotation = _orientation(poses, orientation, signs)
     moved = (positions - away) @ rotation.T
     scale = 1.0 / max(float(np.abs(moved).max()), 1e-12) if scaled else 1.0
     return _similarity(scale, rotation, -scale * rotation @ away)
 
 
-def _orientation(poses: Poses, method: str) -> Float64[np.ndarray, "3 3"]:
+def as_nerfstudio_trained(poses: Poses, model_from_data: Similarity) -> Similarity:
+    """Return nerfstudio's normalization as its model has it, from how `dataparser_transforms.json` has it.
+
+    They differ with orientation pca: cameras that come out upside down are turned about x, which isn't written.
+    """
+    rotation = model_from_data[:3, :3] / np.cbrt(np.linalg.det(model_from_data[:3, :3]))
+    for world in (np.eye(4), COLMAP_TO_Z_UP):
+        signs = _main_axes(world @ poses).T @ rotation @ world[:3, :3].T
+        is_by_pca = np.abs(np.abs(signs) - np.eye(3)).max() < _ALIKE
+        if is_by_pca and _looks_down(poses, rotation):
+            return _UPSIDE_DOWN @ model_from_data
+    return model_from_data
+
+
+def _looks_down(poses: Poses, rotation: Float64[np.ndarray, "3 3"]) -> bool:
+    return bool((rotation @ -poses[:, :3, 1].mean(0))[2] < 0)
+
+
+def _main_axes(poses: Poses) -> Float64[np.ndarray, "3 3"]:
+    """Return the principal axes of the positions as columns, right-handed, that of the largest spread first."""
+    centred = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
+    axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].copy()
+    if np.linalg.det(axes) < 0:
+        axes[:, 2] *= -1
+    return axes
+
+
+def _orientation(poses: Poses, method: str, signs: Similarity = _SIGNS[""]) -> Float64[np.ndarray, "3 3"]:
     if method == "none":
         return np.eye(3)
     if method == "pca":
-        centred = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
-        # Eigenvectors by descending eigenvalue are applied as they are, not transposed.
-        axes = np.linalg.eigh(centred.T @ centred)[1][:, ::-1].copy()
-        if np.linalg.det(axes) < 0:
-            axes[:, 2] *= -1
-        return np.diag([1.0, -1.0, -1.0]) @ axes if (axes @ -poses[:, :3, 1].mean(0))[2] < 0 else axes
+        # Applied as they are, not transposed.
+        axes = _main_axes(poses) @ signs[:3, :3]
+        return _UPSIDE_DOWN[:3, :3] @ axes if _looks_down(poses, axes) else axes
     up = _unit(-poses[:, :3, 1].mean(0))
     if method == "vertical":
         # Photos are held level: their x axes lie in the horizontal plane.
@@ -94,8 +133,8 @@ def gsplat_normalizations(poses: Poses, points: Float64[np.ndarray, "p 3"] | Non
             name = f"gsplat's normalization (centre {centre}{', strict scaling' if farthest else ''}"
             if points is not None and len(points) > 3:
                 turned = _principal_axes(points @ by_cameras[:3, :3].T + by_cameras[:3, 3])
-                yield f"{name}, principal axes)", turned @ by_cameras
-                yield f"{name}, principal axes, upside down)", np.diag([1.0, -1.0, -1.0, 1.0]) @ turned @ by_cameras
+                for about, signs in _SIGNS.items():
+                    yield f"{name}, principal axes{about})", signs @ turned @ by_cameras
             yield f"{name})", by_cameras
 
 

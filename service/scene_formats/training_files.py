@@ -1,7 +1,7 @@
 """What a scene folder says of its training: cameras, background, photos, and how a trainer moved the world.
 
-The first one that is there is read: `transforms*.json`, COLMAP's `sparse/0` (of which that is made), or Inria's
-`cameras.json`.
+The first one that is there is read: `transforms*.json`, COLMAP's `sparse/0` (of which that is made), Inria's
+`cameras.json`, or MultiSet's `poses.json`.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from service.scene_formats.inria import ARGUMENTS, CAMERAS, background_of
 from service.scene_formats.inria import read_cameras as read_inria_cameras
 from service.scene_formats.layouts import COLMAP_FOLDER
 from service.scene_formats.manifest import Manifest, numbers, read_json
+from service.scene_formats.multiset import POSES, is_of_multiset
+from service.scene_formats.multiset import read_cameras as read_multiset_cameras
 from service.scene_formats.nerfstudio import DATAPARSER, TransformsFile, transforms_path
 from service.scene_formats.normalizations import COLMAP_TO_Z_UP
 from service.types import NamedCamera
@@ -44,6 +46,8 @@ class TrainingFiles:
     file: CameraFile
     background: tuple[float, float, float] | None = None
     warnings: tuple[str, ...] = ()
+    has_lens: bool = True
+    """The cameras' intrinsics are of the file, not assumed."""
 
 
 def read_training(folder: Path, manifest: Manifest, without_photos: Collection[str] = ()) -> TrainingFiles:
@@ -72,6 +76,9 @@ def _read_training(folder: Path, manifest: Manifest, without_photos: Collection[
         return TrainingFiles(CameraFile(cameras, read_points=lambda: read_points(model), stated=stated), background)
     if (folder / CAMERAS).is_file():
         return TrainingFiles(CameraFile(read_inria_cameras(folder / CAMERAS, keep)), background)
+    if is_of_multiset(folder / POSES):
+        cameras = read_multiset_cameras(folder / POSES, keep)
+        return TrainingFiles(CameraFile(cameras), background, _models_elsewhere(folder), has_lens=False)
     return TrainingFiles(CameraFile(()), background, _models_elsewhere(folder))
 
 
@@ -139,7 +146,7 @@ def _of_transforms(file: TransformsFile, manifest: Manifest, keep: Callable[[str
             except CorruptScene:  # a broken frame that is not used is no error
                 continue
     applied = _applied(file.data, file.path.name)
-    stated = list(_of_dataparser(file.path.parent, ("", np.eye(4)), ("applied_transform", applied)))
+    stated = list(_of_dataparser(file.path.parent, ("applied_transform", applied), ("", np.eye(4))))
     if not np.array_equal(applied, np.eye(4)):
         stated.append(Stated("applied_transform undone", applied))
     cameras = tuple(file.camera(photo, manifest) for photo in photos)
@@ -173,7 +180,11 @@ def _measured_frame(folder: Path) -> Stated | None:
 
 
 def _of_dataparser(folder: Path, *worlds: tuple[str, Float64[np.ndarray, "4 4"]]) -> list[Stated]:
-    """Return what nerfstudio's trainer wrote, for each world that it may have begun with. Raises CorruptScene."""
+    """Return what nerfstudio's trainer wrote, for each world that it may have begun with, the likelier one first.
+
+    A world is given by its transform from the camera file's. nerfstudio writes the product of its normalization with
+    `applied_transform`, and of both scales, but centres in the camera file's unit. Raises CorruptScene.
+    """
     path = folder / DATAPARSER
     if not path.is_file():
         return []
@@ -181,9 +192,15 @@ def _of_dataparser(folder: Path, *worlds: tuple[str, Float64[np.ndarray, "4 4"]]
     scale = float(numbers(data.get("scale", 1.0), (), f"{path.name}: scale"))
     if not scale > 0:
         raise CorruptScene(f"must be positive, is {scale}.", where=f"{path.name}: scale")
-    model = np.diag([scale, scale, scale, 1.0]) @ _transform(data.get("transform"), f"{path.name}: transform")
-    distinct = worlds[:1] if np.array_equal(worlds[0][1], worlds[1][1]) else worlds
-    return [Stated(f"{path.name}{f' and {name}' if name else ''}", model @ w, True) for name, w in distinct]
+    model = _transform(data.get("transform"), f"{path.name}: transform")
+    distinct = worlds[1:] if np.array_equal(worlds[0][1], worlds[1][1]) else worlds
+    stated = []
+    for name, world in distinct:
+        unit = np.cbrt(np.linalg.det(world[:3, :3]))
+        rigid = world @ np.diag([1 / unit, 1 / unit, 1 / unit, 1.0])
+        matrix = np.diag([scale * unit] * 3 + [1.0]) @ model @ rigid
+        stated.append(Stated(f"{path.name}{f' and {name}' if name else ''}", matrix, True))
+    return stated
 
 
 def _transform(value: Any, where: str) -> Float64[np.ndarray, "4 4"]:
