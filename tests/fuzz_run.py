@@ -187,6 +187,19 @@ def inria_target() -> Target:
     return scene_target("cameras.json", {"one": seed}, (*_JSON_WORDS, *camera), read=read)
 
 
+def multiset_target() -> Target:
+    from service.scene_formats.multiset import is_of_multiset, read_cameras
+
+    pose = {"ts": "1.5", "T": [1, 2, 3], "R": [0, 0, 0, 1], "RGB": None}
+    seed = json.dumps({"poses": [pose, pose]}).encode()
+
+    def read(folder: Path) -> object:
+        path = folder / "poses.json"
+        return is_of_multiset(path) and read_cameras(path, lambda name: True)
+
+    return scene_target("poses.json", {"two": seed}, (*_JSON_WORDS, "poses", *pose), read=read)
+
+
 def manifest_target() -> Target:
     text = (HERE.parent / "service" / "scene_formats" / "manifest.py").read_text("utf-8")
     example = text[text.index("{") : text.index("Every key")].replace("scene.ply", "scene.ply")
@@ -381,6 +394,7 @@ TARGETS: dict[str, Callable[[], Target]] = {
     "gltf": lambda: written_target("plain.glb"),
     "checkpoint": checkpoint_target,
     "inria_cameras": inria_target,
+    "multiset_poses": multiset_target,
     "manifest": manifest_target,
     "transforms": transforms_target,
     "colmap_cameras_bin": lambda: colmap_target("cameras.bin", _BIN_CAMERAS, "images.bin", _BIN_IMAGES),

@@ -243,6 +243,7 @@ def test_an_archive_unpacks_to_so_many_bytes_in_all(most: int, fits: bool, tmp_p
         ("transforms_train.json", True),
         ("other.json", False),
         ("cameras.json", True),
+        ("poses.json", True),
         ("sparse/0/cameras.bin", True),
         ("sparse/images.txt", True),
         ("sparse/0/notes.pdf", False),

@@ -475,6 +475,41 @@ class TestTrainersFolders:
         with pytest.raises(CorruptScene, match=says):
             load_scene(tmp_path)
 
+    def test_multiset(self, tmp_path):
+        """As its documentation shows the file; a quarter turn about z has the quaternion (0, 0, s, s), scalar last."""
+        s = np.sqrt(0.5)
+        poses = [
+            {"ts": "1776075484.516121864", "T": [1, 2, 3], "R": [0, 0, s, s], "RGB": None},
+            {"ts": "1776075485.016", "T": [4, 5, 6], "R": [1.4, 0, 0, 1.4], "RGB": None},
+        ]
+        folder = written(tmp_path, name="point_cloud.ply")
+        (folder / "poses.json").write_text(json.dumps({"poses": poses}))
+        scene = load_scene(folder)
+        first, second = scene.cameras
+        assert first.name == "1776075484.516121864"
+        assert first.camera.pose.position_in_world.tolist() == [1, 2, 3]
+        assert np.allclose(first.camera.pose.world_from_camera[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+        assert np.allclose(second.camera.pose.world_from_camera[:3, :3], [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+        assert scene.info.training_focal_px is None  # the lens is assumed: nothing is known of training
+        assert scene.info.training_long_side_px is None
+
+    @pytest.mark.parametrize(
+        ("changed", "says"),
+        [({"ts": None}, "'ts'"), ({"R": [0, 0, 0, 0]}, "R: must not be zero"), ({"T": [1, 2]}, "pose 0: T")],
+    )
+    def test_broken_poses(self, tmp_path, changed, says):
+        folder = written(tmp_path, name="point_cloud.ply")
+        pose = {"ts": "1", "T": [1, 2, 3], "R": [0, 0, 0, 1]} | changed
+        (folder / "poses.json").write_text(json.dumps({"poses": [pose]}))
+        with pytest.raises(CorruptScene, match=says):
+            load_scene(folder)
+
+    @pytest.mark.parametrize("text", ["[]", "{", '{"poses": {}}', '{"poses": [{"pose": 1}]}'])
+    def test_poses_of_other_programs_are_left_alone(self, tmp_path, text):
+        folder = written(tmp_path, name="point_cloud.ply")
+        (folder / "poses.json").write_text(text)
+        assert load_scene(folder).cameras == ()
+
     def test_point_clouds_and_hidden_files_are_no_scenes(self, tmp_path):
         folder = written(tmp_path, name="splat.ply")
         (folder / "sparse_pc.ply").write_bytes(ply_bytes({n: np.zeros(9) for n in "xyz"}))

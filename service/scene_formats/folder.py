@@ -50,12 +50,13 @@ def load_scene(
     given = training is not None or path.is_file()
     found = TrainingFiles(CameraFile(tuple(training or ()))) if given else read_training(path, manifest, without_photos)
     listed = found.file.cameras if cameras else ()
-    size = manifest.training_size or _median_size(found.file.cameras)
+    lenses = found.file.cameras if found.has_lens else ()
+    size = manifest.training_size or _median_size(lenses)
     background = manifest.background or found.background
     fit = None if given or not listed else fitted(raw, found.file, photos_beside(path, background), background)
     # Cameras that were left out count in the digest, too: by their file, since another one may fit.
     raw, used, extent, origin = _in_world(raw, fit.cameras if fit else listed, manifest)
-    facts = (found.background, size, _training_focal_px(listed, manifest.training_size))
+    facts = (found.background, size, _training_focal_px(lenses if cameras else (), manifest.training_size))
     facts += ("cameras unverified",) if fit and fit.is_doubtful else ()
     info = SceneInfo(
         id=_scene_id(path),

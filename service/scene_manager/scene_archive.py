@@ -21,6 +21,7 @@ from service.scene_formats.formats import is_scene_file
 from service.scene_formats.inria import ARGUMENTS, CAMERAS
 from service.scene_formats.layouts import COLMAP_FOLDER, STEPS
 from service.scene_formats.manifest import MANIFEST
+from service.scene_formats.multiset import POSES
 from service.scene_formats.nerfstudio import DATAPARSER
 from service.scene_formats.training_files import CAMERA_FRAME
 
@@ -32,7 +33,7 @@ _MAX_NAME_BYTES = 255
 """On all usual file systems."""
 _MAX_DEPTH = 4
 _COPY_BYTES = 1 << 20
-_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER, DIGEST_FILE, CAMERA_FRAME}
+_OWN_NAMES = {MANIFEST, ARGUMENTS, CAMERAS, DATAPARSER, DIGEST_FILE, CAMERA_FRAME, POSES}
 _PHOTOS = (".jpg", ".jpeg", ".png", ".webp")
 _SYSTEM_FOLDER = "__MACOSX"
 
