@@ -48,7 +48,7 @@ def outcome(latency_ms: float, degrees: float = 0.5) -> Outcome:
     return Outcome(Status.LOCALIZED, degrees, 0.005, latency_ms, latency_ms / 3)
 
 
-@pytest.mark.parametrize(("first_ms", "count"), [(300.0, 3), (2000.0, 1), (70.0, 5)])
+@pytest.mark.parametrize(("first_ms", "count"), [(600.0, 3), (4000.0, 1), (140.0, 5)])
 def test_as_many_photos_are_measured_as_fit_into_the_time(
     first_ms: float, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,7 +62,7 @@ def test_as_many_photos_are_measured_as_fit_into_the_time(
 
     monkeypatch.setattr(device, "measure", measure)
     monkeypatch.setattr(device, "localize_trial", lambda one, trial, request, kind: f"{trial} {kind}")
-    found = device._measured(SimpleNamespace(units=None), list("abcde"), "withheld", 1.0)  # type: ignore[arg-type]
+    found = device._measured(SimpleNamespace(units=None), list("abcde"), "withheld", 2.0)  # type: ignore[arg-type]
     assert calls == [["a withheld"], [f"{name} withheld" for name in "abcde"[:count]]]
     assert found["queries"] == count
     assert found["latency_ms_p50"] == 100 * (count + 1) / 2
@@ -277,6 +277,10 @@ def test_a_fleet_by_hand_without_failures(monkeypatch: pytest.MonkeyPatch) -> No
     assert found.found_share == 1.0
     assert found.busy_share == pytest.approx((2.0 + 0.5 + 1.5 + 1.0 + 0.25) / 20.25)
     assert (found.repeated, found.ended) == (0, 5)
+
+
+def test_placement_expects_of_a_load_what_the_simulation_lets_it_take() -> None:
+    assert FleetSimulation(FleetModel(1, 1, load_s=7.0))._table._load_s(fleet_simulation._SIZE) == pytest.approx(7.0)
 
 
 def test_a_fleet_by_hand_whose_replica_dies(monkeypatch: pytest.MonkeyPatch) -> None:
