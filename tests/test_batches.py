@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_room import INTRINSICS, pose_at, write_room
 
-from service.estimators import mc_do, pnerf, search_state, view_index
+from service.estimators import ambiguity_check, mc_do, pnerf, search_state, view_index
 from service.estimators.search_config import SEARCH
 from service.geometry import moved
 from service.interfaces import Frame, Rasterizer, RenderTally, Tools
@@ -162,7 +162,7 @@ def test_first_renders_of_several_candidates_are_made_in_one_call(scene, index):
         tools = Tools(scene, Counted(rasterizer, tally), tools.matcher, tools.rng, index)
         state = search_state.SearchState.of(query_of(scene), tools, SEARCH)
         answer = SimpleNamespace(refined=SimpleNamespace(correction=NO_CORRECTION))
-        taken = search_state.rendered_ahead(state, candidates, answer)  # type: ignore[arg-type]
+        taken = ambiguity_check.rendered_ahead(state, candidates, answer)  # type: ignore[arg-type]
         first = next(taken)
         assert first is candidates[0]
         assert getattr(rasterizer, "calls", []) == calls

@@ -11,7 +11,7 @@ import pytest
 from test_search_thresholds import HERE, agreed, state, verdict
 
 from service.device_readings import HeadingPrior, PositionPrior, ScenePriors, UpPrior
-from service.estimators import search_state
+from service.estimators import ambiguity_check, search_state
 from service.estimators.search_state import SearchState
 from service.geometry import look_at, moved, se3_exp, transformed
 from service.pose.absolute_pose import fisheye
@@ -318,7 +318,7 @@ def test_a_mirror_image_is_searched_without_what_is_known_of_the_photo(monkeypat
     searching = state()
     searching.images = SimpleNamespace(query=query)  # type: ignore[assignment]
     answer: Any = SimpleNamespace(refined=SimpleNamespace(correction=IntrinsicsCorrection(1.2)))
-    assert search_state.mirror_image_of(searching, answer) == "state"  # type: ignore[comparison-overlap]
+    assert ambiguity_check.mirror_image_of(searching, answer) == "state"  # type: ignore[comparison-overlap]
     (mirrored,) = made
     assert (mirrored.prior, mirrored.region, mirrored.scene_priors) == (None, None, None)
     assert (mirrored.rgb[:, -1] == 255).all()

@@ -14,7 +14,7 @@ from test_bench import estimate
 from test_search_thresholds import HERE, LENS, QUERY, agreed, drained, state, verdict
 
 from service import localize as localizing
-from service.estimators import lens_check, search_state, view_index
+from service.estimators import ambiguity_check, lens_check, view_index
 from service.estimators.search_config import SEARCH
 from service.estimators.search_state import SearchState, StageOutcome, VerifiedPose
 from service.estimators.view_index import Options
@@ -365,9 +365,9 @@ def test_a_mirror_image_that_is_less_unlike_the_photo_is_told(
     names = ("gradients", "gradients_half", "colours", "colours_half", "local_colour_correlation")
     asked: list[tuple] = []
     pair = SimpleNamespace(verify=lambda pose: verdict(other), appearance_at=lambda pose: dict.fromkeys(names, 0.81))
-    monkeypatch.setattr(search_state, "mirror_image_of", lambda *_: pair)
-    monkeypatch.setattr(search_state, "prefers", lambda *_: False)
-    monkeypatch.setattr(search_state, "_search_mirrored", returns(refined() if found else None, asked))
+    monkeypatch.setattr(ambiguity_check, "mirror_image_of", lambda *_: pair)
+    monkeypatch.setattr(ambiguity_check, "prefers", lambda *_: False)
+    monkeypatch.setattr(ambiguity_check, "_search_mirrored", returns(refined() if found else None, asked))
 
     def checked(signal: float) -> tuple[list, bool]:
         searching = state()
@@ -376,7 +376,7 @@ def test_a_mirror_image_that_is_less_unlike_the_photo_is_told(
         given = replace(verdict(status), signals=dict.fromkeys(names, signal))
         searching.best = VerifiedPose(refined(0.03), given, ImageVariant(400, 3))
         searching.finished = finished
-        return drained(search_state.check_mirror(searching))
+        return drained(ambiguity_check.check_mirror(searching))
 
     records, is_mirrored = checked(0.8)
     assert is_mirrored is bool(mirrored)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from test_bench import estimate
 
-from service.estimators import search_state
+from service.estimators import ambiguity_check, search_state
 from service.estimators.search_config import SEARCH
 from service.estimators.search_state import SearchState, Stage, VerifiedPose
 from service.geometry import look_at, moved, pose_distance
@@ -477,8 +477,8 @@ def test_a_better_answer_replaces_the_best_and_a_doubt_that_is_conclusive_ends_t
 def test_an_ambiguous_hypothesis_may_leave_three_times_the_answers_residual(monkeypatch, loss: float) -> None:
     seen = []
     monkeypatch.setattr(
-        search_state, "refine_stage", lambda other, images, renderer, config, most: seen.append(most) or iter(())
+        ambiguity_check, "refine_stage", lambda other, images, renderer, config, most: seen.append(most) or iter(())
     )
     answer = VerifiedPose(SimpleNamespace(loss=loss, correction=None), verdict(), ImageVariant(416))  # type: ignore[arg-type]
-    records, refined = drained(search_state.refine_ambiguous(state(), agreed(30), answer))
+    records, refined = drained(ambiguity_check.refine_ambiguous(state(), agreed(30), answer))
     assert (records, refined, seen) == ([], None, [pytest.approx(3 * loss)])

@@ -16,18 +16,20 @@ from itertools import chain
 
 import numpy as np
 
+from service.estimators.ambiguity_check import (
+    hypotheses_of_photo,
+    mirror_image_of,
+    refine_ambiguous,
+    rendered_ahead,
+    seen_from,
+    twins_of,
+)
 from service.estimators.search_state import (
     SearchState,
     VerifiedPose,
     changed,
-    hypotheses_of_photo,
-    mirror_image_of,
     only_colours_doubt,
-    refine_ambiguous,
     refined_in_other_light,
-    rendered_ahead,
-    seen_from,
-    twins_of,
 )
 from service.pose.absolute_pose.pnp import AbsolutePose, estimate_absolute_pose
 from service.pose.features.image_sizes import scaled_px

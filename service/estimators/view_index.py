@@ -27,6 +27,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from service.errors import InvalidOptions
+from service.estimators.ambiguity_check import check_ambiguity, check_mirror
 from service.estimators.lens_check import check_lens
 from service.estimators.patch_stage import refine_by_patches
 from service.estimators.rivals import check_rivals
@@ -38,8 +39,6 @@ from service.estimators.search_state import (
     StageResult,
     VerifiedPose,
     changed,
-    check_ambiguity,
-    check_mirror,
     run_stage,
 )
 from service.estimators.shutter_check import check_shutter
