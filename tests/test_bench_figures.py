@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_bench import LENS, poses
+from test_gate_bench import sample as leveled
 
 from service.bench import (
     coverage,
@@ -32,6 +34,7 @@ from service.bench.pose_files import read_names, read_pose_file
 from service.bench.pose_metrics import Outcome, Units
 from service.errors import InvalidRequest, SceneNotFound
 from service.pose.verification.gate import VERIFICATION
+from service.pose.verification.gate_model import SHIPPED_MODEL
 from service.results import Status
 from service.scene_formats.gaussians import RawGaussians
 from service.types import SH_C0, GaussianScene, Intrinsics, SceneInfo
@@ -230,6 +233,20 @@ def test_a_reliability_diagram_has_a_row_for_each_tenth_that_occurs() -> None:
         [sample(right=right, tracked=tracked) for right, tracked in ((True, True), (True, False), (True, True),
                                                                      (False, True), (False, False), (False, False))]
     ) == {"right": 3, "right_localized": 2, "wrong": 3, "wrong_localized": 1}  # fmt: skip
+
+
+def test_tracked_poses_are_counted_apart_and_fitted_on_nowhere() -> None:
+    levels = [(True, 0.8 + 0.02 * k) for k in range(9)] + [(False, 0.03 * k) for k in range(7)]
+    samples = [leveled(scene, "moved", right, level) for scene in "ab" for right, level in levels]
+    tracked = [(True, True), (True, False), (True, True), (False, False), (False, True)]
+    both = samples + [replace(leveled("c", "tracked", right, 0.5), tracked=said) for right, said in tracked]
+    found, alone = gate_fit.summary(both, SHIPPED_MODEL), gate_fit.summary(samples, SHIPPED_MODEL)
+    assert found["tracked"] == {"right": 3, "right_localized": 2, "wrong": 2, "wrong_localized": 1}
+    assert alone["tracked"] == {"right": 0, "right_localized": 0, "wrong": 0, "wrong_localized": 0}
+    assert (found["photometric"], found["with_matches"]) == (alone["photometric"], alone["with_matches"])
+    assert (found["photometric"]["right"], found["photometric"]["wrong"]) == (18, 14)
+    model = gate_fit.fit_model(both, SHIPPED_MODEL, {"seed": 4})
+    assert model.fitted_on == {"seed": 4, "poses": 32, "right": 18, "doubted": 0}
 
 
 # ------------------------------------------------------------------ a fleet
