@@ -15,6 +15,7 @@ from service.geometry import se3_exp
 from service.localize import Cancelled, Request
 from service.pose.absolute_pose.rig_pose import RigMatches
 from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.retrieval.scene_symmetries import NO_REPETITIONS
 from service.rig import RIG, RigPhoto, _Hypothesis, _nearness, _scaled, _Search, _units_per_metre
 from service.types import Intrinsics, Pose
 
@@ -46,7 +47,8 @@ def search(*photos: RigPhoto, **request: Any) -> Any:
     found._photos, found._config, found._request = photos, RIG, Request(**request)
     found._images = [SimpleNamespace(matcher=None, features=lambda: None) for _ in photos]
     found._clock, found._records, found._report = SimpleNamespace(wall_s=1.0, cpu_s=1.0), [], lambda record: None
-    found._supported = None
+    found._supported, found._reach = None, 1.0
+    found._index = SimpleNamespace(repetitions=NO_REPETITIONS)
     return found
 
 

@@ -205,7 +205,10 @@ def test_a_route_without_a_body_gets_none(stepping):
     async def no_room(client, most, key) -> None:
         raise AssertionError("a job is queued")
 
-    asyncio.run(Limits(curious, settings(), no_room)(scope, receive, None))  # type: ignore[arg-type]
+    async def in_time(key, rate) -> None:
+        return None
+
+    asyncio.run(Limits(curious, settings(), no_room, in_time)(scope, receive, None))  # type: ignore[arg-type]
     assert seen == [b"", b"http.disconnect"]
 
 
