@@ -24,10 +24,10 @@ def fronts(request, tmp_path) -> Iterator[tuple[SharedState, SharedState]]:
     if request.param == "local":
         yield local, local
         return
+    address = request.getfixturevalue("postgres").database()  # which skips the test where there is none
     from service.jobs.postgres_database import PostgresDatabase
     from service.web.postgres_state import PostgresState
 
-    address = request.getfixturevalue("postgres").database()
     databases = [PostgresDatabase(address) for _ in range(2)]
     first, second = (PostgresState(database, local) for database in databases)
     yield first, second
