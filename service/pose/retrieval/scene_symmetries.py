@@ -40,8 +40,8 @@ class SymmetryConfig:
     """A larger scene is taken to repeat itself: examining it takes 10 ms a view, and more the more views there are."""
     every: int = 2
     """Of the views, every second one is compared with the others..."""
-    turned_of_many: int = 24
-    """...of a larger scene only so many, turned."""
+    max_turned: int = 24
+    """...of which at most so many are turned, too; of a larger scene only these are compared."""
     compared_px: int = 256
     """Long side of the render from where a view is seen elsewhere..."""
     compared_levels: int = 3
@@ -130,8 +130,13 @@ def _is_near(pose: Pose, other: Pose, distance: float, config: SymmetryConfig) -
 def is_examined(number: int, count: int, config: SymmetryConfig = SYMMETRY) -> bool:
     """Return whether the view of this number, of so many, is compared with the others."""
     # Repetition is mutual: of two views that look alike at least one is likely among them.
-    every = config.every if count <= config.max_views else -(-count // config.turned_of_many)
+    every = config.every if count <= config.max_views else -(-count // config.max_turned)
     return number % every == 0
+
+
+def _is_turned(number: int, count: int, config: SymmetryConfig) -> bool:
+    """Return whether an examined view is turned, too."""
+    return count > config.max_views or number % (config.every * -(-count // (config.every * config.max_turned))) == 0
 
 
 def find_repetitions(
@@ -149,21 +154,21 @@ def find_repetitions(
     """
     are_many = len(views) > config.max_views
 
-    def examined(view: View, images: QueryImages | None) -> tuple[list[np.ndarray], bool]:
+    def examined(number: int, view: View, images: QueryImages | None) -> tuple[list[np.ndarray], bool]:
         if images is None or len(view.points_in_world) == 0:
             return [], False
         # In a large scene a photo's own matches tell where it is seen as it is.
         upright = [] if are_many else _seen_from_elsewhere(view, view.features, views, matcher, AMBIGUITY, config)
         turned = [
             pose
-            for features in _turned(images, config)
+            for features in (_turned(images, config) if _is_turned(number, len(views), config) else ())
             for pose in _seen_from_elsewhere(view, features, views, matcher, ANYWHERE, config)
         ]
         alike = [_if_alike(images, pose, rasterizer, config) for pose in (*upright, *turned)]
         own = view.camera.pose.camera_from_world
         return [pose.world_from_camera @ own for pose in alike if pose], bool(upright)
 
-    found = list(pool.map(examined, views, pictures))
+    found = list(pool.map(examined, range(len(views)), views, pictures))
     motions = [(motion, _sample(view, config)) for view, (some, _) in zip(views, found, strict=True) for motion in some]
     repetitions = Repetitions.of([motion for motion, _ in motions], [part for _, part in motions])
     return repetitions, are_many or bool(motions) or any(is_repeated for _, is_repeated in found)
