@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 import uvicorn
+from axe_playwright_python.sync_playwright import Axe
 from fastapi import FastAPI
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
@@ -47,6 +48,15 @@ def opened(browser: Browser, address: str, width: int = 1100, height: int = 700)
     page.set_default_timeout(PATIENCE_MS)
     page.goto(address)
     return page
+
+
+def serious(page: Page) -> list[str]:
+    """Return what axe finds serious or critical. Headings and landmarks, which viser's page and Swagger UI's lack, are
+    moderate findings.
+    """
+    impacts = ("serious", "critical")
+    found = [rule for rule in Axe().run(page).response["violations"] if rule["impact"] in impacts]
+    return [f"{rule['id']}: {node['html'][:200]}" for rule in found for node in rule["nodes"]]
 
 
 @contextmanager

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
 from fake_service import FakeService, coverage_map, records
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
@@ -182,17 +181,6 @@ def test_the_3d_view_has_most_of_the_window(
         page.wait_for_timeout(500)
         assert not serious(page)
     page.close()
-
-
-def serious(page: Page) -> list[str]:
-    """Return what axe finds serious or critical. That viser's page has no heading and no landmarks is moderate."""
-    found = Axe().run(page).response["violations"]
-    return [
-        f"{rule['id']}: {node['html'][:200]}"
-        for rule in found
-        if rule["impact"] in ("serious", "critical")
-        for node in rule["nodes"]
-    ]
 
 
 def test_on_a_phone_the_panel_is_a_sheet_that_folds(browser: Browser, fake: FakeService, url: str) -> None:

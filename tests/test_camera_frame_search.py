@@ -192,7 +192,7 @@ def test_a_service_finds_it_by_itself_and_loads_the_scene_again(edited: Path) ->
     scenes.add(entry)
     scenes.start()
     try:
-        until = time.monotonic() + 200
+        until = time.monotonic() + 110
         while entry.loaded is None or entry.state != "ready":
             assert time.monotonic() < until
             time.sleep(0.02)

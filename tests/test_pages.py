@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
 from gateway import behind_nginx, free_port
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
@@ -330,21 +330,15 @@ def test_the_api_page_needs_no_other_server(page: Page, url: str) -> None:
     page.get_by_text("Post a photo to").wait_for()
     page.get_by_text("/localize", exact=True).first.wait_for()
     assert [address for address in asked if not address.startswith((f"{url}/", "data:", "blob:"))] == []
-    assert not _serious(page)  # Swagger UI's headings and landmarks are moderate findings
+    assert not serious(page)  # Swagger UI's headings and landmarks are moderate findings
     for path in ("/localize", "/scenes/{scene_id}/render"):
         operation = page.locator(".opblock").filter(has=page.get_by_text(path, exact=True))
         operation.locator(".opblock-summary-control").click()
         operation.get_by_role("button", name="Try it out").click()
         operation.get_by_role("button", name="Execute").wait_for()
-    assert not _serious(page)
+    assert not serious(page)
     page.get_by_role("link", name="Start page").click()
     page.get_by_role("radio").first.wait_for()
-
-
-def _serious(page: Page) -> list[str]:
-    found = Axe().run(page).response["violations"]
-    impacts = ("serious", "critical")
-    return [f"{rule['id']}: {at['html'][:200]}" for rule in found if rule["impact"] in impacts for at in rule["nodes"]]
 
 
 def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_path: Path) -> None:
