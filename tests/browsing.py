@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import httpx
 import pytest
 import uvicorn
 from axe_playwright_python.sync_playwright import Axe
@@ -25,6 +26,8 @@ FLAGS = [
     "--disable-component-update",
     "--disable-sync",
 ]
+HTTP = httpx.Client(trust_env=False, verify=False, limits=httpx.Limits(max_keepalive_connections=0))
+"""One client for all: each `httpx.get` reads the certificates again, for 30 ms in which the served app stands still."""
 PATIENCE_MS = 90_000
 """Software rendering on a busy machine: 20 s were seen for a first picture."""
 NEEDS_CHROMIUM = [

@@ -6,7 +6,6 @@ import io
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 from api_server import until
@@ -30,7 +29,7 @@ STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
 def url() -> Iterator[str]:
     port = free_port()
     with served(create_app(Settings(scenes=[STUDIO], port=port, cache_dir=None)), port) as url:
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         yield url
 
 
@@ -50,7 +49,7 @@ def test_a_photo_is_localized_and_seen_in_the_viewer(page: Page, url: str) -> No
     page.wait_for("document.querySelector('.badge.localized') !== null")
     page.wait_for("[...document.querySelectorAll('.stack img')].every(image => image.naturalWidth > 0)")
     job = page.tell("location.hash").rpartition("/")[2]
-    position = httpx.get(f"{url}/jobs/{job}", trust_env=False).json()["result"]["pose"]["position"]
+    position = HTTP.get(f"{url}/jobs/{job}").json()["result"]["pose"]["position"]
     shown = page.tell("document.querySelector('details.pose pre').textContent").split()
     assert np.allclose([float(shown[i]) for i in (3, 7, 11)], position, atol=1e-8)  # of the 4x4, row by row
     page.open(f"{url}/viewer/jobs/{job}/")

@@ -6,12 +6,11 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
 import numpy as np
 import pytest
 from api_server import until
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, launched, opened, served
+from browsing import HTTP, NEEDS_CHROMIUM, launched, opened, served
 from gateway import free_port
 from playwright.sync_api import Browser, Page, expect
 from small_room import FOCAL, pose_at, write_room
@@ -52,7 +51,7 @@ def film(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def url(scene: Path) -> Iterator[str]:
     port = free_port()
     with served(create_app(Settings(scenes=[scene], port=port, cache_dir=None, viewer=False)), port) as url:
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         yield url
 
 
@@ -99,7 +98,7 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
 def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path) -> None:
     port, settings = free_port(), {"scenes": [scene], "cache_dir": None, "viewer": False}
     with served(create_app(Settings(port=port, **settings)), port) as url:
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         page = opened(browser, f"{url}/live", 390, 844)
         page.get_by_role("button", name="Start camera").click()
         expect(page.locator(".verdict .badge")).to_have_text("Localized")

@@ -13,11 +13,10 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Literal
 
-import httpx
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from browsing import NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
+from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
 from gateway import behind_nginx, free_port
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect
@@ -46,7 +45,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     room = write_room(tmp_path_factory.mktemp("scenes") / "room")
     settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=None)
     with served(create_app(settings), port) as url:
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)  # kernels may be compiled
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)  # kernels may be compiled
         yield url
 
 
@@ -99,14 +98,12 @@ def drop_all(page: Page, files: dict[str, bytes], *, paste: bool = False) -> Non
 def posted(url: str, photo: bytes, fields: dict) -> dict:
     """Localize a photo by the API alone."""
     wait = {"Prefer": "wait=60"}
-    answer = httpx.post(
-        f"{url}/localize", files={"photo": photo}, data=fields, headers=wait, trust_env=False, timeout=90
-    )
+    answer = HTTP.post(f"{url}/localize", files={"photo": photo}, data=fields, headers=wait, timeout=90)
     return answer.json()
 
 
 def job_of(page: Page, url: str) -> dict:
-    return httpx.get(f"{url}/jobs/{page.url.rpartition('/')[2]}", trust_env=False).json()
+    return HTTP.get(f"{url}/jobs/{page.url.rpartition('/')[2]}").json()
 
 
 def written(page: Page, title: str) -> str:
@@ -148,7 +145,7 @@ def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
     assert np.linalg.norm(there[:3, 3] - truth_of(PHOTO)[:3, 3]) < 0.05
     # The lines for other programs say what the service's own files say.
     for title, kind, line in (("COLMAP", "colmap", 2), ("TUM", "tum", 0)):
-        theirs = httpx.get(f"{url}{job['links']['export']}/{kind}", trust_env=False).text.splitlines()[line].split()
+        theirs = HTTP.get(f"{url}{job['links']['export']}/{kind}").text.splitlines()[line].split()
         ours = written(page, title).split()
         words = slice(0, -1) if kind == "colmap" else slice(0, None)
         np.testing.assert_allclose(np.float64(ours[words]), np.float64(theirs[words]), atol=1e-6)
@@ -192,7 +189,7 @@ def test_the_answer_can_be_copied_and_taken_along(page: Page, url: str) -> None:
         with page.expect_download() as waited:
             page.get_by_role("link", name=link, exact=True).click()
         taken = json.loads(waited.value.path().read_text())
-        assert taken == httpx.get(f"{url}{job['links'][kind]}", trust_env=False).json()
+        assert taken == HTTP.get(f"{url}{job['links'][kind]}").json()
     with page.expect_download() as waited:
         page.get_by_role("link", name="nerfstudio", exact=True).click()
     opengl = json.loads(waited.value.path().read_text())["transform_matrix"]
@@ -226,7 +223,7 @@ def test_the_viewer_shows_how_the_pose_was_found(page: Page, url: str) -> None:
     page.set_viewport_size({"width": 900, "height": 620})
     pose = {"world_from_camera": pose_at(0.3, 0.1).world_from_camera.tolist()}
     wanted = {"pose": pose, "intrinsics": INTRINSICS, "format": "png"}
-    photo = httpx.post(f"{url}/scenes/room/render", json=wanted, trust_env=False).content
+    photo = HTTP.post(f"{url}/scenes/room/render", json=wanted).content
     fields = {"scene": "room", "intrinsics": json.dumps(INTRINSICS), "truth": json.dumps(pose)}
     job = posted(url, photo, fields)
     page.goto(f"{url}/#/jobs/{job['id']}")
@@ -357,7 +354,7 @@ def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_
     page.once("dialog", lambda dialog: dialog.accept())
     card.get_by_role("button", name="Delete").click()
     expect(card).to_have_count(0)
-    assert httpx.get(f"{url}/scenes/my_attic", trust_env=False).status_code == 404
+    assert HTTP.get(f"{url}/scenes/my_attic").status_code == 404
 
 
 def test_photos_that_are_dropped_with_a_scene_are_looked_for_in_it(page: Page, url: str, tmp_path: Path) -> None:
@@ -371,18 +368,18 @@ def test_photos_that_are_dropped_with_a_scene_are_looked_for_in_it(page: Page, u
         expect(rows.filter(has_text=name).locator(".badge")).to_have_text(re.compile("not localized|uncertain"))
     # Where the scene doesn't come, its photos stay where they are.
     page.get_by_role("link", name="Localize").click()
-    before = httpx.get(f"{url}/jobs", trust_env=False).json()["jobs"][0]["id"]
+    before = HTTP.get(f"{url}/jobs").json()["jobs"][0]["id"]
     drop_all(page, {"three.jpg": PHOTO.read_bytes(), "junk.ply": b"not a scene"})
     expect(page.get_by_role("alert")).to_contain_text("ply")
-    assert httpx.get(f"{url}/jobs", trust_env=False).json()["jobs"][0]["id"] == before
-    httpx.delete(f"{url}/scenes/cellar", trust_env=False)
+    assert HTTP.get(f"{url}/jobs").json()["jobs"][0]["id"] == before
+    HTTP.delete(f"{url}/scenes/cellar")
 
 
 def test_a_dropped_file_that_is_no_scene_is_refused(page: Page, url: str) -> None:
     page.get_by_role("radio").first.wait_for()
     drop(page, b"not a scene", "junk.ply")
     expect(page.get_by_role("alert")).to_contain_text("ply")
-    assert httpx.get(f"{url}/scenes/junk", trust_env=False).status_code == 404
+    assert HTTP.get(f"{url}/scenes/junk").status_code == 404
 
 
 def test_a_job_is_run_again_and_deleted_from_the_history(page: Page, url: str) -> None:
@@ -398,7 +395,7 @@ def test_a_job_is_run_again_and_deleted_from_the_history(page: Page, url: str) -
     page.once("dialog", lambda dialog: dialog.accept())
     row.get_by_role("button", name="Delete").click()
     expect(row).to_have_count(0)
-    assert httpx.get(f"{url}/jobs/{job['id']}", trust_env=False).status_code == 404
+    assert HTTP.get(f"{url}/jobs/{job['id']}").status_code == 404
 
 
 def test_a_pose_becomes_the_prior_of_the_next_photo(page: Page, url: str) -> None:
@@ -522,7 +519,7 @@ def test_keys_are_made_shown_once_and_revoked_by_admins(browser: Browser, tmp_pa
             expect(row).to_contain_text(told)
         made = next(known for known in read_keys(file) if known.name == "robot 7")
         assert abs((made.limits.expires or 0) - time.time() - 30 * 86_400) < 60
-        assert httpx.get(f"{url}/key", headers={"Authorization": f"Bearer {key}"}).json()["scenes"] == [
+        assert HTTP.get(f"{url}/key", headers={"Authorization": f"Bearer {key}"}).json()["scenes"] == [
             "lab",
             "floor-*",
         ]
@@ -616,7 +613,7 @@ def test_a_photo_for_any_scene_finds_its_own(page: Page, url: str) -> None:
 
 
 def test_a_photo_waits_for_its_scene(page: Page, url: str) -> None:
-    room = httpx.get(f"{url}/scenes/room", trust_env=False).json()
+    room = HTTP.get(f"{url}/scenes/room").json()
     loading, sent = room | {"state": "loading", "gaussians": None}, []
     page.route(f"{url}/scenes/room", lambda route: route.fulfill(json=loading))
     page.route(f"{url}/localize", lambda route: (sent.append(1), route.continue_()))
@@ -631,13 +628,13 @@ def test_a_photo_waits_for_its_scene(page: Page, url: str) -> None:
 
 def test_a_photo_for_a_scene_that_is_not_in_memory_loads_it(page: Page, url: str) -> None:
     page.get_by_role("radio", name="room").check()
-    httpx.post(f"{url}/scenes/room/unload", trust_env=False).raise_for_status()
-    until(lambda: httpx.get(f"{url}/scenes/room", trust_env=False).json()["state"] == "unloaded")
+    HTTP.post(f"{url}/scenes/room/unload").raise_for_status()
+    until(lambda: HTTP.get(f"{url}/scenes/room").json()["state"] == "unloaded")
     page.set_input_files("#photo", PHOTO)
     expect(page.locator(".sendbox")).to_contain_text("Waiting: the scene is loading")
     page.wait_for_url("**/#/jobs/*", timeout=2 * PATIENCE_MS)
     assert job_of(page, url)["scene"] == "room"
-    until(lambda: httpx.get(f"{url}/scenes/room", trust_env=False).json()["state"] == "ready", 200)
+    until(lambda: HTTP.get(f"{url}/scenes/room").json()["state"] == "ready", 200)
 
 
 def test_a_job_without_a_step_says_whether_it_waits_or_runs(page: Page, url: str) -> None:
@@ -674,7 +671,7 @@ def test_a_sequences_photo_is_the_one_of_the_shown_pose(page: Page, url: str) ->
     page.goto(f"{url}/#/jobs/{job['id']}")
     shown = page.locator(".stack .below").get_attribute("src") or ""
     assert shown != job["links"]["photo"]
-    assert httpx.get(f"{url}{shown}", trust_env=False).status_code == 200
+    assert HTTP.get(f"{url}{shown}").status_code == 200
 
 
 @pytest.mark.parametrize("nginx", [False, True], ids=["direct", "nginx"])
@@ -700,7 +697,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
     port = settings.port
     slow = {"estimator": "mc_do", "options": json.dumps({"hypotheses": 4096, "refinement_steps": 10000})}
     with served(create_app(settings), port):
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         context = browser.new_context(viewport={"width": 1000, "height": 700})
         page, viewer = context.new_page(), context.new_page()
         page.bring_to_front()
@@ -711,7 +708,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
         page.get_by_role("radio").wait_for()
         asked: dict = {"files": {"photo": PHOTO.read_bytes()}}
         asked |= {"headers": {"Authorization": f"Bearer {key}"}} if key else {}
-        job = httpx.post(f"{url}/localize", data=slow, trust_env=False, timeout=90, **asked).json()
+        job = HTTP.post(f"{url}/localize", data=slow, timeout=90, **asked).json()
         page.goto(f"{url}/#/jobs/{job['id']}")
         expect(page.locator(".line")).to_contain_text("step ")
         viewer.bring_to_front()
@@ -723,7 +720,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
     viewer.bring_to_front()
     expect(viewer.locator(".splatfix-lost")).to_contain_text("Reconnecting")
     with served(create_app(settings), port):
-        until(lambda: httpx.get(f"{url}/readyz", trust_env=False).status_code == 200, 240)
+        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         ready = time.monotonic()
         viewer.wait_for_function("!window.old", timeout=PATIENCE_MS)
         expect(viewer.locator(".splatfix-lost")).to_have_count(0)
@@ -826,12 +823,12 @@ def test_a_picked_point_is_named_shown_and_deleted(browser: Browser, url: str) -
     expect(page.locator(".anchors li")).to_contain_text("lamp 0.5, -0.25, 1")
     expect(page.locator("svg.plan text").filter(has_text="lamp")).to_have_count(1)
     expect(page.get_by_label("Name of the picked point")).to_have_count(0)
-    kept = httpx.get(f"{url}/scenes/room/anchors", trust_env=False).json()
+    kept = HTTP.get(f"{url}/scenes/room/anchors").json()
     assert kept == {"anchors": [{"name": "lamp", "position": [0.5, -0.25, 1.0]}]}
     assert _overflow(page) <= 0
     page.get_by_role("button", name="Delete lamp").click()
     expect(page.locator(".anchors li")).to_have_count(0)
-    assert httpx.get(f"{url}/scenes/room/anchors", trust_env=False).json() == {"anchors": []}
+    assert HTTP.get(f"{url}/scenes/room/anchors").json() == {"anchors": []}
     page.close()
 
 
@@ -842,7 +839,7 @@ def test_a_scene_is_registered_by_anchors_and_that_undone(browser: Browser, url:
     """With a length of 3 m between points that are 2 units apart; the same API takes coordinates and a floor."""
     places = {"left": [0, 0, 0], "right": [2, 0, 0], "far": [0, 2, 0]}
     for name, position in places.items():
-        httpx.put(f"{url}/scenes/room/anchors/{name}", json={"position": position}, trust_env=False).raise_for_status()
+        HTTP.put(f"{url}/scenes/room/anchors/{name}", json={"position": position}).raise_for_status()
     page = opened(browser, f"{url}/#/scenes/room")
     page.get_by_text("Not registered").wait_for()
     page.get_by_text("Register by anchors").click()
@@ -857,12 +854,12 @@ def test_a_scene_is_registered_by_anchors_and_that_undone(browser: Browser, url:
     _audit(page)
     page.get_by_role("button", name="Register").click()
     expect(page.get_by_text("Metres per unit")).to_be_visible()
-    found = httpx.get(f"{url}/scenes/room/registration", trust_env=False).json()
+    found = HTTP.get(f"{url}/scenes/room/registration").json()
     assert found["metres_per_unit"] == pytest.approx(1.5)
     page.get_by_role("button", name="Undo registration").click()
     page.get_by_text("Not registered").wait_for()
     for name in places:
-        httpx.delete(f"{url}/scenes/room/anchors/{name}", trust_env=False)
+        HTTP.delete(f"{url}/scenes/room/anchors/{name}")
     page.close()
 
 

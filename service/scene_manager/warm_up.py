@@ -11,29 +11,41 @@ from service.errors import InvalidPrior
 from service.geometry import look_at
 from service.loaded_scene import LoadedScene
 from service.localize import Request, localize
+from service.pose.retrieval.index import ViewIndex
 from service.types import Camera, Intrinsics, Query
 
+WARM_UP_PX = 512
 ENOUGH_RENDERS = 10
-"""Of a method that needs a prior: it begins at the answer, and more of the same would warm nothing."""
+"""Of each localization: a photo that is found takes about as many. More would warm nothing, and a scene that repeats
+itself would be searched for seconds in vain."""
 _log = logging.getLogger(__name__)
 
 
 def warm_up(loaded: LoadedScene, estimator: str) -> None:
     """Localize a render of the scene, so that the first photo meets compiled code and loaded networks."""
-    camera = overview(loaded, 512)
+    camera = _camera(loaded, estimator)
     frame = loaded.rasterizer.render([camera])[0]
     rgb = np.clip(np.rint(frame.rgb * 255), 0, 255).astype(np.uint8)
     # Estimated intrinsics have code of their own.
     for intrinsics in (camera.intrinsics, replace(camera.intrinsics, trust="approximate")):
         query = Query(rgb, intrinsics, "given", intrinsics)
         try:
-            estimate = localize(query, loaded, Request(estimator))
+            estimate = localize(query, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
         # Methods that only refine need a pose to start from.
         except InvalidPrior:
             begun = replace(query, prior=camera.pose)
             estimate = localize(begun, loaded, Request(estimator, budget_renders=ENOUGH_RENDERS))
         trust, status = intrinsics.trust, estimate.verdict.status
         _log.info("scene %s: warmed up, %s intrinsics: %s", loaded.scene.info.id, trust, status)
+
+
+def _camera(loaded: LoadedScene, estimator: str) -> Camera:
+    """Return the indexed view with the most features, from which a photo is found at once; else an overview."""
+    index = loaded.prepare(estimator)
+    if not isinstance(index, ViewIndex) or not index.views:
+        return overview(loaded, WARM_UP_PX)
+    camera = max(index.views, key=lambda view: len(view.points_in_world)).camera
+    return Camera(camera.intrinsics.with_long_side(WARM_UP_PX), camera.pose)
 
 
 def overview(loaded: LoadedScene, long_side: int) -> Camera:
