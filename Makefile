@@ -41,9 +41,12 @@ test-fleet: setup
 	$(BIN)/pytest -rs tests/test_fronts.py tests/test_shared_state.py tests/test_object_store.py tests/test_gateway.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
 		tests/test_bench_peer.py
 
-# All tests, and which lines they run in their own process.
+# All tests. Those of `make test` tell which lines they run in their own process; the others, among them live cameras
+# and other tests by the clock, run without a tracer and one a core.
 coverage: check
-	COVERAGE_FILE="$$(mktemp -d)/coverage" $(PYTEST) --cov --cov-report=term:skip-covered --cov-fail-under=92
+	COVERAGE_FILE="$$(mktemp -d)/coverage" $(PYTEST) -m "not browser and not ci" \
+		--cov --cov-report=term:skip-covered --cov-fail-under=92
+	$(BIN)/pytest -n 2 --dist loadfile -m "browser or ci"
 
 # Some of the tests with the newest versions that the ranges allow.
 newest: setup

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from api_server import until
-from browsing import served
+from browsing import HTTP, served
 from firefox import FIREFOX, XVFB, Page, firefox
 from gateway import free_port
 from PIL import Image

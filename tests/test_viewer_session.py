@@ -7,6 +7,7 @@ import logging
 import signal
 import sys
 import threading
+import weakref
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
@@ -304,6 +305,29 @@ def test_an_outage_is_logged_once_and_again_after_it_was_over(
         lists.close()
     said = [record.getMessage() for record in caplog.records if "list of jobs" in record.getMessage()]
     assert [text.partition(": ")[2] for text in said] == ["nobody answers", "another reason", "nobody answers"]
+
+
+def test_the_thread_ends_though_the_last_listener_goes_after_the_end() -> None:
+    """And lets go of whom it told: they held their browsers' widgets for as long as the viewer ran."""
+    client = Mock()
+    client.jobs.return_value = client.scenes.return_value = []
+    lists, told = ServiceLists(client), threading.Event()
+
+    def listener() -> None:
+        told.set()
+
+    lists.add_listener(listener)
+    before = set(threading.enumerate())
+    lists.start()
+    (thread,) = set(threading.enumerate()) - before
+    assert told.wait(20)
+    seen = weakref.ref(listener)
+    lists.close()
+    lists.remove_listener(listener)
+    del listener
+    thread.join(20)
+    assert not thread.is_alive()
+    until(lambda: seen() is None, "the end of the listener")
 
 
 def _raised(answer: Any) -> Any:

@@ -37,8 +37,9 @@ class ServiceLists:
 
     def close(self) -> None:
         """End the background thread at its next poll."""
-        self._closed.set()
-        self._has_listeners.set()
+        with self._lock:
+            self._closed.set()
+            self._has_listeners.set()
 
     def add_listener(self, listener: Listener) -> None:
         """Call `listener` on the background thread whenever one of the lists has changed, until `remove_listener`."""
@@ -50,7 +51,8 @@ class ServiceLists:
         """Remove a listener; without listeners polling pauses."""
         with self._lock:
             self._listeners.discard(listener)
-            if not self._listeners:
+            # The last listener may go after `close`, which the background thread must still notice.
+            if not self._listeners and not self._closed.is_set():
                 self._has_listeners.clear()
 
     def _lists(self) -> tuple[tuple[ListedJob, ...], tuple[str, ...]]:
@@ -71,8 +73,11 @@ class ServiceLists:
                 lists = self.jobs, self.scenes
             if lists != (self.jobs, self.scenes):
                 self.jobs, self.scenes = lists
-                with self._lock:
-                    listeners = tuple(self._listeners)
-                for listener in listeners:
-                    listener()
+                self._notify()
             self._closed.wait(_POLL_S)
+
+    def _notify(self) -> None:
+        with self._lock:
+            listeners = tuple(self._listeners)
+        for listener in listeners:
+            listener()
