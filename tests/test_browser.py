@@ -56,6 +56,11 @@ def test_an_open_page_loads_itself_anew_for_another_run_of_the_viewer(
     browser: Browser, fake: FakeService, url: str
 ) -> None:
     page = opened(browser, f"{url}/")
+    # viser's empty page is covered until the panel is there.
+    loading = page.get_by_role("status").filter(has_text="Loading the viewer")
+    loading.wait_for()
+    page.locator("[data-splatfix]").first.wait_for()
+    expect(loading).to_have_count(0)
     page.evaluate("window.old = true")
     for _ in range(2):  # asked twice, and the same answer
         page.wait_for_event("response", lambda response: response.url.endswith("/viewer-run"))

@@ -185,9 +185,9 @@ def test_a_frame_of_another_scene_does_not_count(edited: Path) -> None:
 
 
 @pytest.mark.ci
-def test_a_service_finds_it_by_itself_and_loads_the_scene_again(edited: Path) -> None:
+def test_a_service_finds_it_by_itself_and_loads_the_scene_again(edited: Path, tmp_path: Path) -> None:
     """The whole of it, with photos that are localized in the scene."""
-    scenes = Scenes(DEFAULT_ESTIMATOR, None, rasterizer="cpu")
+    scenes = Scenes(DEFAULT_ESTIMATOR, tmp_path / "cache", rasterizer="cpu")
     entry = Entry("edited", edited, required=True)
     scenes.add(entry)
     scenes.start()

@@ -83,10 +83,19 @@ function set(element, attribute, value) {
   if (value && element.getAttribute(attribute) !== value) element.setAttribute(attribute, value);
 }
 
+// Until the panel comes, viser shows an empty page with settings of its own.
+const cover = document.createElement("div");
+cover.setAttribute("role", "status");
+cover.textContent = "Loading the viewer…";
+cover.style.cssText = "position:fixed;inset:0;z-index:1900;display:grid;place-items:center;background:#1b1d20;" +
+  "color:#e6e8ea;font:16px/1.4 system-ui,sans-serif";
+document.documentElement.append(cover);
+
 let toName = 0;
 new MutationObserver(() => {
   toName ||= requestAnimationFrame(() => {
     toName = 0;
+    if (document.querySelector("[data-splatfix]")) cover.remove();
     for (const [selector, name] of Object.entries(NAMES)) document.querySelectorAll(selector).forEach(name);
   });
 }).observe(document.documentElement, { childList: true, subtree: true });
