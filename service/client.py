@@ -676,6 +676,10 @@ class Client:
         """Return a scene's coverage map as the API has it, or how far it is measured; `measure`: begin that."""
         return _document(self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
 
+    def cancel_coverage(self, scene_id: str) -> Json:
+        """End the measurement of a scene's coverage map, if one runs; return how far it is."""
+        return _document(self._send("DELETE", f"/scenes/{scene_id}/coverage"))
+
     def anchors(self, scene_id: str) -> dict[str, np.ndarray]:
         """Return the positions of a scene's named points in its world, by name; results have their pixels."""
         return _anchors(self._json(f"/scenes/{scene_id}/anchors"))
@@ -872,6 +876,9 @@ class AsyncClient:
 
     async def coverage(self, scene_id: str, *, measure: bool = False) -> Json:
         return _document(await self._send("POST" if measure else "GET", f"/scenes/{scene_id}/coverage"))
+
+    async def cancel_coverage(self, scene_id: str) -> Json:
+        return _document(await self._send("DELETE", f"/scenes/{scene_id}/coverage"))
 
     async def anchors(self, scene_id: str) -> dict[str, np.ndarray]:
         return _anchors(await self._json(f"/scenes/{scene_id}/anchors"))

@@ -180,6 +180,9 @@ class SubprocessEngine:
     def measure_coverage(self, scene_id: str) -> CoverageStatus:
         return self._ask("measure_coverage", scene_id)
 
+    def cancel_coverage(self, scene_id: str) -> CoverageStatus:
+        return self._ask("cancel_coverage", scene_id)
+
     # ------------------------------------------------------------------ the pipe
 
     def _ask(self, name: str, *arguments: Any, on_record: OnRecord | None = None) -> Any:

@@ -216,6 +216,7 @@ PLACED = {"pose": {"world_from_camera": TURNED.world_from_camera.tolist()}}
         ("delete_scene", ("s",), {}, ("DELETE", "/scenes/s", b"")),
         ("coverage", ("s",), {}, ("GET", "/scenes/s/coverage", b"")),
         ("coverage", ("s",), {"measure": True}, ("POST", "/scenes/s/coverage", b"")),
+        ("cancel_coverage", ("s",), {}, ("DELETE", "/scenes/s/coverage", b"")),
         ("anchors", ("s",), {}, ("GET", "/scenes/s/anchors", b"")),
         ("put_anchor", ("s", "a b/c", (1, 2, 3)), {},
          ("PUT", "/scenes/s/anchors/a%20b%2Fc", {"position": [1.0, 2.0, 3.0]})),
@@ -269,7 +270,7 @@ def documents() -> dict[str, object]:
         **dict.fromkeys(("job", "cancel"), job), "jobs": {"jobs": [job]}, "trace": {"iterations": []},
         **dict.fromkeys(("photo", "step_render", "render", "splats", "export"), b"bytes"),
         **dict.fromkeys(("scene", "load_scene", "unload_scene"), scene), "scenes": {"scenes": [scene]},
-        "coverage": {"state": "none"}, "anchors": {"anchors": [{"name": "door", "position": [1, 2, 3]}]},
+        **dict.fromkeys(("coverage", "cancel_coverage"), {"state": "none"}), "anchors": {"anchors": [{"name": "door", "position": [1, 2, 3]}]},
         **dict.fromkeys(("put_anchor", "delete_anchor", "delete_scene"), b""), "depth": depth.getvalue(),
     }  # fmt: skip
 

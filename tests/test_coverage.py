@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
@@ -333,8 +334,11 @@ def test_the_api_measures_in_the_background_and_tells_what_went_wrong(monkeypatc
 
     def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         assert how.progress
+        time.sleep(0.3)
         how.progress(3, 10)
-        assert go_on.wait(30)
+        until(lambda: go_on.is_set() or how.cancel.is_set(), 30)
+        if how.cancel.is_set():
+            raise Cancelled
         return replace(plan_of([trial(True, 1.0)]), scene_sha256=loaded.scene.info.sha256)
 
     monkeypatch.setattr("service.scene_manager.scene_coverage.measured_coverage", measured)
@@ -345,12 +349,20 @@ def test_the_api_measures_in_the_background_and_tells_what_went_wrong(monkeypatc
     (folder / "truth.json").write_text("{}")
     app = create_app(settings(scenes=[folder], cache_dir=None), {"room": make_scene()})
     with serving(app) as client:
-        path = "/scenes/room/coverage"
-        assert client.get(path).json() == {"state": "none", "done": 0, "total": 0, "map": None, "error": None}
+        path, counts = "/scenes/room/coverage", {"done": 0, "total": 0, "remaining_s": None}
+        assert client.get(path).json() == {"state": "none", "map": None, "error": None} | counts
         assert client.post(path).status_code == 202
         until(lambda: client.get(path).json()["done"] == 3, 30)
         assert client.post(path).json()["total"] == 10  # the same measurement
+        # 3 of 10 took 0.3 s and a little: 7 more take 0.7 s.
+        assert 0.7 <= client.get(path).json()["remaining_s"] < 7
         assert client.get("/scenes/room").json()["jobs"] == 1  # it keeps the scene in memory
+        assert client.delete(path).status_code == 200
+        until(lambda: client.get(path).json() == {"state": "none", "map": None, "error": None} | counts, 30)
+        until(lambda: client.get("/scenes/room").json()["jobs"] == 0, 30)
+        assert client.delete(path).json()["state"] == "none"  # nothing is measured
+        assert client.delete("/scenes/none/coverage").status_code == 404
+        assert client.post(path).status_code == 202
         go_on.set()
         until(lambda: client.get(path).json()["state"] == "ready", 30)
         answer = client.get(path).json()["map"]

@@ -227,6 +227,9 @@ class EmbeddedEngine:
     def measure_coverage(self, scene_id: str) -> CoverageStatus:
         return self._coverages.measure(scene_id)
 
+    def cancel_coverage(self, scene_id: str) -> CoverageStatus:
+        return self._coverages.cancel(scene_id)
+
 
 def run_task(
     task: LocalizeTask,

@@ -208,3 +208,7 @@ class Engine(Protocol):
     def measure_coverage(self, scene_id: str) -> CoverageStatus:
         """Begin to measure a scene's coverage map, unless that is under way. Raises SceneError."""
         ...
+
+    def cancel_coverage(self, scene_id: str) -> CoverageStatus:
+        """End the measurement of a scene's coverage map, if there is one. Raises SceneNotFound."""
+        ...

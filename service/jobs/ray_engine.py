@@ -244,6 +244,11 @@ class RayEngine:
     def measure_coverage(self, scene_id: str) -> CoverageStatus:
         return self._ask_replica(scene_id, "measure_coverage", scene_id)
 
+    def cancel_coverage(self, scene_id: str) -> CoverageStatus:
+        if not self._is_there(scene_id):
+            return CoverageStatus("none")
+        return self._ask_replica(scene_id, "cancel_coverage", scene_id)
+
     # ------------------------------------------------------------------ calls
 
     def _ask(self, name: str, *arguments: Any) -> Any:

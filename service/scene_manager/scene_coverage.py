@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -28,6 +29,7 @@ class _Run:
 
     sha256: str
     status: CoverageStatus = field(default_factory=lambda: CoverageStatus("running"))
+    cancel: threading.Event = field(default_factory=threading.Event)
 
 
 class SceneCoverages:
@@ -37,13 +39,14 @@ class SceneCoverages:
         self._scenes = scenes
         self._runs: dict[str, _Run] = {}
         self._read: dict[Path, CoverageMap | None] = {}
-        self._lock, self._stop = threading.Lock(), threading.Event()
+        self._lock = threading.Lock()
         # One thread: a measurement has all cores by itself.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="coverages")
 
     def close(self) -> None:
         """End the measurements, between two photos."""
-        self._stop.set()
+        for run in list(self._runs.values()):
+            run.cancel.set()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def of(self, scene_id: str) -> CoverageStatus:
@@ -72,21 +75,37 @@ class SceneCoverages:
             self._pool.submit(self._work, scene_id, run, loaded)
             return run.status
 
+    def cancel(self, scene_id: str) -> CoverageStatus:
+        """End the measurement of a scene's map, if one waits or runs, between two photos; a map that was stored before
+        stays. Raises SceneNotFound."""
+        self._scenes.entry(scene_id)
+        run = self._runs.get(scene_id)
+        if run is not None:
+            run.cancel.set()
+        return self.of(scene_id)
+
     def _work(self, scene_id: str, run: _Run, loaded: LoadedScene) -> None:
+        began = time.monotonic()
+
         def progress(done: int, total: int) -> None:
-            run.status = CoverageStatus("running", done, total)
+            # Of the trials alone: what comes before them is done once.
+            run.status = CoverageStatus("running", done, total, (time.monotonic() - began) * (total / done - 1))
 
         try:
+            if run.cancel.is_set():
+                raise Cancelled
             path = self._scenes.entry(scene_id).path
             held_out = held_out_photos(path) if path else []
-            found = measured_coverage(loaded, Measurement(held_out, progress, self._stop))
+            found = measured_coverage(loaded, Measurement(held_out, progress, run.cancel))
             file = self._file(loaded, held_out)
             if file:
                 write_coverage(found, file)
                 self._read[file] = found
             run.status = CoverageStatus("ready", found=found)
         except Cancelled:
-            run.status = CoverageStatus("none")
+            # Without it `of` answers with the stored map, if there is one.
+            with self._lock:
+                del self._runs[scene_id]
         except Exception as error:  # one bad scene must not take the others with it
             unexpected = not isinstance(error, SplatfixError)
             _log.error("no coverage map of scene %s: %s", scene_id, error, exc_info=unexpected)

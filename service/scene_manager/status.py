@@ -113,9 +113,11 @@ class CoverageStatus:
 
     state: Literal["none", "running", "ready", "failed"]
     done: int = 0
-    """Photos that were localized."""
+    """Renders and held-out photos that were tried."""
     total: int = 0
     """Of so many; 0 while the measurement waits or begins."""
+    remaining_s: float | None = None
+    """Estimated wall time until it ends; None: not known."""
     found: CoverageMap | None = None
     failure: Failure | None = None
     """Why there is none."""

@@ -26,3 +26,11 @@ def get_coverage(scene_id: str, app_state: AppStateOf, root: RootOf) -> Coverage
 def measure_coverage(scene_id: str, app_state: AppStateOf, root: RootOf) -> CoverageOut:
     """Measure the scene's coverage map anew, in the background, on all cores: a minute or more."""
     return coverage_status_out(app_state.engine.measure_coverage(scene_id), f"{root}/scenes/{scene_id}/coverage")
+
+
+@router.delete("/scenes/{scene_id}/coverage", tags=["scenes"], responses=errors("scene_not_found", body=True))
+@route_policy(role="admin", body=SMALL_BODY, rate_limited=True)
+def cancel_coverage(scene_id: str, app_state: AppStateOf, root: RootOf) -> CoverageOut:
+    """End the measurement of the scene's coverage map, if one waits or runs: within the photos that are being tried. A
+    map that was measured before stays."""
+    return coverage_status_out(app_state.engine.cancel_coverage(scene_id), f"{root}/scenes/{scene_id}/coverage")

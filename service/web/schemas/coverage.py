@@ -70,8 +70,10 @@ class CoverageOut(Model):
 
     state: Literal["none", "running", "ready", "failed"]
     done: int
-    """Photos that were localized so far, of `total`."""
+    """Test renders and held-out photos that were tried so far, of `total`."""
     total: int
+    remaining_s: float | None
+    """Estimated time until the measurement ends; null: not known, or none runs."""
     map: CoverageMapOut | None
     error: Problem | None
     """Why it could not be measured."""
@@ -81,7 +83,14 @@ def coverage_status_out(status: CoverageStatus, instance: str) -> CoverageOut:
     """Convert a map's state."""
     error = status.failure and problem_of_failure(status.failure, instance)
     found = status.found and coverage_out(status.found)
-    return CoverageOut(state=status.state, done=status.done, total=status.total, map=found, error=error)
+    return CoverageOut(
+        state=status.state,
+        done=status.done,
+        total=status.total,
+        remaining_s=status.remaining_s,
+        map=found,
+        error=error,
+    )
 
 
 def coverage_out(found: CoverageMap) -> CoverageMapOut:

@@ -11,6 +11,7 @@ _JOB = ("get_job", "cancel_job", "job_events", "job_photo", "job_trace", "job_re
 _SCENE = (
     *("get_scene", "scene_thumbnail", "scene_splats", "render_scene", "load_scene", "unload_scene", "delete_scene"),
     *("get_registration", "register_scene", "undo_registration", "get_coverage", "measure_coverage"),
+    "cancel_coverage",
     *("list_anchors", "put_anchor", "delete_anchor"),
 )
 
