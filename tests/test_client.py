@@ -270,7 +270,8 @@ def documents() -> dict[str, object]:
         **dict.fromkeys(("job", "cancel"), job), "jobs": {"jobs": [job]}, "trace": {"iterations": []},
         **dict.fromkeys(("photo", "step_render", "render", "splats", "export"), b"bytes"),
         **dict.fromkeys(("scene", "load_scene", "unload_scene"), scene), "scenes": {"scenes": [scene]},
-        **dict.fromkeys(("coverage", "cancel_coverage"), {"state": "none"}), "anchors": {"anchors": [{"name": "door", "position": [1, 2, 3]}]},
+        "coverage": {"state": "none"}, "cancel_coverage": {"state": "none"},
+        "anchors": {"anchors": [{"name": "door", "position": [1, 2, 3]}]},
         **dict.fromkeys(("put_anchor", "delete_anchor", "delete_scene"), b""), "depth": depth.getvalue(),
     }  # fmt: skip
 
