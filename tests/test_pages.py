@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext
+from csv import DictReader
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +20,7 @@ from axe_playwright_python.sync_playwright import Axe
 from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
 from gateway import behind_nginx, free_port
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 from small_room import INTRINSICS, pose_at, write_room
 
 from service.coverage.calibration import Calibration
@@ -37,6 +38,8 @@ from service.web.settings import Settings
 pytestmark = NEEDS_CHROMIUM
 STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
 PHOTO = STUDIO / "photos" / "photo_00.jpg"
+FOG = Image.linear_gradient("L").resize((320, 240)).convert("RGB")
+"""A photo that shows nothing."""
 
 
 @pytest.fixture(scope="module")
@@ -102,6 +105,12 @@ def posted(url: str, photo: bytes, fields: dict) -> dict:
     return answer.json()
 
 
+def jpeg(image: Image.Image) -> bytes:
+    file = io.BytesIO()
+    image.save(file, "JPEG")
+    return file.getvalue()
+
+
 def job_of(page: Page, url: str) -> dict:
     return HTTP.get(f"{url}/jobs/{page.url.rpartition('/')[2]}").json()
 
@@ -154,9 +163,7 @@ def test_a_dropped_photo_gets_its_pose(page: Page, url: str) -> None:
 
 def test_a_pasted_photo_that_shows_nothing_is_refused_with_reason_and_hint(page: Page, url: str) -> None:
     page.get_by_role("radio").first.wait_for()
-    fog = io.BytesIO()
-    Image.linear_gradient("L").resize((320, 240)).convert("RGB").save(fog, "JPEG")
-    drop(page, fog.getvalue(), "fog.jpg", paste=True)
+    drop(page, jpeg(FOG), "fog.jpg", paste=True)
     page.locator(".badge.not_localized").wait_for()
     result = job_of(page, url)["result"]
     lead = page.locator(".lead")
@@ -347,7 +354,7 @@ def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_
     card.get_by_role("button", name="Unload").click()
     expect(card).to_contain_text("Unloaded")
     card.get_by_role("button", name="Load", exact=False).click()
-    expect(card).to_contain_text("Gaussians")
+    expect(card).to_contain_text("MB in memory")
     _audit(page)
     # The operator's own scenes can't be deleted.
     expect(page.get_by_role("button", name="Delete")).to_have_count(1)
@@ -357,12 +364,23 @@ def test_a_scene_is_added_unloaded_loaded_and_deleted(page: Page, url: str, tmp_
     assert HTTP.get(f"{url}/scenes/my_attic").status_code == 404
 
 
+NAMES_OF_BOX = """() => {
+    window.told = "";
+    new MutationObserver(() => { window.told += document.querySelector(".sendbox")?.innerText ?? ""; })
+        .observe(document.querySelector("#main"), { childList: true, subtree: true });
+}"""
+"""Keep what an upload's box says, however short it is shown."""
+
+
 def test_photos_that_are_dropped_with_a_scene_are_looked_for_in_it(page: Page, url: str, tmp_path: Path) -> None:
     page.get_by_role("radio", name="Studio").check()
     scene = next(write_room(tmp_path / "room").glob("*.ply")).read_bytes()
     other = (STUDIO / "photos" / "photo_01.jpg").read_bytes()
+    expect(page.locator(".drop")).to_contain_text("HEIC")
+    page.evaluate(NAMES_OF_BOX)
     drop_all(page, {"one.jpg": PHOTO.read_bytes(), "cellar.ply": scene, "two.jpg": other})
     rows = page.locator("tbody tr")
+    assert "2 photos wait for this scene: one.jpg, two.jpg" in page.evaluate("window.told")
     for name in ("one.jpg", "two.jpg"):
         expect(rows.filter(has_text=name)).to_contain_text("cellar")
         expect(rows.filter(has_text=name).locator(".badge")).to_have_text(re.compile("not localized|uncertain"))
@@ -563,19 +581,36 @@ def test_a_key_is_offered_what_it_may_do(browser: Browser, tmp_path: Path, role:
 def test_several_photos_get_a_table_that_is_exported(page: Page, url: str) -> None:
     page.get_by_role("radio", name="Studio").check()
     photos = sorted((STUDIO / "photos").glob("*.jpg"))[:3]
-    drop_all(page, {p.name: p.read_bytes() for p in photos} | {"notes.jpg": b"not a photo"})
+    drop_all(page, {p.name: p.read_bytes() for p in photos} | {"fog.jpg": jpeg(FOG), "notes.jpg": b"not a photo"})
+    expect(page.get_by_role("progressbar")).to_have_attribute("max", "5")
     expect(page.locator("tbody .badge.localized")).to_have_count(3)
     row = page.get_by_role("row").filter(has_text="notes.jpg")
     expect(row).to_contain_text("photo")  # why it was refused
-    expect(page.get_by_role("status").first).to_contain_text("3 of 4 photos localized.")
+    row = page.get_by_role("row").filter(has_text="fog.jpg")
+    expect(row.locator("summary")).to_be_visible()
+    expect(row.get_by_role("cell").nth(5)).to_have_text("–")  # no best guess as its position
+    expect(page.get_by_role("status").first).to_contain_text("3 of 5 photos localized.")
+    expect(page.get_by_role("progressbar")).to_be_hidden()
     expect(page.locator(".maps a")).to_have_count(3)
-    page.get_by_label("Order").select_option("worst")
-    expect(page.locator("tbody tr").first).to_contain_text("notes.jpg")
-    page.get_by_label("Order").select_option("")
+    expect(page.get_by_role("link", name="History")).to_have_attribute("aria-current", "page")
+    expect(page.get_by_role("link", name="Plan and coverage")).to_have_attribute("href", "#/scenes/studio")
+    page.set_viewport_size({"width": 1280, "height": 800})
+    table = page.locator(".scroll")
+    assert table.evaluate("box => box.scrollWidth <= box.clientWidth")
+    expect(page.get_by_role("button", name="COLMAP images.txt: 3 localized")).to_be_enabled()
     _audit(page)
     csv, images, cameras = (_saved(page, name) for name in ("CSV", "COLMAP images.txt", "COLMAP cameras.txt"))
     frames = json.loads(_saved(page, "nerfstudio"))["frames"]
-    assert len(csv.splitlines()) == 4
+    assert len(csv.splitlines()) == 5
+    lines = {values["photo"]: values for values in DictReader(io.StringIO(csv))}
+    assert not any(lines["fog.jpg"][name] for name in ("x", "y", "z", "qw", "qx", "qy", "qz"))
+    for photo in photos:
+        values, truth = lines[photo.name], truth_of(photo)
+        assert np.linalg.norm([float(values[k]) - truth[i, 3] for i, k in enumerate("xyz")]) < 0.05
+        # world_from_camera, the quaternion's scalar first
+        turned = rotation_from_quat(np.array([float(values[f"q{k}"]) for k in "wxyz"]))
+        assert np.trace(turned.T @ truth[:3, :3]) > 1 + 2 * np.cos(0.02)
+        assert max(len(values[k].lstrip("-0.").replace(".", "")) for k in ("x", "y", "z", "score")) <= 9
     posed = [line.split() for line in images.splitlines() if line and not line.startswith("#")]
     assert [line[-1] for line in posed] == [p.name for p in photos]
     assert len(cameras.splitlines()) == 4
@@ -585,10 +620,66 @@ def test_several_photos_get_a_table_that_is_exported(page: Page, url: str) -> No
         assert np.linalg.norm(there - truth[:3, 3]) < 0.05
         quaternion, translation = np.float64(line[1:5]), np.float64(line[5:8])
         np.testing.assert_allclose(-rotation_from_quat(quaternion).T @ translation, there, atol=1e-6)
-    page.reload()  # the jobs stand in the address
-    expect(page.locator("tbody .badge.localized")).to_have_count(3)
+    page.get_by_label("Order").select_option("worst")
+    expect(page.locator("tbody tr").first).to_contain_text("notes.jpg")
+    _opened_again(page, url)
     page.get_by_label("Outcome").select_option("uncertain")
     expect(page.locator("tbody tr")).to_have_count(0)
+
+
+def _opened_again(page: Page, url: str) -> None:
+    """Load the table of four jobs anew, with the service's answers held back at first; then leave it and come back."""
+    held: list[Route] = []
+    page.route(f"{url}/jobs/*", lambda route: held.append(route))
+    page.reload()  # the jobs and their order stand in the address
+    expect(page.locator("tbody .badge.loading")).to_have_count(4)
+    expect(page.get_by_role("status").first).to_have_text("Loading 4 photos…")
+    expect(page.get_by_role("button", name="CSV")).to_be_disabled()
+    until(lambda: page.evaluate("true") and len(held) == 4)  # all at once
+    page.unroute(f"{url}/jobs/*")  # which lets them go on
+    expect(page.locator("tbody .badge.localized")).to_have_count(3)
+    expect(page.locator("tbody tr").first).to_contain_text("fog.jpg")
+    page.locator("tbody a").first.click()
+    page.locator(".verdict").wait_for()
+    for here in ("Localize", "History"):
+        page.get_by_role("link", name="Back to the 4 photos").or_(
+            page.get_by_role("link", name="4 photos in studio")
+        ).click()
+        expect(page.locator("tbody tr").first).to_contain_text("fog.jpg")
+        page.get_by_role("navigation").get_by_role("link", name=here).click()
+    page.get_by_role("link", name="4 photos in studio").click()
+    page.locator("tbody").get_by_role("link", name="viewer").first.click()
+    page.get_by_role("link", name="Back to the 4 photos").click()
+    expect(page.locator("tbody .badge.localized")).to_have_count(3)
+
+
+def test_the_rest_of_a_batch_is_cancelled_while_its_scene_is_prepared(page: Page, url: str) -> None:
+    """The service's answers are altered: its scenes are ready long since."""
+    scenes = HTTP.get(f"{url}/scenes").json()
+    for scene in scenes["scenes"]:
+        scene["state"] = "preparing"
+    job = posted(url, PHOTO.read_bytes(), {"scene": "studio"}) | {"result": None, "finished": None}
+    jobs, cancelled = (
+        {name: job | {"id": name, "state": state} for name, state in (("a", "running"), ("b", "queued"))},
+        [],
+    )
+
+    def answer(route: Route) -> None:
+        name = route.request.url.rpartition("/")[2]
+        if route.request.method == "DELETE":
+            cancelled.append(name)
+            jobs[name] |= {"state": "cancelled"}
+        route.fulfill(json=jobs[name])
+
+    page.route(f"{url}/scenes", lambda route: route.fulfill(json=scenes))
+    page.route(re.compile("/jobs/[ab]$"), answer)
+    page.goto(f"{url}/#/batch/a,b")
+    expect(page.locator("tbody tr").first.locator(".badge")).to_have_text("preparing the scene")
+    expect(page.locator("tbody tr").last.locator(".badge")).to_have_text("queued")
+    expect(page.get_by_role("status").first).to_contain_text("Preparing the scene")
+    page.get_by_role("button", name="Cancel the rest").click()
+    expect(page.locator("tbody .badge.cancelled")).to_have_count(2)
+    assert sorted(cancelled) == ["a", "b"]
 
 
 def _saved(page: Page, name: str) -> str:

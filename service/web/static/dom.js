@@ -51,8 +51,8 @@ export function degrees(value) {
 /** A length of the scene, in metres where the scene has a scale. */
 export function length(value, metresPerUnit) {
   if (value === null || value === undefined) return "–";
-  const scaled = value * (metresPerUnit ?? 1);
-  return `${Number(scaled.toPrecision(3))} ${metresPerUnit ? "m" : "units"}`;
+  const shown = Number((value * (metresPerUnit ?? 1)).toPrecision(3));
+  return `${shown} ${metresPerUnit ? "m" : shown === 1 ? "unit" : "units"}`;
 }
 
 export function when(iso) {

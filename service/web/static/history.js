@@ -1,10 +1,12 @@
 // All jobs, newest first, with filters; two of them can be compared.
 
 import { ENDED, service } from "./service.js";
+import { batchList } from "./batches.js";
 import { badge, h, say, seconds, when } from "./dom.js";
 import { repeat } from "./repeat.js";
 
 const PAGE = 30;
+const BATCHES = 5;
 const FILTERS = {
   outcome: [["", "any outcome"], ["status=localized", "localized"], ["status=uncertain", "uncertain"],
     ["status=not_localized", "not localized"], ["state=failed", "failed"], ["state=cancelled", "cancelled"],
@@ -49,7 +51,7 @@ export function show(main) {
   service.ask("capabilities").then(({ estimators }) => estimator.append(
     ...estimators.filter(e => e.available).map(e => h("option", { value: e.name }, e.name))), () => {});
 
-  main.append(h("h1", {}, "History"),
+  main.append(h("h1", {}, "History"), batchList(BATCHES) ?? "",
     h("div", { class: "filters" }, outcome, scene, estimator, compare),
     h("div", { class: "scroll", tabIndex: 0, role: "region", "aria-label": "Jobs" }, h("table", { class: "jobs" },
       h("thead", {}, h("tr", {}, ["", "Photo", "Outcome", "Score", "Scene", "Estimator", "Duration", "Created", "3D", "Actions"]

@@ -1,6 +1,7 @@
 // One job: its progress while it runs, then its answer.
 
 import { ENDED, service } from "./service.js";
+import { backLine } from "./batches.js";
 import { h, say, seconds, sentence, words } from "./dom.js";
 import { result } from "./result.js";
 import { recalled } from "./sent.js";
@@ -46,7 +47,7 @@ function progress(view, job) {
     cancel.disabled = true;
     await service.cancel(job.id).catch(error => { trouble.hidden = false; trouble.textContent = error.message; });
   });
-  view.main.replaceChildren(h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
+  view.main.replaceChildren(backLine(job.id) ?? "", h("h1", {}, `Localizing ${job.photo.name || "a photo"}`), trouble,
     h("div", { class: "progress" }, preview(job), h("div", {}, bar, line, stages,
       h("p", { class: "buttons" }, h("a", { class: "button primary", href: job.links.viewer }, "Watch in viewer"), cancel))));
 
@@ -108,6 +109,7 @@ function described(state) {
     return `${sentence(latest.stage)}, step ${latest.index + 1}, ${seconds(elapsed(state))}${eta}`;
   }
   if (scene && ["loading", "unloaded"].includes(scene.state)) return `Queued: the scene is ${scene.state}`;
+  if (scene?.state === "preparing") return "Preparing the scene";
   return job.state === "running" ? "Running" : "Queued";
 }
 

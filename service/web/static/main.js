@@ -20,6 +20,8 @@ const ROUTES = [
   [/^#\/compare\/([\w-]+)\/([\w-]+)$/, compare.show],
   [/^/, start.show],
 ];
+// The menu's entry for each of them.
+const MENU = [[/^#\/keys?$/, "#/keys"], [/^#\/(batch|jobs|compare)\b/, "#/jobs"], [/^/, "#/"]];
 const main = document.querySelector("#main");
 const drophint = document.querySelector("#drophint");
 let leave = null;
@@ -30,8 +32,9 @@ function route() {
   const [pattern, show] = ROUTES.find(([pattern]) => pattern.test(hash));
   main.replaceChildren();
   leave = show(main, ...pattern.exec(hash).slice(1), query) ?? null;
+  const entry = MENU.find(([pattern]) => pattern.test(hash))[1];
   for (const link of document.querySelectorAll("header nav a")) {
-    const here = link.getAttribute("href") === (hash || "#/");
+    const here = link.getAttribute("href") === entry;
     here ? link.setAttribute("aria-current", "page") : link.removeAttribute("aria-current");
   }
   window.scrollTo(0, 0);

@@ -61,9 +61,9 @@ export function drawnPoses(job) {
 
 /**
  * Draw a plan. `map`: a coverage map or null; `cameras`, `jobs` (each with `matrix`, `title`, `href`, `status`) and
- * `anchors` (each with `position`, `name`).
+ * `anchors` (each with `position`, `name`). `size`: of the longer side in pixels, as it is shown: texts are drawn for it.
  */
-export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit }) {
+export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, size = SIZE }) {
   const cells = (map?.cells ?? []).map(cell => ({ ...pointInPlan(axes, cell.position), cell }));
   const views = cameras.map(matrix => inPlan(axes, matrix));
   const found = jobs.map(job => ({ ...inPlan(axes, job.matrix), job }));
@@ -73,11 +73,11 @@ export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit }) {
   const reach = (map?.cell ?? 0) * 0.75;
   const bounds = ["x", "y"].map(k => [Math.min(...all.map(p => p[k])) - reach, Math.max(...all.map(p => p[k])) + reach]);
   const extent = Math.max(...bounds.map(([low, high]) => high - low), 1e-6);
-  const scale = (SIZE - 2 * MARGIN) / extent;
+  const scale = (size - 2 * MARGIN) / extent;
   const height = (bounds[1][1] - bounds[1][0]) * scale + 2 * MARGIN + 30;
   const width = (bounds[0][1] - bounds[0][0]) * scale + 2 * MARGIN;
   const px = p => [MARGIN + (p.x - bounds[0][0]) * scale, MARGIN + (bounds[1][1] - p.y) * scale];
-  const ray = 0.03 * (SIZE - 2 * MARGIN);
+  const ray = 0.03 * (size - 2 * MARGIN);
   return svg("svg", { viewBox: `0 0 ${Math.max(width, 260).toFixed(1)} ${height.toFixed(1)}`, class: "plan", role: found.length ? "group" : "img", "aria-label": "Plan of the scene" },
     svg("g", { class: "cells" }, cells.map(c => star(px(c), 0.46 * map.cell * scale, map.headings_deg, c.cell.probabilities))),
     svg("g", { class: "cameras" }, views.map(v => arrow(px(v), v, 0.7 * ray))),

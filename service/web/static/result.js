@@ -1,6 +1,7 @@
 // The answer of an ended job: photo and render blended, the pose in every convention, why, and what to export.
 
 import { asksForKey, service } from "./service.js";
+import { backLine } from "./batches.js";
 import { blend, blendSlider } from "./blend.js";
 import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
 import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
@@ -12,6 +13,7 @@ import { told } from "./start.js";
 export function result(job, scene) {
   const answer = job.result;
   return [
+    backLine(job.id) ?? "",
     h("h1", { class: "verdict" }, badge(answer?.status ?? job.state), " ", h("span", {}, job.photo.name || "photo")),
     ...verdict(job),
     h("div", { class: "columns" },

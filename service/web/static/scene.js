@@ -2,7 +2,7 @@
 
 import { service } from "./service.js";
 import { degrees, facts, h, length, say, words } from "./dom.js";
-import { drawnPoses, drawPlan, LEVELS, planAxes } from "./plan.js";
+import { drawnPoses, drawPlan, level, LEVELS, planAxes } from "./plan.js";
 import { RegistrationPart } from "./registration.js";
 
 const POLL_MS = 1000;
@@ -103,15 +103,16 @@ async function jobsOf(id) {
 function draw(state) {
   const { scene, axes, coverage, jobs } = state;
   const map = coverage?.map ?? null;
+  const cameras = scene.training_cameras.map(camera => camera.world_from_camera);
   const picture = drawPlan({
-    axes, map, jobs, cameras: scene.training_cameras.map(camera => camera.world_from_camera),
+    axes, map, jobs, cameras,
     anchors: state.point ? [...state.anchors, { name: "the picked point", position: state.point }] : state.anchors,
     metresPerUnit: scene.metres_per_unit,
   });
   state.plan.replaceChildren(picture ?? h("p", { class: "note" }, "No cameras, no jobs and no coverage map yet: there is nothing to draw."));
   if (state.aside.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;  // who types
   state.registration.setAnchors(state.anchors);
-  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, jobs, state.anchors), state.registration.element);
+  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, cameras, jobs, state.anchors), state.registration.element);
 }
 
 function coverageParts(state, map) {
@@ -151,13 +152,16 @@ async function measure(state, button) {
   }
 }
 
-function legend(map, jobs, anchors) {
+/** What the plan draws, and nothing else. */
+function legend(map, cameras, jobs, anchors) {
+  const drawn = new Set(map?.cells.flatMap(cell => cell.probabilities.map(level)));
   const row = (kind, text) => h("li", {}, h("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
   const statuses = ["localized", "uncertain"].filter(status => jobs.some(job => job.status === status));
   return h("ul", { class: "legend", "aria-label": "Legend" },
-    map ? [...LEVELS.map(([, kind, text]) => row(kind, text)), row("blind", "nothing of the scene in view")] : [],
-    row("camera", "training camera"), anchors.length ? row("anchor", "anchor") : [], statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
-    h("li", { class: "quiet" }, "Seen from above; each wedge and line points where its camera looks."));
+    LEVELS.filter(([, kind]) => drawn.has(kind)).map(([, kind, text]) => row(kind, text)),
+    drawn.has("blind") ? row("blind", "nothing of the scene in view") : [],
+    cameras.length ? row("camera", "training camera") : [], anchors.length ? row("anchor", "anchor") : [], statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
+    h("li", { class: "quiet" }, `Seen from above; each ${map ? "wedge and line" : "line"} points where its camera looks.`));
 }
 
 function percent(share) {

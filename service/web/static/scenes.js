@@ -5,6 +5,7 @@ import { service } from "./service.js";
 
 export const ANY = "auto";
 const POLL_MS = 1000;
+const NAMED = 5;  // of the photos that wait
 const BUSY = ["loading", "preparing", "unloading"];
 const SCENE_FILE = /\.(ply|ply\.gz|splat|ksplat|spz|sog|glb|gltf|zip|pt|ckpt)$/i;
 
@@ -77,7 +78,7 @@ export class SceneList {
     const picture = loaded
       ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
       : h("span", { class: "nopicture" });
-    const facts = loaded ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)}` : "";
+    const facts = loaded ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)} in memory` : "";
     const busy = BUSY.includes(scene.state);
     return h("div", { class: "card" },
       h("label", {}, radio, picture, h("span", { class: "name" }, scene.name),
@@ -124,8 +125,8 @@ export class SceneList {
       h("span", { class: "quiet" }, "A scene file, or a ZIP of a scene folder. You can also drop it on this page."));
   }
 
-  /** Upload a scene under its file's name, and choose it; tell whether it came. */
-  async upload(file) {
+  /** Upload a scene under its file's name, and choose it; tell whether it came. `waiting`: photos that are sent then. */
+  async upload(file, waiting = []) {
     const id = file.name.replace(/(\.compressed)?\.(ply\.gz|[^.]*)$/i, "").replaceAll(/[^\w-]+/g, "_").replace(/^[_-]+/, "").slice(0, 64) || "scene";
     const abort = new AbortController();
     const bar = h("progress", { max: 1, "aria-label": "Upload" });
@@ -133,7 +134,7 @@ export class SceneList {
     const cancel = h("button", { type: "button" }, "Cancel");
     cancel.addEventListener("click", () => abort.abort());
     const box = h("section", { class: "sendbox", "aria-label": "Upload of a scene" },
-      h("p", {}, h("strong", {}, file.name), " ", line), bar, h("p", { class: "buttons" }, cancel));
+      h("p", {}, h("strong", {}, file.name), " ", line), bar, waitingLine(waiting), h("p", { class: "buttons" }, cancel));
     this.element.before(box);
     const onProgress = share => {
       line.textContent = share < 1 ? `Uploading, ${Math.round(100 * share)} % of ${bytes(file.size)}` : "Checking the file…";
@@ -152,6 +153,14 @@ export class SceneList {
       this.poll();
     }
   }
+}
+
+/** The photos that are sent once their scene is there. */
+function waitingLine(photos) {
+  if (!photos.length) return null;
+  const names = photos.slice(0, NAMED).map(photo => photo.name || "photo").join(", ");
+  const more = photos.length > NAMED ? ` and ${photos.length - NAMED} more` : "";
+  return h("p", { class: "quiet" }, `${photos.length === 1 ? "A photo waits" : `${photos.length} photos wait`} for this scene: ${names}${more}`);
 }
 
 function anyCard(chosen, choose) {

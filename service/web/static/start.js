@@ -2,6 +2,7 @@
 
 import { service } from "./service.js";
 import * as batch from "./batch.js";
+import { batchList } from "./batches.js";
 import { h, say } from "./dom.js";
 import { viewOf } from "./example.js";
 import { OptionsForm } from "./options.js";
@@ -27,7 +28,7 @@ export function show(main, query) {
   main.append(
     h("h1", {}, "Where was this photo taken?"),
     h("p", { class: "lead" }, "splatfix finds the camera's pose of a photo inside a 3D Gaussian Splatting scene."),
-    alertLine, priorLine(), picker(example),
+    alertLine, priorLine(), picker(example), batchList(1) ?? "",
     h("p", { class: "note readers" }, "Your key shows results. To localize photos, sign in with a key of the role “localize”."),
     list.element, more(),
   );
@@ -56,7 +57,7 @@ export async function submit(files, known = {}) {
   const scenes = files.filter(isScene);
   if (scenes.length) {
     files = files.filter(file => !isScene(file));
-    if (!await addScenes(scenes) || !files.length) return;  // photos go to the scene that came with them, or nowhere
+    if (!await addScenes(scenes, files) || !files.length) return;  // photos go to the scene that came with them, or nowhere
   }
   const fields = { ...(chosen.prior && { prior: chosen.prior.value }), ...(chosen.form ? chosen.form.fields() : {}), ...known };
   const scene = chosen.scene ?? await onlyScene();
@@ -77,12 +78,12 @@ export async function submit(files, known = {}) {
 }
 
 /** Upload scenes one after the other, which the first view shows, and choose the last; tell whether all came. */
-async function addScenes(files) {
+async function addScenes(files, waiting) {
   if (!list) {
     location.hash = "#/";
     await new Promise(resolve => addEventListener("hashchange", resolve, { once: true }));  // after which it is shown
   }
-  for (const file of files) if (!await list?.upload(file)) return false;
+  for (const file of files) if (!await list?.upload(file, waiting)) return false;
   return true;
 }
 
@@ -144,10 +145,12 @@ function picker(example) {
     });
   }
   return h("div", { class: "drop", "data-needs": "localize" },
-    h("p", {}, h("strong", {}, "Drop photos or a video here"), ", paste, or"),
+    h("p", {}, h("strong", {}, "Drop photos", h("span", { "data-needs": "admin" }, ", a scene file"), " or a video here"), ", paste, or"),
     h("div", { class: "buttons" },
       pick, h("label", { for: "photo", class: "button primary" }, "Choose photos"),
-      ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : []), example));
+      ...(hasCamera ? [shoot, h("label", { for: "shoot", class: "button" }, "Take a photo")] : []), example),
+    h("p", { class: "quiet formats" }, "Photos: JPEG, PNG, WebP, HEIC. Video: MP4, MOV, WebM, Matroska, AVI.", h("span", { "data-needs": "admin" },
+      " Scene: PLY, SPZ, SOG, SPLAT, KSPLAT, GLB, a checkpoint (PT, CKPT), a ZIP of a scene folder; alone, or together with photos of it.")));
 }
 
 function more() {

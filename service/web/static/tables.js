@@ -1,20 +1,25 @@
 // The poses of many jobs in one file: CSV, COLMAP's text model, nerfstudio's transforms.json.
 
+const DIGITS = 9;  // a micrometre in a kilometre
 const POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"];
 
-/** A row for each job; the pose is world_from_camera in OpenCV axes, in scene units. */
+/**
+ * A row for each job; the pose is world_from_camera in OpenCV axes, in scene units, its quaternion's scalar first. It is
+ * empty of photos that are not localized, so that nobody takes a best guess for a position.
+ */
 export function csvTable(jobs) {
   const head = ["photo", "job", "scene", "status", "reason", "score", ...POSE, "inliers"];
   const rows = jobs.map(({ id, photo, scene, result }) => {
     const { translation, quaternion_wxyz } = result.pose.world_from_camera;
-    return [photo.name, id, scene, result.status, result.reason, result.score, ...translation, ...quaternion_wxyz, result.inliers];
+    const pose = result.status === "not_localized" ? POSE.map(() => "") : [...translation, ...quaternion_wxyz];
+    return [photo.name, id, scene, result.status, result.reason, result.score, ...pose, result.inliers];
   });
   return [head, ...rows].map(cells => `${cells.map(quoted).join(",")}\r\n`).join("");
 }
 
 function quoted(value) {
   // A name that begins like a formula would be run by a spreadsheet.
-  const text = typeof value === "string" ? value.replace(/^[=+\-@]/, "'$&") : String(value);
+  const text = typeof value === "string" ? value.replace(/^[=+\-@]/, "'$&") : String(Number(value.toPrecision(DIGITS)));
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 

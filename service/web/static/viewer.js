@@ -108,8 +108,24 @@ styles.textContent = `
 @media (max-width: 36em) {
   [style^="width: 20em"], [style*=" width: 20em"] { width: 100vw !important; }
   [style*=" width: 20em"] { max-height: 42dvh !important; border-radius: 14px 14px 0 0 !important; }
-}`;
+  .splatfix-back { inset: .6em .6em auto auto !important; }
+}
+.splatfix-back { position: fixed; inset: auto auto .6em .6em; z-index: 1000; padding: .4em .8em; border-radius: 8px;
+  background: #1f2226; color: #f0953f; font: 15px/1.4 system-ui, sans-serif; }`;
 document.head.append(styles);
+
+// A job that was sent with others has a way back to their table.
+const [, job] = location.pathname.match(/\/jobs\/([\w-]+)/) ?? [];
+if (job) import(new URL("ui/batches.js", root)).then(({ backFrom }) => {
+  const back = backFrom(job);
+  if (!back) return;
+  const link = document.createElement("a");
+  link.href = "#";
+  link.textContent = back.text;
+  link.className = "splatfix-back";
+  link.dataset.splatfix = `./${back.page}`;
+  document.body.append(link);
+});
 
 const bar = document.createElement("div");
 bar.setAttribute("role", "alert");
