@@ -28,6 +28,7 @@ from service.coverage.coverage_map import CoverageMap, Trial
 from service.coverage.measurement import Measurement
 from service.geometry import look_at, rotation_from_quat
 from service.loaded_scene import LoadedScene
+from service.localize import Cancelled
 from service.results import Status
 from service.types import Pose
 from service.web.api_keys import KeyRing
@@ -851,19 +852,22 @@ def _overflow(page: Page) -> int:
 
 
 def test_a_scenes_coverage_is_measured_and_drawn(browser: Browser, url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a map that is known: the left one of two places is found in all directions, the right one in none."""
+    """With a map that is known: one of two places is found in all directions, the other in none. The map's plan is
+    turned by 180 degrees against that of the scene's cameras."""
     go_on = threading.Event()
 
     def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         assert how.progress
         how.progress(3, 10)
-        assert go_on.wait(60)
+        while not go_on.wait(0.05):
+            if how.cancel.is_set():
+                raise Cancelled
         places = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
         cameras = [(x, level_at(x, 90 * k)) for k in range(4) for x in (0, 20)]
         trials = [Trial(pose, Status.LOCALIZED, x == 0, 0.1, 0.01, 0.1) for x, pose in cameras]
         shape = np.ones((2, 4), bool)
         return CoverageMap(
-            loaded.scene.info.sha256, np.eye(3), 0.5, places, np.arange(4) * np.pi / 2, shape, shape * 0.1,
+            loaded.scene.info.sha256, np.diag([-1.0, -1, 1]), 0.5, places, np.arange(4) * np.pi / 2, shape, shape * 0.1,
             tuple(trials * 9), (), Calibration(), 1.0,
         )  # fmt: skip
 
@@ -876,13 +880,17 @@ def test_a_scenes_coverage_is_measured_and_drawn(browser: Browser, url: str, mon
         if scheme == "light":
             expect(page.get_by_text("Not measured yet")).to_be_visible()
             page.get_by_role("button", name="Measure coverage").click()
-            expect(page.get_by_text("3 of 10 photos")).to_be_visible()
+            expect(page.get_by_text("3 of 10 test renders")).to_contain_text("s left")
+            page.get_by_role("button", name="Cancel").click()
+            page.get_by_role("button", name="Measure coverage").click()
+            expect(page.get_by_text("3 of 10 test renders")).to_be_visible()
             go_on.set()
         expect(page.get_by_text("upper bound: not calibrated")).to_be_visible()
         assert page.locator("path.cell").count() == 8
         assert page.locator("path.cell.sure").count() == page.locator("path.cell.rare").count() == 4
         places = [box_of(page, kind)["x"] for kind in ("sure", "rare")]
-        assert places[0] < places[1]
+        assert places[0] > places[1]
+        expect(page.locator("image.ground")).to_have_attribute("href", re.compile("^data:image/png"))
         assert page.locator("line.camera").count() == 24
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         _audit(page)

@@ -78,7 +78,7 @@ def test_the_legend_has_the_words_and_bounds_of_the_drawing() -> None:
     assert "upper bound" in text
     for _, _, words in LEVELS:
         assert words in text
-    assert "3 of 10 photos" in coverage_html(answered(CoverageStatus("running", 3, 10)))
+    assert "3 of 10 test renders" in coverage_html(answered(CoverageStatus("running", 3, 10)))
     assert "not measured yet" in coverage_html(answered(CoverageStatus("none")))
 
 

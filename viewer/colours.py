@@ -27,10 +27,10 @@ INITIAL_COLOUR: RGB = (150, 150, 150)
 CURRENT_COLOUR: RGB = (255, 140, 0)
 TRUTH_COLOUR: RGB = (240, 240, 240)
 COVERAGE_LEVELS: tuple[tuple[float, RGB, str], ...] = (
-    (0.9, (253, 231, 37), "found: 90 % and more"),
-    (0.7, (94, 201, 98), "usually found: 70 to 90 %"),
-    (0.4, (33, 145, 140), "sometimes found: 40 to 70 %"),
-    (0.0, (85, 110, 180), "rarely found: below 40 %"),
+    (0.9, (47, 134, 224), "found: 90 % and more"),
+    (0.7, (168, 212, 245), "usually found: 70 to 90 %"),
+    (0.4, (242, 180, 92), "sometimes found: 40 to 70 %"),
+    (0.0, (212, 90, 23), "rarely found: below 40 %"),
 )
 """Of the coverage map: least probability, colour, words."""
 BLIND_COLOUR: RGB = (90, 90, 90)

@@ -179,7 +179,7 @@ def coverage_html(answer: CoverageAnswer) -> str:
         rows = "".join(f"<div style='white-space:nowrap'>{_swatch(ground)}{words}</div>" for ground, words in levels)
         return _small(f"<b>{escape(answer.found.title)}</b>{rows}each ray points where the camera looks")
     if answer.state == "running":
-        return _small(f"coverage: {answer.done} of {answer.total or '…'} photos are localized")
+        return _small(f"coverage: {answer.done} of {answer.total or '…'} test renders and held-out photos tried")
     if answer.problem:
         return _small(f"coverage could not be measured: {escape(answer.problem)}")
     return _small("coverage is not measured yet: measure it on the scene's page (start page, “Plan and coverage”)")

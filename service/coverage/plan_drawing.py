@@ -12,12 +12,12 @@ from service.coverage.coverage_map import CoverageMap
 from service.photos.images import encode_image
 
 LEVELS: tuple[tuple[float, tuple[int, int, int], str], ...] = (
-    (0.9, (253, 231, 37), "found: 90 % and more"),
-    (0.7, (94, 201, 98), "usually found: 70 to 90 %"),
-    (0.4, (33, 145, 140), "sometimes found: 40 to 70 %"),
-    (0.0, (59, 82, 139), "rarely found: below 40 %"),
+    (0.9, (8, 81, 156), "found: 90 % and more"),
+    (0.7, (74, 152, 207), "usually found: 70 to 90 %"),
+    (0.4, (214, 124, 16), "sometimes found: 40 to 70 %"),
+    (0.0, (166, 60, 6), "rarely found: below 40 %"),
 )
-"""Least probability, colour (sRGB, of the viridis scale: told apart also by lightness), words."""
+"""Least probability, colour (sRGB, from blue to orange: told apart also by those who don't see red or green), words."""
 _PX, _MARGIN, _LEGEND = 900, 40, 200
 _BLIND, _CAMERA, _INK, _PAPER = (205, 205, 205), (190, 40, 40), (30, 30, 30), (255, 255, 255)
 

@@ -343,6 +343,17 @@ export class Client {
     return this.ask(`${scenePath(id)}/coverage`, { method: measure ? "POST" : "GET" });
   }
 
+  /**
+   * The most important Gaussians of a scene, in the binary form of `GET /scenes/{id}/splats`.
+   * @param {string} id
+   * @param {number} max
+   * @returns {Promise<ArrayBuffer>}
+   */
+  async splats(id, max) { return (await this.send(`${scenePath(id)}/splats?max=${max}`)).arrayBuffer(); }
+
+  /** End the measurement of a scene's coverage map; for which the key has the role admin. @param {string} id */
+  cancelCoverage(id) { return this.ask(`${scenePath(id)}/coverage`, { method: "DELETE" }); }
+
   /** The named points of a scene. @param {string} id @returns {Promise<Anchor[]>} */
   async anchors(id) { return (await this.ask(`${scenePath(id)}/anchors`)).anchors; }
 

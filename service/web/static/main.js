@@ -16,7 +16,7 @@ const ROUTES = [
   [/^#\/batch\/([\w,-]*)$/, batch.show],
   [/^#\/jobs$/, history.show],
   [/^#\/jobs\/([\w-]+)$/, job.show],
-  [/^#\/scenes\/([\w%-]+)$/, scene.show],
+  [/^#\/scenes\/([^/]+)$/, scene.show],
   [/^#\/compare\/([\w-]+)\/([\w-]+)$/, compare.show],
   [/^/, start.show],
 ];

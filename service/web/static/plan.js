@@ -61,30 +61,39 @@ export function drawnPoses(job) {
 
 /**
  * Draw a plan. `map`: a coverage map or null; `cameras`, `jobs` (each with `matrix`, `title`, `href`, `status`) and
- * `anchors` (each with `position`, `name`). `size`: of the longer side in pixels, as it is shown: texts are drawn for it.
+ * `anchors` (each with `position`, `name`); `ground`: a PlanGround to draw beneath, or null; `size`: of the longer side
+ * in pixels, as it is shown: texts are drawn for it.
  */
-export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, size = SIZE }) {
+export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, ground = null, size = SIZE }) {
   const cells = (map?.cells ?? []).map(cell => ({ ...pointInPlan(axes, cell.position), cell }));
   const views = cameras.map(matrix => inPlan(axes, matrix));
   const found = jobs.map(job => ({ ...inPlan(axes, job.matrix), job }));
   const points = anchors.map(anchor => ({ ...pointInPlan(axes, anchor.position), anchor }));
-  const all = [...cells, ...views, ...found, ...points];
+  let all = [...cells, ...views, ...found, ...points];
+  if (!cells.length && !views.length && ground) all = [...all, ...ground.corners];
   if (!all.length) return null;
   const reach = (map?.cell ?? 0) * 0.75;
   const bounds = ["x", "y"].map(k => [Math.min(...all.map(p => p[k])) - reach, Math.max(...all.map(p => p[k])) + reach]);
   const extent = Math.max(...bounds.map(([low, high]) => high - low), 1e-6);
   const scale = (size - 2 * MARGIN) / extent;
-  const height = (bounds[1][1] - bounds[1][0]) * scale + 2 * MARGIN + 30;
   const width = (bounds[0][1] - bounds[0][0]) * scale + 2 * MARGIN;
+  const shown = (bounds[1][1] - bounds[1][0]) * scale + 2 * MARGIN, height = shown + 30;
+  const eye = median([...(map?.cells ?? []).map(cell => dot(axes[2], cell.position)), ...cameras.map(m => dot(axes[2], m.map(row => row[3])))]);
+  const framed = bounds.map(([low, high]) => [low - MARGIN / scale, high + MARGIN / scale]);
   const px = p => [MARGIN + (p.x - bounds[0][0]) * scale, MARGIN + (bounds[1][1] - p.y) * scale];
   const ray = 0.03 * (size - 2 * MARGIN);
   return svg("svg", { viewBox: `0 0 ${Math.max(width, 260).toFixed(1)} ${height.toFixed(1)}`, class: "plan", role: found.length ? "group" : "img", "aria-label": "Plan of the scene" },
+    ground ? svg("image", { class: "ground", width, height: shown, href: ground.picture(framed, width, eye) }) : null,
     svg("g", { class: "cells" }, cells.map(c => star(px(c), 0.46 * map.cell * scale, map.headings_deg, c.cell.probabilities))),
     svg("g", { class: "cameras" }, views.map(v => arrow(px(v), v, 0.7 * ray))),
     svg("g", { class: "jobs" }, found.map(f => svg("a", { href: f.job.href },
       svg("title", {}, f.job.title), arrow(px(f), f, 1.4 * ray, `job ${f.job.status}`), disc(px(f), 5, `job ${f.job.status}`)))),
     svg("g", { class: "anchors" }, points.map(p => [disc(px(p), 4, "anchor"), label(px(p), p.anchor.name)])),
     scaleBar(scale, height - 14, metresPerUnit));
+}
+
+function median(values) {
+  return values.length ? values.toSorted((a, b) => a - b)[Math.floor(values.length / 2)] : null;
 }
 
 function star([x, y], radius, headings, probabilities) {

@@ -3,15 +3,17 @@
 import { service } from "./service.js";
 import { degrees, facts, h, length, say, words } from "./dom.js";
 import { drawnPoses, drawPlan, level, LEVELS, planAxes } from "./plan.js";
+import { PlanGround } from "./plan_ground.js";
 import { RegistrationPart } from "./registration.js";
 
 const POLL_MS = 1000;
+const LASTS = "about a minute on two cores, longer while photos are localized";
 const JOBS = 100;
 
 export function show(main, id, query) {
   const plan = h("div", { class: "planbox" });
   const aside = h("div");
-  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], anchors: [], coverage: null, point: pointOf(query), stopped: false, timer: 0 };
+  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], anchors: [], coverage: null, ground: null, point: pointOf(query), stopped: false, timer: 0 };
   document.title = "scene – splatfix";
   const title = h("h1", {}, state.id);
   main.append(title, h("div", { class: "columns" }, plan, aside));
@@ -31,11 +33,25 @@ async function begin(state, title) {
     return;
   }
   state.scene = scene;
-  state.axes = planAxes(scene);
   state.registration = new RegistrationPart(state.id);
   await refresh(state);
+  showGround(state).catch(() => {});  // the plan can be read without it
   [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), service.anchors(state.id)]);
   draw(state);
+}
+
+/** The plan's axes: the map's own, where there is one: without cameras the scene's may be turned against it. */
+function axesOf({ scene, coverage }) {
+  return coverage?.map?.plan_from_world ?? planAxes(scene);
+}
+
+/** Draw the Gaussians beneath the plan, again when the axes are others. */
+async function showGround(state) {
+  const axes = axesOf(state), key = String(axes);
+  if (state.groundKey === key) return;
+  state.groundKey = key;
+  state.ground = await PlanGround.of(service, state.id, axes);
+  if (!state.stopped) draw(state);
 }
 
 /** The point of `?point=x,y,z`, as the viewer's link has it; null: none. */
@@ -86,7 +102,10 @@ async function refresh(state) {
   const before = state.coverage?.state;
   state.coverage = await service.coverage(state.id);
   if (state.stopped) return;
-  if (before === "running" && state.coverage.state === "ready") say("The coverage map is ready");
+  if (before === "running" && state.coverage.state === "ready") {
+    say("The coverage map is ready");
+    showGround(state).catch(() => {});
+  }
   draw(state);
   if (state.coverage.state !== "running") return;
   state.timer = setTimeout(() => refresh(state).catch(error => state.aside.replaceChildren(trouble(error))), POLL_MS);
@@ -101,11 +120,11 @@ async function jobsOf(id) {
 }
 
 function draw(state) {
-  const { scene, axes, coverage, jobs } = state;
+  const { scene, coverage, jobs, ground } = state;
   const map = coverage?.map ?? null;
   const cameras = scene.training_cameras.map(camera => camera.world_from_camera);
   const picture = drawPlan({
-    axes, map, jobs, cameras,
+    axes: axesOf(state), map, jobs, ground, cameras,
     anchors: state.point ? [...state.anchors, { name: "the picked point", position: state.point }] : state.anchors,
     metresPerUnit: scene.metres_per_unit,
   });
@@ -118,8 +137,10 @@ function draw(state) {
 function coverageParts(state, map) {
   const { coverage, scene } = state;
   const running = coverage.state === "running";
-  const button = h("button", { type: "button", disabled: running, "data-needs": "admin" }, map ? "Measure again" : "Measure coverage");
-  button.addEventListener("click", () => measure(state, button));
+  const button = running
+    ? h("button", { type: "button", "data-needs": "admin" }, "Cancel")
+    : h("button", { type: "button", "data-needs": "admin" }, map ? "Measure again" : "Measure coverage");
+  button.addEventListener("click", () => (running ? cancel : measure)(state, button));
   const parts = [h("h2", {}, "Where photos are found")];
   if (map) {
     parts.push(h("p", {}, h("strong", {}, map.title)), facts([
@@ -128,17 +149,43 @@ function coverageParts(state, map) {
       ["median rotation error", degrees(map.median_rotation_deg)],
       ["median position error", length(map.median_position_units, scene.metres_per_unit)],
       ["Brier score", map.brier === null ? null : map.brier.toFixed(3)],
-    ]));
+    ]), ...reading(map));
   } else if (!running) {
-    parts.push(h("p", {}, "Not measured yet. The service localizes renders that are degraded as photos are, all over the scene; photos take longer meanwhile."));
+    parts.push(h("p", {}, `Not measured yet. The service tries test renders, degraded as photos are, all over the scene: ${LASTS}.`));
   }
   if (running) {
     const total = coverage.total || null;
-    parts.push(h("p", { role: "status" }, total ? `${coverage.done} of ${total} photos are localized` : "Preparing…"),
+    parts.push(h("p", { role: "status" }, total ? `${coverage.done} of ${total} test renders and held-out photos tried${left(coverage.remaining_s)}` : `Preparing; then ${LASTS}`),
       h("progress", { "aria-label": "Measuring coverage", max: total ?? 1, ...(total ? { value: coverage.done } : {}) }));
   }
   if (coverage.error) parts.push(trouble({ message: `${coverage.error.detail} ${coverage.error.hint}` }));
   return [...parts, h("p", { class: "buttons" }, button)];
+}
+
+/** How a map is read. */
+function reading(map) {
+  const evenly = "The average counts places and headings that are spread evenly through the scene, also those where nobody takes photos.";
+  if (map.calibration_photos) return [h("p", { class: "quiet" }, evenly)];
+  const how = [
+    "Upper bound: test renders show the scene exactly as it is stored, so fewer real photos are found. To calibrate it, put at least four photos that the scene was not trained on into its folder, with their cameras: listed in ",
+    h("code", {}, "test_filenames"), " of transforms.json, or in ", h("code", {}, "truth.json"), ". Then measure again.",
+  ];
+  return [h("p", { class: "quiet" }, evenly), h("p", { class: "quiet" }, how)];
+}
+
+function left(seconds) {
+  return seconds === null ? "" : `; about ${Math.max(1, Math.round(seconds))} s left`;
+}
+
+async function cancel(state, button) {
+  button.disabled = true;
+  try {
+    await service.cancelCoverage(state.id);
+    say("The measurement is cancelled");
+  } catch (error) {
+    button.disabled = false;
+    button.after(trouble(error));
+  }
 }
 
 async function measure(state, button) {
