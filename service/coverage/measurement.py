@@ -50,7 +50,7 @@ class Measurement:
 
     held_out: Sequence[HeldOutPhoto] = ()
     progress: Callable[[int, int], None] | None = None
-    """Called with the photos that are done, and all, from several threads."""
+    """Called with the photos that are done, and all: with 0 before the first, then from several threads."""
     cancel: threading.Event = field(default_factory=threading.Event)
     config: CoverageConfig = COVERAGE
 
@@ -70,6 +70,8 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
     places = find_places(loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan)
     pairs = spread(places, config.trials)
     runner = _Runner(loaded, how, captured, distance, len(pairs) + len(how.held_out))
+    if how.progress:
+        how.progress(0, len(pairs) + len(how.held_out))
     # Threads suffice: most of the time is spent in kernels, which release the GIL.
     with ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="coverage") as pool:
         cameras = [places.cameras[cell][heading] for cell, heading in pairs]

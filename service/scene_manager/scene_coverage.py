@@ -88,8 +88,12 @@ class SceneCoverages:
         began = time.monotonic()
 
         def progress(done: int, total: int) -> None:
-            # Of the trials alone: what comes before them is done once.
-            run.status = CoverageStatus("running", done, total, (time.monotonic() - began) * (total / done - 1))
+            nonlocal began
+            if not done:
+                # What came before the trials is done once, and says nothing of those that are left.
+                began = time.monotonic()
+            remaining_s = (time.monotonic() - began) * (total / done - 1) if done else None
+            run.status = CoverageStatus("running", done, total, remaining_s)
 
         try:
             if run.cancel.is_set():
