@@ -378,6 +378,11 @@ def test_photos_that_are_dropped_with_a_scene_are_looked_for_in_it(page: Page, u
     scene = next(write_room(tmp_path / "room").glob("*.ply")).read_bytes()
     other = (STUDIO / "photos" / "photo_01.jpg").read_bytes()
     expect(page.locator(".drop")).to_contain_text("HEIC")
+    expect(page.locator("#drophint")).to_contain_text("HEIC")
+    shown = page.evaluate(
+        "import('./ui/dom.js').then(({ length }) => [0.9999, 1.2, -1].map(value => length(value, null)))"
+    )
+    assert shown == ["1 unit", "1.2 units", "-1 units"]
     page.evaluate(NAMES_OF_BOX)
     drop_all(page, {"one.jpg": PHOTO.read_bytes(), "cellar.ply": scene, "two.jpg": other})
     rows = page.locator("tbody tr")
@@ -892,6 +897,9 @@ def test_a_scenes_coverage_is_measured_and_drawn(browser: Browser, url: str, mon
         assert places[0] > places[1]
         expect(page.locator("image.ground")).to_have_attribute("href", re.compile("^data:image/png"))
         assert page.locator("line.camera").count() == 24
+        legend = page.get_by_role("list", name="Legend")
+        for kind, drawn in (("sure", 1), ("rare", 1), ("usual", 0), ("blind", 0), ("camera", 1), ("anchor", 0)):
+            expect(legend.locator(f".swatch.{kind}")).to_have_count(drawn)
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
         _audit(page)
         page.close()
