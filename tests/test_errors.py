@@ -382,6 +382,7 @@ PROVOKED: dict[tuple[str, str], Callable[[SimpleNamespace], httpx.Response]] = {
     ("get_registration", "registration_not_found"): lambda s: s.client.get("/scenes/good/registration"),
     ("get_registration", "corrupt_scene"): lambda s: damaged_registration(s, "GET"),
     ("get_coverage", "scene_not_found"): lambda s: s.client.get("/scenes/none/coverage"),
+    ("cancel_coverage", "scene_not_found"): lambda s: s.client.delete("/scenes/none/coverage"),
     ("list_anchors", "scene_not_found"): lambda s: s.client.get("/scenes/none/anchors"),
     ("list_anchors", "corrupt_scene"): lambda s: damaged_anchors(s, "GET", ""),
     ("put_anchor", "invalid_request"): lambda s: s.client.put("/scenes/good/anchors/a", json={"position": [1]}),

@@ -39,7 +39,7 @@ GET /openapi.json  GET /key  GET /capabilities  GET /version  GET /livez  POST /
 ADMIN = """
 PUT /scenes/{scene_id}  DELETE /scenes/{scene_id}  POST /scenes/{scene_id}/load  POST /scenes/{scene_id}/unload
 PUT /scenes/{scene_id}/anchors/{name}  DELETE /scenes/{scene_id}/anchors/{name}  POST /scenes/{scene_id}/coverage
-POST /scenes/{scene_id}/registration  DELETE /scenes/{scene_id}/registration
+DELETE /scenes/{scene_id}/coverage  POST /scenes/{scene_id}/registration  DELETE /scenes/{scene_id}/registration
 GET /keys  PUT /keys/{name}  DELETE /keys/{name}
 """
 """Refused, whatever is named: admin keys have all scenes."""
