@@ -58,6 +58,8 @@ def serious(page: Page) -> list[str]:
     moderate findings.
     """
     impacts = ("serious", "critical")
+    # The viewer's page names viser's controls in the frame after they came.
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
     found = [rule for rule in Axe().run(page).response["violations"] if rule["impact"] in impacts]
     return [f"{rule['id']}: {node['html'][:200]}" for rule in found for node in rule["nodes"]]
 
