@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import obstore  # pyright: ignore[reportMissingImports]
 from obstore.exceptions import AlreadyExistsError, BaseError  # pyright: ignore[reportMissingImports]
@@ -20,7 +21,7 @@ from service.errors import StorageFailed
 
 _CONNECT, _REQUEST = "5s", "600s"
 """A scene of 2 GB at 4 MB/s takes 500 s."""
-_RETRY = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
+_RETRY: Any = {"max_retries": 3, "retry_timeout": timedelta(seconds=10)}
 _PIECE_BYTES = 8 << 20
 
 
@@ -31,7 +32,7 @@ class S3Objects:
         """Use `s3://bucket/prefix`. Raises StorageFailed."""
         # Whoever names an address without TLS means it; `splatfix doctor` warns.
         plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
-        client = {"connect_timeout": _CONNECT, "timeout": _REQUEST, "allow_http": plain}
+        client: Any = {"connect_timeout": _CONNECT, "timeout": _REQUEST, "allow_http": plain}
         with _storing("open"):
             self._store = S3Store.from_url(address, client_options=client, retry_config=_RETRY)
 

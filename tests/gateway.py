@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import socket
 import subprocess
@@ -31,12 +32,13 @@ def behind_nginx(ports: Sequence[int], folder: Path) -> Iterator[str]:
         pytest.skip("there is no nginx on this machine")
     folder.mkdir()
     given, front = ROOT / "docker" / "nginx", free_port()
-    gateway = (given / "gateway.conf").read_text("utf-8").replace("/etc/nginx", str(given))
+    gateway = (given / "gateway.conf").read_text("utf-8")
+    gateway = re.sub(r"/etc/nginx(/[\w./-]*)", lambda found: f'"{given}{found[1]}"', gateway)  # may have spaces
     gateway = gateway.replace("listen 8080", f"listen 127.0.0.1:{front}").replace("splatfix:8000", "fronts")
     servers = " ".join(f"server 127.0.0.1:{port} max_fails=0;" for port in ports)
     kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    paths = " ".join(f"{kind}_temp_path {folder}/{kind};" for kind in kinds)
-    main = f"daemon off; master_process off; pid {folder}/pid; error_log {folder}/log; events {{}}"
+    paths = " ".join(f'{kind}_temp_path "{folder}/{kind}";' for kind in kinds)
+    main = f'daemon off; master_process off; pid "{folder}/pid"; error_log "{folder}/log"; events {{}}'
     (folder / "nginx.conf").write_text(
         f"{main} http {{ access_log off; {paths} upstream fronts {{ {servers} }} {gateway} }}"
     )

@@ -149,6 +149,7 @@ def test_the_demo_photos_are_localized_as_by_the_embedded_engine(engine):
         assert np.array_equal(first.verdict.covariance, second.verdict.covariance)
         assert (first.intrinsics, first.renders, first.warnings) == (second.intrinsics, second.renders, second.warnings)
     engine.release(held[1].token)
+    until(lambda: engine.scene("studio").jobs == 0)  # the coordinator hears of it a little later
     engine.remove("studio")
     own.close()
 
