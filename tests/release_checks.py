@@ -19,16 +19,18 @@ DEMO_PARTS = ("scene.compressed.ply", "scene.json", "transforms.json", "truth.js
 MAX_WHEEL_BYTES = 12_000_000
 """9.2 million were seen; what is larger holds something that nobody meant."""
 SDIST_PARTS = (*PACKAGES, "docs", "docker", "scenes", "pyproject.toml", "constraints.txt", "openapi.yaml", ".gitignore")
-SDIST_PARTS += ("README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md")
+SDIST_PARTS += ("README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "CITATION.cff")
 OPERATIONS = ("get", "put", "post", "patch", "delete")
 
 
 def version_problems(root: Path, final: bool) -> list[str]:
     """Compare the places that have the version; of a `final` release the changelog has the date."""
-    read = {name: (root / name).read_text("utf-8") for name in ("CHANGELOG.md", "docker/Dockerfile", "openapi.yaml")}
+    files = ("CHANGELOG.md", "CITATION.cff", "docker/Dockerfile", "openapi.yaml")
+    read = {name: (root / name).read_text("utf-8") for name in files}
     version = own_version(root)
     found = {
         "CHANGELOG.md": first(r"^## (\S+) \(", read["CHANGELOG.md"]),
+        "CITATION.cff": first(r"^version: (\S+)", read["CITATION.cff"]),
         "docker/Dockerfile": first(r"^ARG VERSION=(\S+)", read["docker/Dockerfile"]),
         "openapi.yaml": first(r"^  version: (\S+)", read["openapi.yaml"]),
     }

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import hashlib
 import json
 import re
 import subprocess
@@ -39,6 +40,29 @@ def test_each_claim_of_security_names_tests_that_exist():
             tree = ast.parse((ROOT / "tests" / file).read_text("utf-8"))
             functions = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
             assert name in functions, f"{file}::{name}"
+
+
+def test_the_citation_is_of_this_program_and_of_the_paper():
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    # What version 1.2.0 of the format demands of a file and of each reference.
+    assert {"cff-version", "message", "title", "authors"} <= cited.keys()
+    assert (cited["cff-version"], cited["type"]) == ("1.2.0", "software")
+    assert (cited["title"], cited["license"]) == (project["name"], project["license"])
+    (paper,) = cited["references"]
+    assert {"type", "title", "authors"} <= paper.keys()
+    assert "Monte Carlo initialization and decoupled optimization" in paper["title"]
+
+
+def test_scenes_of_the_repository_have_the_hash_and_split_of_the_benches_table():
+    text = (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
+    ((path, said),) = re.findall(r"^\| `(scenes/\S+)` \| `([0-9a-f]{64})` \|", text, re.M)
+    with (ROOT / path).open("rb") as file:
+        assert hashlib.file_digest(file, "sha256").hexdigest() == said
+    folder = (ROOT / path).parent
+    trained = json.loads((folder / "transforms.json").read_text("utf-8"))["frames"]
+    tested = json.loads((folder / "truth.json").read_text("utf-8"))
+    assert f"| studio | {len(trained)} / {len(tested)} |" in text
 
 
 def slug(heading: str) -> str:

@@ -119,10 +119,10 @@ def test_the_versions_of_this_repository_agree():
 
 
 def test_an_old_version_is_noticed_and_a_final_one_needs_a_date(tmp_path):
-    for name in ("service/__init__.py", "CHANGELOG.md", "docker/Dockerfile", "openapi.yaml"):
+    for name in ("service/__init__.py", "CHANGELOG.md", "CITATION.cff", "docker/Dockerfile", "openapi.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text((ROOT / name).read_text("utf-8"), "utf-8")
-    for name in ("CHANGELOG.md", "docker/Dockerfile", "openapi.yaml"):
+    for name in ("CHANGELOG.md", "CITATION.cff", "docker/Dockerfile", "openapi.yaml"):
         text = (tmp_path / name).read_text("utf-8")
         (tmp_path / name).write_text(text.replace(checks.own_version(ROOT), "9.9.9", 1), "utf-8")
     changelog = (tmp_path / "CHANGELOG.md").read_text("utf-8")
@@ -130,7 +130,7 @@ def test_an_old_version_is_noticed_and_a_final_one_needs_a_date(tmp_path):
         re.sub(r"^## .*", "## 9.9.9 (soon)", changelog, count=1, flags=re.M), "utf-8"
     )
     found = "\n".join(checks.version_problems(tmp_path, final=True))
-    assert len(found.splitlines()) == 4
+    assert len(found.splitlines()) == 5
     assert "'soon' is no date" in found
 
 
