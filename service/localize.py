@@ -36,6 +36,7 @@ from service.pose.retrieval.index import ViewIndex
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.captured_volume import is_outside
 from service.pose.verification.gate import VERIFICATION, doubted, downgraded, verify
+from service.pose.verification.search_summary import search_summary
 from service.readings_in_scene import contradictions, fused, scene_priors
 from service.registration.registration import Registration
 from service.render.render_counter import Counted
@@ -286,6 +287,7 @@ def estimate_of(
         + _cautions(query, verdict),
         records=tuple(records),
         frames=info.frames,
+        search_summary=search_summary(records, verdict),
     )
 
 

@@ -130,7 +130,9 @@ class Reason(StrEnum):
 HINTS: dict[Reason, str] = {
     Reason.VERIFIED: "",
     Reason.FEW_FEATURES: "The photo shows almost no texture: take it sharper, brighter or with more of the scene.",
-    Reason.NO_MATCHING_VIEW: "Nothing in the photo was recognised: check that it shows this scene, or send a prior.",
+    Reason.NO_MATCHING_VIEW: (
+        "No place in the scene was found that fits the photo: check that it shows this scene, or send a prior."
+    ),
     Reason.RENDER_MISMATCH: (
         "The scene rendered at the best pose does not look like the photo: check the intrinsics, and whether the "
         "scene has changed since it was captured."
@@ -266,6 +268,9 @@ class PoseEstimate:
     """Of the scene: other frames than the pose's."""
     scene_ranking: tuple[tuple[str, int], ...] = ()
     """Where several scenes were searched: each one's id, and how many matches agreed, best first."""
+    search_summary: str = ""
+    """What the search found of a photo that isn't localized, in a sentence; empty where it matched nothing, of a
+    localized one, and in results of version 0.1.0."""
     advice: tuple[str, ...] = ()
     """What would help, by what was seen, the most helpful first; nothing for a pose that is localized."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 from small_room import write_room
 from test_estimators import photo_at, unseen_pose
-from test_reasons import BEFORE_A_WALL, FAR_OUTSIDE, middle_of_a_wall, with_any_lens
+from test_reasons import BEFORE_A_WALL, FAR_OUTSIDE, FAST, middle_of_a_wall, with_any_lens
 
 from service.geometry import look_at, moved
 from service.interfaces import Frame, Rasterizer
@@ -20,7 +21,8 @@ from service.localize import Request, localize, render_and_verify
 from service.pose.features.query_images import QueryImages
 from service.pose.verification.advice import advice_for, content_extent
 from service.pose.verification.photo_quality import blur_effect, photo_faults
-from service.results import Status, Verdict
+from service.pose.verification.search_summary import search_summary
+from service.results import IterationRecord, Reason, Status, Verdict
 from service.types import BoxPrior, Camera, Pose, Query
 
 TRUTH = unseen_pose()
@@ -192,3 +194,55 @@ def test_a_localized_photo_needs_no_advice_and_any_other_has_some(room: LoadedSc
     half = localize(replace(only(query, "left"), prior=TRUTH), room, Request(budget_renders=1))
     assert half.verdict.status is not Status.LOCALIZED
     assert 1 <= len(half.advice) <= 3
+
+
+# ---------------------------------------------------------------- what the search found
+
+
+@pytest.mark.parametrize(
+    ("steps", "reason", "said"),
+    [
+        ([("retrieve", None, None)], "few_features", ""),
+        ([("descend", None, None)], "render_mismatch", ""),
+        ([("retrieve", None, None), ("match", 0, 0)], "no_matching_view", "No feature of the photo matches the scene."),
+        (
+            [("match", 40, 0), ("match", 90, 0)],
+            "few_inliers",
+            "None of 90 matches with the scene agree on a camera pose.",
+        ),
+        (
+            [("retrieve", None, None), ("match", 400, 9), ("match_pooled", 1073, 14), ("check_mirror", 500, 30)],
+            "no_matching_view",
+            "At best 14 of 1073 matches with the scene agree on a camera pose: too few to trust it.",
+        ),
+        (
+            [("retrieve", None, None), ("match", 400, 60), ("refine", None, 60), ("verify", None, 0)],
+            "render_mismatch",
+            "At best 60 of 400 matches with the scene agree on a camera pose, but the scene rendered at the best guess "
+            "does not look like the photo.",
+        ),
+        (
+            [("retrieve", None, None), ("match", 400, 60), ("verify", None, 12)],
+            "low_coverage",
+            "At best 60 of 400 matches with the scene agree on a camera pose.",
+        ),
+    ],
+)
+def test_the_summary_has_the_numbers_of_the_trace(
+    steps: list[tuple[str, int | None, int | None]], reason: str, said: str, room: LoadedScene
+) -> None:
+    records = [IterationRecord(stage, TRUTH, num_matches=n, num_inliers=k) for stage, n, k in steps]
+    verdict = render_and_verify(QueryImages(photo_at(room, TRUTH), room.matcher), TRUTH, room.rasterizer)
+    assert search_summary(records, replace(verdict, status=Status.NOT_LOCALIZED, reason=Reason(reason))) == said
+    assert search_summary(records, verdict) == ""
+
+
+def test_a_photo_of_something_else_is_told_how_many_matches_there_were(room: LoadedScene) -> None:
+    query = photo_at(room, TRUTH)
+    rgb = np.random.default_rng(3).permutation(query.rgb.reshape(-1, 16, 3)).reshape(query.rgb.shape)
+    found = localize(replace(query, rgb=rgb), room, FAST)
+    assert found.verdict.status is Status.NOT_LOCALIZED
+    best, matches = map(int, re.findall(r"(\d+) of (\d+) matches", found.search_summary)[0])
+    pairs = [(r.num_inliers, r.num_matches) for r in found.records if r.num_matches and r.stage != "check_mirror"]
+    assert (best, matches) in pairs
+    assert best == max(inliers or 0 for inliers, _ in pairs)

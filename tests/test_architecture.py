@@ -23,7 +23,7 @@ FLOORS = {
         {
             *("types", "results", "accuracy", "errors", "plugins", "logs", "versions", "distortion", "codec"),
             "device_readings",
-            *("client", "live_client"),
+            *("client", "live_client", "labels"),
             *("disk_cache", "operating_system"),
         },
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"}
@@ -175,7 +175,7 @@ def _may_import(place: Path, module: str) -> bool:
     if module == "service.__version__":
         return True
     if place.parts[0] == "viewer":
-        return module.split(".")[1] in ("types", "results", "client")
+        return module.split(".")[1] in ("types", "results", "client", "labels")
     if len(place.parts) == 2 and place.stem == "__init__":
         return False  # `import service` stays light
     return all(_floors_allow(package, place, Path(*module.split("."))) for package in FLOORS)

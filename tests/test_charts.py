@@ -185,12 +185,12 @@ def test_bands_and_strip_show_each_stage_over_its_steps() -> None:
     bands = [numbers(band, "x", "y", "width", "height") for band in svg.iter("rect")]
     # Half a step to either side of each.
     assert bands == [pytest.approx((8.5, 4, 166, 86), abs=0.06), pytest.approx((174.5, 4, 249, 86), abs=0.06)]
-    assert [band.findtext("title") for band in svg.iter("rect")] == ["match", "refine"]
+    assert [band.findtext("title") for band in svg.iter("rect")] == ["Match with a view", "Refine the pose by pixels"]
     strip = charts.stages_html(records, 3)
-    places = re.findall(r"title='(\w+): (\d) steps' style='position:absolute;left:([\d.]+)%;width:([\d.]+)%", strip)
-    assert places == [("match", "2", "0.00", "37.50"), ("refine", "3", "37.50", "62.50")]
+    places = re.findall(r"title='([\w ]+): (\d) steps' style='position:absolute;left:([\d.]+)%;width:([\d.]+)%", strip)
+    assert places == [("Match with a view", "2", "0.00", "37.50"), ("Refine the pose by pixels", "3", "37.50", "62.50")]
     assert "left:calc(75.00% - 1.5px)" in strip
-    assert re.findall(r"</i>(\w+)</span>", strip) == ["match", "refine"]
+    assert re.findall(r"</i>([\w ]+)</span>", strip) == ["Match with a view", "Refine the pose by pixels"]
     for colour in charts.stage_colours(records).values():
         assert strip.count(colour) == 2  # in the strip and beside its name
 

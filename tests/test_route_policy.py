@@ -26,7 +26,8 @@ from service.web.viewer_relay import Relay
 PUBLIC = {
     ("GET", "/"), ("GET", "/livez"), ("GET", "/readyz"), ("GET", "/docs"), ("GET", "/openapi.json"), ("GET", "/ui/x"),
     *(("GET", f"/shared/token{rest}") for rest in ("", "/job", "/photo", "/trace", "/iterations/index/render.jpg")),
-    ("GET", "/client.js"), ("GET", "/docs/swagger-ui-bundle.js"), ("GET", "/docs/swagger-ui.css"),
+    ("GET", "/client.js"), ("GET", "/ui/labels.js"),
+    ("GET", "/docs/swagger-ui-bundle.js"), ("GET", "/docs/swagger-ui.css"),
 }  # fmt: skip
 UNKNOWN = [
     *(("GET", path) for path in ("/nowhere", "/jobs/", "/JOBS", "//jobs", "/ui", "/livez/x", "/docs/", "/redoc")),

@@ -490,7 +490,9 @@ def test_texts_escape_what_others_wrote() -> None:
     job = Job("1", "succeeded", "<s>", "2026-01-01T00:00:00Z", "view_index", "<b>x</b>.jpg", PHOTO, None, answer)
     text = headline_html(job, 4, "")
     assert "not localized" in text
-    assert "few features, score 0.10, 3 inliers" in text
+    assert ">Almost no texture in the photo</span>, score 0.10, 3 inliers" in text
+    assert "title='view_index'>Search of the whole scene<" in text
+    assert "title='match'>Match with a view<" in record_html(replace(records(1)[0], stage="match"))
     assert "Take it &lt;sharper&gt;." in text
     for html in (text, headline_html(job, 0, "<i>"), scene_html("<b>", 1, 2, 3)):
         assert not {"<b>", "<s>", "<i>", "<sharper>"} & {html[m:n] for m in range(len(html)) for n in (m + 3, m + 9)}
@@ -578,7 +580,8 @@ def test_charts_have_gaps_where_nothing_is_known_and_marks_of_stages() -> None:
     loss = drawn.split("</svg>")[0]
     # Scene3D `retrieve` has one value, `refine` those of the steps 1, 2, 4 and 5: a line begins anew after the gap.
     assert re.findall(r"<path d='(M[^']*)' fill='none'", loss)[1].count("M") == 2
-    assert loss.count("<title>retrieve</title>") == loss.count("<title>refine</title>") == 1
+    assert loss.count("<title>Search among the scene&#x27;s views</title>") == 1
+    assert loss.count("<title>Refine the pose by pixels</title>") == 1
     assert re.findall(r"<title>step (\d): ([^<]*)</title>", loss) == [
         (str(k), f"{1 / (k + 1):.4g}") for k in (0, 1, 2, 4, 5)
     ]

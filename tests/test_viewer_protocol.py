@@ -117,7 +117,7 @@ def test_without_a_job_the_scene_is_shown_and_the_first_job_is_followed(fake: Fa
             job.add(record)
         browser.wait(lambda: browser.widget("step")["value"] == 5, "the newest step")
         job.finish(Status.NOT_LOCALIZED, Reason.FEW_FEATURES)
-        browser.wait(lambda: "few features" in browser.text() and "sharper" in browser.text(), "reason and hint")
+        browser.wait(lambda: "Almost no texture" in browser.text() and "sharper" in browser.text(), "reason and hint")
         browser.wait(lambda: "/trajectory/final" in browser.nodes, "the final camera")
         fake.job("second", 2, finished=True)
         browser.wait(lambda: "second" in browser.widget("job")["value"], "the next job, by itself")

@@ -12,6 +12,7 @@ from itertools import groupby
 import numpy as np
 from jaxtyping import Float64
 
+from service.labels import label
 from service.results import IterationRecord
 from service.types import Pose
 from viewer.match_geometry import MIN_VECTOR_PX, MatchView, direction_histogram, mean_angle_deg, pose_error
@@ -60,13 +61,14 @@ def stages_html(records: Sequence[IterationRecord], index: int) -> str:
         indices = [r.index for r in steps]
         left, right = (100 * float(np.clip(i, 0, last)) / last for i in (indices[0] - 0.5, indices[-1] + 0.5))
         parts.append(
-            f"<div title='{escape(stage)}: {len(indices)} steps' style='position:absolute;left:{left:.2f}%;"
+            f"<div title='{_words(stage)}: {len(indices)} steps' style='position:absolute;left:{left:.2f}%;"
             f"width:{right - left:.2f}%;height:100%;background:{colours[stage]}'></div>"
         )
     for stage, colour in colours.items():
         names.append(
-            f"<span style='white-space:nowrap'><i style='display:inline-block;width:.7em;height:.7em;"
-            f"background:{colour};margin-right:.3em'></i>{escape(stage)}</span>"
+            f"<span style='white-space:nowrap' title='{escape(stage)}'>"
+            f"<i style='display:inline-block;width:.7em;height:.7em;"
+            f"background:{colour};margin-right:.3em'></i>{_words(stage)}</span>"
         )
     mark = (
         f"<div style='position:absolute;left:calc({100 * index / last:.2f}% - 1.5px);top:-3px;bottom:-3px;width:3px;"
@@ -77,6 +79,10 @@ def stages_html(records: Sequence[IterationRecord], index: int) -> str:
         "<div style='display:flex;flex-wrap:wrap;gap:.1em .8em;margin-top:.35em;font-size:.75em'>"
         f"{''.join(names)}</div></div>"
     )
+
+
+def _words(stage: str) -> str:
+    return escape(label("stage", stage))
 
 
 def stage_colours(records: Sequence[IterationRecord]) -> dict[str, str]:
@@ -135,7 +141,7 @@ def _curve_chart(
     for name, values in series.items():
         parts.append(_line(values, x, y, palette[name]))
     parts += [_text(x(step), _HEIGHT - 2, str(step)) for step in (0, last)]
-    legend = " ".join(f"<b style='color:{palette[name]}'>{escape(name)}</b>" for name in series if name)
+    legend = " ".join(f"<b style='color:{palette[name]}'>{_words(name)}</b>" for name in series if name)
     return (
         f"<div style='padding:0 .6em'><div style='font-size:.8em'>{escape(title)} {legend}</div>"
         f"<svg viewBox='0 0 {_WIDTH} {_HEIGHT}' width='100%' role='img' aria-label='{escape(title)} by step'>"
@@ -169,7 +175,7 @@ def _bands(records: Sequence[IterationRecord], x: Callable[[float], float]) -> s
         left, right = x(indices[0] - 0.5), x(indices[-1] + 0.5)
         bands.append(
             f"<rect x='{left:.1f}' y='4' width='{right - left:.1f}' height='{_HEIGHT - 18}' "
-            f"fill='{colours[stage]}' fill-opacity='.12'><title>{escape(stage)}</title></rect>"
+            f"fill='{colours[stage]}' fill-opacity='.12'><title>{_words(stage)}</title></rect>"
         )
     return "".join(bands)
 

@@ -11,6 +11,7 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from service.labels import Kind, label
 from service.results import IterationRecord
 from service.types import Pose
 from viewer.colours import (
@@ -46,10 +47,10 @@ def job_label(job: ListedJob, zone: ZoneInfo | None = None) -> str:
 def headline_html(job: Job | None, records: int, error: str) -> str:
     """Return status, reason and hint of a job, or its progress; instead, an error."""
     if error:
-        return _block(_badge("error", ERROR_COLOUR), error)
+        return _block(_badge("error", ERROR_COLOUR), escape(error))
     if job is None:
         return _block(_badge("no job", PENDING_COLOUR), "Drop a photo on the start page, or choose a job above.")
-    title = f"{job.photo_name or 'a photo'} in {job.scene}, by {job.estimator}"
+    title = escape(f"{job.photo_name or 'a photo'} in {job.scene}") + f", {labelled('estimator', job.estimator)}"
     link = f"<a href='/' data-splatfix='./#/jobs/{escape(job.id)}'>result page</a>"
     if job.outcome is None:
         # The job was read when its stream began: that it runs meanwhile only its records show.
@@ -85,7 +86,6 @@ def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_u
     unit, scale = length_unit(metres_per_unit), metres_per_unit or 1.0
     error_deg, error_units = pose_error(record.pose, truth) if truth else (None, None)
     rows = [
-        ("stage", escape(record.stage)),
         ("elapsed", f"{record.elapsed_s * 1000:.0f} ms"),
         # Wall and CPU time differ where a job waits or uses several threads.
         ("CPU time", f"{record.cpu_s * 1000:.0f} ms"),
@@ -104,7 +104,8 @@ def record_html(record: IterationRecord, truth: Pose | None = None, metres_per_u
         f"<div><div style='opacity:.85;font-size:.8em'>{name}</div><div style='white-space:nowrap'>{value}</div></div>"
         for name, value in rows
     )
-    return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{cells}</div>")
+    stage = f"<div style='grid-column:1/-1'>{labelled('stage', record.stage)}</div>"
+    return _padded(f"<div style='display:grid;grid-template-columns:repeat(4,1fr);gap:.35em .6em'>{stage}{cells}</div>")
 
 
 def length_unit(metres_per_unit: float | None) -> str:
@@ -199,8 +200,14 @@ def scene_html(name: str, drawn: int, total: int, cameras: int) -> str:
     return _small(f"{escape(name)}: {splats}; {cameras} training cameras")
 
 
+def labelled(kind: Kind, name: str) -> str:
+    """Return the words for a name of the API, as HTML with the name as their tooltip."""
+    return f"<span title='{escape(name)}'>{escape(label(kind, name))}</span>"
+
+
 def _reason(outcome: JobOutcome) -> str:
-    words = [outcome.reason.replace("_", " ")]
+    """Return as HTML why a result has its status, with its numbers; of a failed job, what failed."""
+    words = [escape(outcome.reason) if outcome.score is None else labelled("reason", outcome.reason)]
     if outcome.score is not None:
         words.append(f"score {outcome.score:.2f}")
     if outcome.inliers:  # tracking finds poses without matches
@@ -209,9 +216,10 @@ def _reason(outcome: JobOutcome) -> str:
 
 
 def _block(badge: str, text: str, title: str = "", hint: str = "", link: str = "") -> str:
-    parts = [f"{badge} <span>{escape(text)}</span>"]
+    """Return the panel's head; all but the hint is HTML."""
+    parts = [f"{badge} <span>{text}</span>"]
     if title:
-        parts.append(f"<div style='opacity:.85;font-size:.85em;overflow-wrap:anywhere'>{escape(title)}; {link}</div>")
+        parts.append(f"<div style='opacity:.85;font-size:.85em;overflow-wrap:anywhere'>{title}; {link}</div>")
     if hint:
         parts.append(f"<div style='margin-top:.3em'>{escape(hint)}</div>")
     return _padded("".join(parts))

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import viser
 
+from service.labels import label
 from service.results import IterationRecord
 from viewer.camera_views import Viewpoint, view_from_behind
 from viewer.colours import match_colours
@@ -67,7 +68,7 @@ class _RecordingCanvas:
 
 
 def _label(record: IterationRecord, count: int, job: Job) -> str:
-    text = f"step {record.index} of {count - 1}: {record.stage}"
+    text = f"step {record.index} of {count - 1}: {label('stage', record.stage)}"
     if record.index < count - 1 or job.outcome is None:
         return text
     return f"{text}, {job.outcome.status.replace('_', ' ')}"

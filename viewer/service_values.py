@@ -62,6 +62,7 @@ class JobOutcome:
     """localized, uncertain, not_localized; failed or cancelled where there is no result."""
     reason: str
     hint: str
+    """What the search found and what to do about it; of a failed job, what to do."""
     score: float | None = None
     inliers: int | None = None
 
@@ -249,7 +250,8 @@ def _photo_step(frames: list[dict[str, Any]] | None) -> int | None:
 def _outcome(raw: dict[str, Any]) -> JobOutcome | None:
     result, error = raw["result"], raw["error"]
     if result:
-        return JobOutcome(result["status"], result["reason"], result["hint"], result["score"], result["inliers"])
+        hint = " ".join(filter(None, (result.get("search_summary"), result["hint"])))
+        return JobOutcome(result["status"], result["reason"], hint, result["score"], result["inliers"])
     if error:
         return JobOutcome(raw["state"], error["detail"], error["hint"])
     return JobOutcome(raw["state"], "", "") if raw["state"] in api.ENDED else None

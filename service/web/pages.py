@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from fastapi import FastAPI, Request
@@ -9,6 +10,7 @@ from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from starlette.responses import Response
 
+from service.labels import TABLES
 from service.web.route_policy import RoutePolicy, declare, route_policy
 
 PAGES = Path(__file__).parent / "static"
@@ -27,6 +29,7 @@ def add_pages(app: FastAPI) -> None:
     app.add_api_route("/docs", _api_page, include_in_schema=False)
     app.add_api_route("/shared/{token}", _shared_page, include_in_schema=False)
     app.add_api_route("/client.js", _client, include_in_schema=False)
+    app.add_api_route("/ui/labels.js", _labels, include_in_schema=False)
     # Public: without a key, too, the start page must be able to ask for one.
     app.mount("/ui", declare(_Files(directory=PAGES), RoutePolicy(role=None)), "ui")
 
@@ -57,6 +60,13 @@ async def _shared_page(token: str, request: Request) -> FileResponse:
 @route_policy(role=None)
 async def _client() -> FileResponse:
     return FileResponse(PAGES / "client.js", media_type="text/javascript", headers=_REVALIDATE)
+
+
+@route_policy(role=None)
+async def _labels() -> Response:
+    """Return the words for names of the API, as a module that the pages import: the table is Python's."""
+    module = f"export const LABELS = {json.dumps(TABLES)};\n"
+    return Response(module, media_type="text/javascript", headers=_REVALIDATE)
 
 
 class _Files(StaticFiles):

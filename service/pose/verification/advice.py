@@ -108,7 +108,7 @@ def advice_for(
     if len(seen.inliers_px) >= config.min_inliers:
         said += _about_view(seen, config) + _about_position(seen, verdict, scene_extent, config)
     elif not said:
-        said.append("Nothing of the scene was recognised here: take a second photo from where the scene was captured.")
+        said.append("Take a second photo from where the scene was captured.")
     elif not images.query.prior:
         said.append("Take a second photo, of another part of the scene.")
     return tuple(said[: config.most])

@@ -283,6 +283,7 @@ def result_out(result: JobResult, anchors: Sequence[Anchor] = ()) -> Result:
     return Result(
         status=verdict.status,
         reason=verdict.reason,
+        search_summary=estimate.search_summary,
         hint=HINTS[verdict.reason],
         advice=list(estimate.advice),
         score=verdict.score,

@@ -142,6 +142,9 @@ class Result(Model):
     """`localized`: use the pose. `uncertain`: check it. `not_localized`: don't use it."""
     reason: Reason
     """What decided the status."""
+    search_summary: str = ""
+    """What the search found, in a sentence: how many matches, and how many of them agree on a pose. Empty for a pose
+    that is localized, and where the method matches nothing."""
     hint: str
     """What to do about the reason; empty for a pose that is localized."""
     advice: list[str] = Field(default_factory=list)

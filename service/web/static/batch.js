@@ -5,7 +5,8 @@ import { h, say } from "./dom.js";
 import { batchTable, done, isLoading, isPreparing, ordered, outcome } from "./batch_table.js";
 import { address, forget, keep } from "./batches.js";
 import { drawnPoses, drawPlan, planAxes } from "./plan.js";
-import { cameraTable, csvTable, imageTable, transforms } from "./tables.js";
+import { savingButton } from "./saving.js";
+import { colmapModel, csvTable, transforms } from "./tables.js";
 import { sendPhoto } from "./sending.js";
 
 const POLL_MS = 1000;
@@ -155,9 +156,9 @@ class Head {
       history.replaceState(null, "", this.order.value ? `${hash}?order=${this.order.value}` : hash);
     });
     const all = () => found(entries(), false), usable = () => found(entries(), true);
-    this.exports = [["CSV", "poses.csv", all, csvTable], ["COLMAP images.txt", "images.txt", usable, imageTable],
-      ["COLMAP cameras.txt", "cameras.txt", usable, cameraTable], ["nerfstudio", "transforms.json", usable, transforms],
-    ].map(([label, file, jobs, text]) => ({ label, jobs, button: saving(file, () => text(jobs())) }));
+    this.exports = [["CSV", "poses.csv", all, csvTable], ["COLMAP", "colmap.zip", usable, colmapModel],
+      ["nerfstudio", "transforms.json", usable, transforms],
+    ].map(([label, file, jobs, made]) => ({ label, jobs, button: savingButton(file, () => made(jobs())) }));
     this.plans = h("p", { class: "plans" });
     this.element = h("div", { class: "head" }, h("h1", {}, "Photos"), this.summary, this.running,
       h("div", { class: "filters" }, this.filter, this.order, this.exports.map(({ button }) => button)), this.plans);
@@ -240,14 +241,4 @@ class Maps {
 
 function chooser(label, pairs) {
   return h("select", { "aria-label": label }, pairs.map(([value, text]) => h("option", { value }, text)));
-}
-
-function saving(name, text) {
-  const button = h("button", { type: "button", disabled: true });
-  button.addEventListener("click", () => {
-    const link = h("a", { href: URL.createObjectURL(new Blob([text()], { type: "text/plain" })), download: name });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
-  });
-  return button;
 }

@@ -1,6 +1,6 @@
 // The table of a batch: a row for each photo, its state in words, and the order of the rows.
 
-import { badge, h, seconds, sentence } from "./dom.js";
+import { badge, h, label, seconds } from "./dom.js";
 import { ENDED } from "./service.js";
 
 const HEADS = ["Photo", "Outcome", "Score", "3D", "Reason", "Position", "Duration", "Scene"];
@@ -86,7 +86,7 @@ function row(entry, state) {
 /** Why there is no verified pose: its first sentence, the rest under it when that is opened. */
 function why({ note, job }) {
   const result = job?.result;
-  const told = result && result.status !== "localized" ? `${sentence(result.reason)}. ${result.hint}` : "";
+  const told = result && result.status !== "localized" ? [`${label("reason", result.reason)}.`, result.search_summary, result.hint].filter(Boolean).join(" ") : "";
   const [first, rest] = (note || told || job?.error?.detail || "").split(/(?<=\.) (.*)/s);
   if (!rest) return first;
   return h("details", {}, h("summary", { title: `${first} ${rest}` }, first), rest);

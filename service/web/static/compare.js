@@ -2,7 +2,7 @@
 
 import { service } from "./service.js";
 import { blend, blendSlider } from "./blend.js";
-import { badge, degrees, h, length, seconds, words } from "./dom.js";
+import { badge, degrees, h, label, labelled, length, seconds } from "./dom.js";
 import { poseDistance } from "./formats.js";
 import { photoOf } from "./result.js";
 
@@ -19,13 +19,13 @@ function scenes(jobs) {
 }
 
 function compared(jobs, [sceneA, sceneB]) {
-  const pairs = jobs.map(job => blend(photoOf(job), job.links.render, `The scene at the pose that ${job.estimator} found`));
+  const pairs = jobs.map(job => blend(photoOf(job), job.links.render, `The scene at the pose that “${label("estimator", job.estimator)}” found`));
   const same = jobs[0].photo.sha256 === jobs[1].photo.sha256;
   return [
     h("p", { class: same ? "lead" : "warning" }, same ? jobs[0].photo.name : "These jobs are of different photos."),
     h("p", { class: "lead" }, apart(jobs, sceneA, sceneB)),
     h("div", { class: "pair" }, jobs.map((job, i) => h("section", {},
-      h("h2", {}, h("a", { href: `#/jobs/${job.id}` }, `${"AB"[i]}: ${job.estimator}`), " ", badge(job.result?.status ?? job.state)),
+      h("h2", {}, h("a", { href: `#/jobs/${job.id}` }, `${"AB"[i]}: `, labelled("estimator", job.estimator)), " ", badge(job.result?.status ?? job.state)),
       job.result ? pairs[i].element : h("p", {}, "No result.")))),
     blendSlider(pairs),
     h("div", { class: "scroll" }, h("table", {}, h("thead", {}, h("tr", {}, h("td", {}),
@@ -48,10 +48,10 @@ function error({ result, truth }) {
 
 function differences(jobs, scene) {
   const rows = {
-    scene: job => job.scene, estimator: job => job.estimator, options: job => JSON.stringify(job.options), seed: job => job.seed,
-    prior: job => (job.prior ? "given" : "none"), "intrinsics from": job => job.result?.intrinsics_source,
-    reason: job => words(job.result?.reason), score: job => job.result?.score.toFixed(3), inliers: job => job.result?.inliers,
-    gradient_correlation: job => job.result?.gradient_correlation.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
+    scene: job => job.scene, estimator: job => label("estimator", job.estimator), options: job => JSON.stringify(job.options), seed: job => job.seed,
+    prior: job => (job.prior ? "given" : "none"), intrinsics: job => job.result && label("source", job.result.intrinsics_source),
+    reason: job => job.result && label("reason", job.result.reason), score: job => job.result?.score.toFixed(3), inliers: job => job.result?.inliers,
+    "gradient correlation": job => job.result?.gradient_correlation.toFixed(3), coverage: job => job.result?.coverage.toFixed(3),
     "rotation error": job => degrees(error(job)[0]), "position error": job => length(error(job)[1], scene?.metres_per_unit),
     "rotation σ": job => degrees(job.result?.covariance?.sigma_deg), steps: job => job.records,
     "wall time": job => seconds(sum(job, "wall_s")), "CPU time": job => seconds(sum(job, "cpu_s")),

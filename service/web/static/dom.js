@@ -1,5 +1,7 @@
 // Elements, numbers in words, and the clipboard: what every view needs. No innerHTML anywhere.
 
+import { LABELS } from "./labels.js";
+
 /** Make an element. Properties are set as such, `class` and names with a dash as attributes; null is left out. */
 export function h(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -19,6 +21,16 @@ export function say(text) {
 
 export function words(name) {
   return (name ?? "").replaceAll("_", " ");
+}
+
+/** The words for a name of the API; of an unknown one, as of a plug-in, its own. `kind`: stage, estimator, reason, source. */
+export function label(kind, name) {
+  return LABELS[kind][name] ?? words(name);
+}
+
+/** The words for a name, with the name as their tooltip. */
+export function labelled(kind, name) {
+  return h("span", { title: name }, label(kind, name));
 }
 
 /** The words of a name, as a sentence begins. */

@@ -2,7 +2,7 @@
 
 import { ENDED, service } from "./service.js";
 import { batchList } from "./batches.js";
-import { badge, h, say, seconds, when } from "./dom.js";
+import { badge, h, label, labelled, say, seconds, when } from "./dom.js";
 import { repeat } from "./repeat.js";
 
 const PAGE = 30;
@@ -49,7 +49,7 @@ export function show(main) {
   compare.addEventListener("click", () => { location.hash = `#/compare/${[...marked].join("/")}`; });
   service.scenes().then(scenes => scene.append(...scenes.map(s => h("option", { value: s.id }, s.name))), () => {});
   service.ask("capabilities").then(({ estimators }) => estimator.append(
-    ...estimators.filter(e => e.available).map(e => h("option", { value: e.name }, e.name))), () => {});
+    ...estimators.filter(e => e.available).map(e => h("option", { value: e.name }, label("estimator", e.name)))), () => {});
 
   main.append(h("h1", {}, "History"), batchList(BATCHES) ?? "",
     h("div", { class: "filters" }, outcome, scene, estimator, compare),
@@ -75,7 +75,7 @@ function row(job, marked, compare, note) {
     h("td", {}, h("a", { href: `#/jobs/${job.id}`, class: "photo" }, picture, h("span", {}, name))),
     h("td", {}, badge(job.status ?? job.state)),
     h("td", { class: "number" }, job.score === null ? "–" : job.score.toFixed(2)),
-    h("td", {}, job.scene), h("td", {}, job.estimator),
+    h("td", {}, job.scene), h("td", {}, labelled("estimator", job.estimator)),
     h("td", { class: "number" }, seconds(took)), h("td", {}, when(job.created)),
     h("td", {}, h("a", { href: job.links.viewer, "aria-label": `${name} in the viewer` }, "viewer")),
     h("td", {}, h("span", { class: "actions" }, actions(job, name, marked, compare, note))));

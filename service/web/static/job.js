@@ -2,7 +2,7 @@
 
 import { ENDED, service } from "./service.js";
 import { backLine } from "./batches.js";
-import { h, say, seconds, sentence, words } from "./dom.js";
+import { h, label, labelled, say, seconds, words } from "./dom.js";
 import { result } from "./result.js";
 import { recalled } from "./sent.js";
 
@@ -34,7 +34,7 @@ async function finish(view, job) {
   const preview = view.main.querySelector("img.preview")?.src;
   view.main.replaceChildren(...result(job, scene));
   if (preview) URL.revokeObjectURL(preview);
-  say(`${words(status)}. ${job.result?.hint ?? job.error?.detail ?? ""}`);
+  say(`${words(status)}. ${[job.result?.search_summary, job.result?.hint].filter(Boolean).join(" ") || job.error?.detail || ""}`);
 }
 
 function progress(view, job) {
@@ -63,7 +63,7 @@ function progress(view, job) {
   const ended = service.follow(job.id, {
     signal: stop.signal,
     onRecord: record => {
-      if (record.stage !== state.latest?.stage) stages.append(h("li", {}, words(record.stage)));
+      if (record.stage !== state.latest?.stage) stages.append(h("li", {}, labelled("stage", record.stage)));
       [state.latest, state.latestAt] = [record, performance.now()];
       draw();
     },
@@ -106,7 +106,7 @@ function described(state) {
   if (latest) {
     const left = usual ? usual - elapsed(state) : null;
     const eta = left === null ? "" : left > 0 ? `, about ${seconds(left)} left` : ", longer than usual";
-    return `${sentence(latest.stage)}, step ${latest.index + 1}, ${seconds(elapsed(state))}${eta}`;
+    return `${label("stage", latest.stage)}, step ${latest.index + 1}, ${seconds(elapsed(state))}${eta}`;
   }
   if (scene && ["loading", "unloaded"].includes(scene.state)) return `Queued: the scene is ${scene.state}`;
   if (scene?.state === "preparing") return "Preparing the scene";

@@ -1,14 +1,14 @@
 // What may be sent beside the photo: intrinsics, prior, estimator and its options from the service's own schema.
 // Only what differs from the default is sent, so that the request stays as short as it can be.
 
-import { h, words } from "./dom.js";
+import { h, label, words } from "./dom.js";
 
 const NUMBERS = ["width", "height", "fx", "fy", "cx", "cy"];
 
 export class OptionsForm {
   constructor(capabilities) {
     this.estimators = capabilities.estimators.filter(estimator => estimator.available);
-    this.estimator = select(this.estimators.map(e => [e.name, e.name + (e.default ? " (default)" : e.needs_prior ? " (needs a prior pose)" : "")]),
+    this.estimator = select(this.estimators.map(e => [e.name, label("estimator", e.name) + (e.default ? " (default)" : e.needs_prior ? " (needs a prior pose)" : "")]),
       this.estimators.find(e => e.default)?.name);
     this.estimator.addEventListener("change", () => this.#listOptions());
     this.seed = input({ type: "number", min: 0, step: 1, placeholder: "0" });

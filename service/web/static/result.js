@@ -3,11 +3,13 @@
 import { asksForKey, service } from "./service.js";
 import { backLine } from "./batches.js";
 import { blend, blendSlider } from "./blend.js";
-import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
+import { badge, copyButton, degrees, facts, h, label, labelled, length, seconds, when, words } from "./dom.js";
 import { curlLine, fieldsOf, poseDistance, poseFormats } from "./formats.js";
 import { repeat } from "./repeat.js";
+import { savingButton } from "./saving.js";
 import { recalled } from "./sent.js";
 import { told } from "./start.js";
+import { colmapModel } from "./tables.js";
 
 /** Return the elements that show an ended job; `scene` is its document, null if it is gone. */
 export function result(job, scene) {
@@ -26,9 +28,10 @@ export function result(job, scene) {
 
 function verdict({ result, error, state }) {
   if (!result) return [h("p", { class: "lead" }, error ? `${error.detail} ${error.hint}` : `The job was ${state}.`)];
-  const lead = result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint;
+  const { status, reason, search_summary: summary, hint } = result;
   return [
-    h("p", { class: "lead" }, result.status === "localized" ? lead : h("span", {}, h("strong", {}, `${sentence(result.reason)}.`), " ", lead)),
+    status === "localized" ? h("p", { class: "lead" }, "The render at this pose agrees with the photo.")
+      : h("p", { class: "lead" }, h("strong", {}, labelled("reason", reason), "."), " ", [summary, hint].filter(Boolean).join(" ")),
     ...(result.advice?.length ? [h("ul", { class: "advice" }, result.advice.map(sentence => h("li", {}, sentence)))] : []),
     ...(result.frames ? [h("p", { class: "lead" }, walk(result.frames))] : []),
     ...(result.alternatives.length ? [alternatives(result)] : []),
@@ -79,7 +82,7 @@ function numbers(job, scene) {
   const { result } = job;
   const took = job.finished && job.started ? (Date.parse(job.finished) - Date.parse(job.started)) / 1000 : null;
   const scale = scene?.metres_per_unit;
-  const common = [["Scene", scene?.name ?? job.scene], ["Estimator", job.estimator], ["Created", when(job.created)],
+  const common = [["Scene", scene?.name ?? job.scene], ["Estimator", labelled("estimator", job.estimator)], ["Created", when(job.created)],
     ["Duration", seconds(took)], ["Steps", String(job.records)]];
   if (!result) return h("section", {}, h("h2", {}, "Job"), facts(common));
   const { covariance, intrinsics } = result;
@@ -94,7 +97,7 @@ function numbers(job, scene) {
     ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}, ${lens(result)}`],
     ...common,
   ]), h("details", {}, h("summary", {}, "Time by stage"), facts(
-    result.timings.map(t => [words(t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
+    result.timings.map(t => [labelled("stage", t.stage), `${seconds(t.wall_s)} (CPU ${seconds(t.cpu_s)})`]))));
 }
 
 /** The parts of the score, and what `precise` is about; null in results of version 0.1.0. */
@@ -105,8 +108,7 @@ function parts({ right_place: place, precise, asked }, scale) {
 }
 
 function lens({ intrinsics, intrinsics_source: source }) {
-  const from = { exif: "from EXIF", memory: "from earlier photos of the camera",
-    fisheye: "a fisheye, by the photo itself" }[source] ?? source;
+  const from = label("source", source);
   return intrinsics.trust === "approximate" ? `${from}, then estimated with the pose` : from;
 }
 
@@ -118,7 +120,7 @@ function taking(job) {
   asksForKey().then(asks => { curl.textContent = line(asks); });
   return h("section", {}, h("h2", {}, "Export"),
     h("p", { class: "buttons" }, file("JSON", job.links.self), file("Trace", job.links.trace),
-      ...exports(job).map(([name, format]) => file(name, `${job.links.export}/${format}`))),
+      ...exports(job, file)),
     sharing(job), h("h3", {}, "Repeat with curl"),
     h("div", { class: "poserow" }, curl, copyButton(() => curl.textContent, "the curl line")));
 }
@@ -141,10 +143,12 @@ function sharing(job) {
   return h("div", {}, h("p", { class: "buttons" }, button), place);
 }
 
-function exports({ result }) {
+function exports(job, file) {
+  const { result, links } = job;
   if (!result || result.status === "not_localized") return [];
-  const formats = [["COLMAP", "colmap"], ["nerfstudio", "nerfstudio"], ["TUM", "tum"]];
-  return result.geopose ? [...formats, ["GeoPose", "geopose"]] : formats;
+  const formats = [["nerfstudio", "nerfstudio"], ["TUM", "tum"], ...(result.geopose ? [["GeoPose", "geopose"]] : [])];
+  const colmap = savingButton("colmap.zip", () => colmapModel([job]), "COLMAP");
+  return [colmap, ...formats.map(([name, format]) => file(name, `${links.export}/${format}`))];
 }
 
 function again(job) {
@@ -159,7 +163,7 @@ function again(job) {
   others(job).then(jobs => {
     if (!jobs.length) return;
     const list = h("select", { "aria-label": "Another job on the same photo" },
-      jobs.map(other => h("option", { value: other.id }, `${when(other.created)}, ${other.estimator}, ${words(other.status ?? other.state)}`)));
+      jobs.map(other => h("option", { value: other.id }, `${when(other.created)}, ${label("estimator", other.estimator)}, ${words(other.status ?? other.state)}`)));
     const go = h("button", { type: "button" }, "Compare with");
     go.addEventListener("click", () => { location.hash = `#/compare/${job.id}/${list.value}`; });
     place.append(h("span", { class: "joined" }, go, list));

@@ -2,7 +2,7 @@
 
 import { Client } from "../client.js";
 import { blend, blendSlider } from "./blend.js";
-import { badge, copyButton, degrees, facts, h, length, seconds, sentence, when, words } from "./dom.js";
+import { badge, copyButton, degrees, facts, h, labelled, length, seconds, when } from "./dom.js";
 import { poseFormats } from "./formats.js";
 
 const main = document.querySelector("#main");
@@ -20,7 +20,7 @@ async function show() {
     return;
   }
   const pair = blend(`${job.links.photo}?undistorted=true`, job.links.render, "The scene rendered at the pose");
-  main.append(head, h("p", { class: "lead" }, result.status === "localized" ? "The render at this pose agrees with the photo." : result.hint),
+  main.append(head, h("p", { class: "lead" }, result.status === "localized" ? "The render at this pose agrees with the photo." : [result.search_summary, result.hint].filter(Boolean).join(" ")),
     h("div", { class: "columns" },
       h("div", {}, pair.element, blendSlider([pair]), evidence(job, scale)),
       h("div", {}, h("h2", {}, "Pose"), poses(job), anchors(result, scale), await steps(job))));
@@ -29,10 +29,10 @@ async function show() {
 function evidence(job, scale) {
   const { result } = job, { covariance, intrinsics } = result;
   return h("section", {}, h("h2", {}, "Evidence"), facts([
-    ["Reason", sentence(result.reason)], ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
+    ["Reason", labelled("reason", result.reason)], ["Score", result.score.toFixed(2)], ["Inliers", String(result.inliers)],
     ["Rotation σ", covariance && degrees(covariance.sigma_deg)], ["Position σ", covariance && length(covariance.sigma_units, scale)],
     ["Focal length", `${intrinsics.fx.toFixed(1)} px of ${intrinsics.width} × ${intrinsics.height}`],
-    ["Estimator", job.estimator], ["Created", when(job.created)]]));
+    ["Estimator", labelled("estimator", job.estimator)], ["Created", when(job.created)]]));
 }
 
 function poses(job) {
@@ -60,7 +60,7 @@ async function steps(job) {
     const record = records[slider.value];
     slider.setAttribute("aria-valuetext", `step ${record.index}`);
     picture.src = `${token}/iterations/${record.index}/render.jpg`;
-    line.replaceChildren(facts([["Step", `${record.index + 1} of ${records.length}`], ["Stage", words(record.stage)],
+    line.replaceChildren(facts([["Step", `${record.index + 1} of ${records.length}`], ["Stage", labelled("stage", record.stage)],
       ["Elapsed", seconds(record.elapsed_s)], ["Inliers", record.num_inliers === null ? null : String(record.num_inliers)]]));
   };
   slider.addEventListener("change", move);  // a render each: not while it is dragged

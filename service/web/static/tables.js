@@ -1,5 +1,7 @@
 // The poses of many jobs in one file: CSV, COLMAP's text model, nerfstudio's transforms.json.
 
+import { zip } from "./saving.js";
+
 const DIGITS = 9;  // a micrometre in a kilometre
 const POSE = ["x", "y", "z", "qw", "qx", "qy", "qz"];
 
@@ -23,19 +25,37 @@ function quoted(value) {
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
-/** COLMAP's images.txt: camera_from_world, the camera of each image under the image's own number. */
-export function imageTable(jobs) {
-  const lines = jobs.map(({ photo, result }, i) => {
-    const { quaternion_wxyz, translation } = result.pose.camera_from_world;
-    return `${[i + 1, ...quaternion_wxyz, ...translation, i + 1, named(photo)].join(" ")}\n\n`;
-  });
+/** COLMAP's model in text, as a ZIP: its readers need all three files, and there are no points. */
+export function colmapModel(jobs) {
+  const images = jobs.flatMap(colmapImages);
+  const points = "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID, POINT2D_IDX)\n# Number of points: 0\n";
+  return zip({ "cameras.txt": cameraTable(images), "images.txt": imageTable(images), "points3D.txt": points });
+}
+
+/** The photos of a job that have a pose, with their intrinsics and `camera_from_world`. */
+function colmapImages({ photo, result }) {
+  const { intrinsics, frames, pose } = result;
+  if (!frames) return [{ name: named(photo), intrinsics, ...pose.camera_from_world }];
+  const found = frames.filter(frame => frame.status === "localized");
+  return found.map(frame => ({ name: named(frame), intrinsics, ...inverse(frame.world_from_camera) }));
+}
+
+function inverse({ matrix, quaternion_wxyz: [w, ...v] }) {
+  const translation = [0, 1, 2].map(i => -[0, 1, 2].reduce((sum, k) => sum + matrix[k][i] * matrix[k][3], 0));
+  return { quaternion_wxyz: [w, ...v.map(x => -x)], translation };
+}
+
+/** images.txt: camera_from_world, the camera of each image under the image's own number. */
+function imageTable(images) {
+  const lines = images.map(({ name, quaternion_wxyz, translation }, i) =>
+    `${[i + 1, ...quaternion_wxyz, ...translation, i + 1, name].join(" ")}\n\n`);
   return `# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then an empty line\n${lines.join("")}`;
 }
 
-/** COLMAP's cameras.txt, by the intrinsics of each result. */
-export function cameraTable(jobs) {
-  const lines = jobs.map(({ result: { intrinsics: k } }, i) => {
-    const focal = k.model.startsWith("SIMPLE") || k.model === "RADIAL" ? [k.fx] : [k.fx, k.fy];
+/** cameras.txt, by the intrinsics of each result. */
+function cameraTable(images) {
+  const lines = images.map(({ intrinsics: k }, i) => {
+    const focal = k.model.startsWith("SIMPLE") || k.model.startsWith("RADIAL") ? [k.fx] : [k.fx, k.fy];
     return `${[i + 1, k.model, k.width, k.height, ...focal, k.cx, k.cy, ...k.distortion].join(" ")}\n`;
   });
   return `# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n${lines.join("")}`;
