@@ -48,7 +48,7 @@ class Accuracy:
             raise InvalidAccuracy(
                 f"scene '{scene_name}' has no scale, so metres mean nothing in it.",
                 where="accuracy.metres",
-                hint='Ask for units or share, or say "metres_per_unit" in its scene.json.',
+                hint='Ask for units or share, or put "metres_per_unit" into a scene.json beside the scene file.',
             )
         return replace(self, units=self.metres / metres_per_unit, metres=None)
 

@@ -22,6 +22,7 @@ from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene, release
+from service.scene_formats.manifest import told_by_manifest
 from service.scene_formats.training_files import training_photo_path
 from service.types import GaussianScene, Query
 
@@ -31,8 +32,9 @@ RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
 DEFAULT_ESTIMATOR = "view_index"
 DEFAULT_MATCHER = "xfeat"
 WHITE_ASSUMED = (
-    "the scene's background colour is unknown: white is assumed, since the photo's border is white; set "
-    '"background" in scene.json.'
+    "the scene's background colour is unknown: white is assumed, since the photo's border is white; "
+    + told_by_manifest('"background": [red, green, blue]')
+    + "."
 )
 
 
@@ -139,6 +141,10 @@ class LoadedScene:
                 # It was read through for the index; from now on the renderer's copy is used.
                 release(self.scene)
             return self._prepared[estimator]
+
+    def prepared(self, estimator: str) -> Any:
+        """Return what the estimator has prepared; None as long as it hasn't: nothing is made or waited for."""
+        return self._prepared.get(estimator)
 
     def digest_photos(self, folder: Path, progress: Callable[[int, int], None] | None = None) -> PhotoDigest:
         """Return the digest of the training photos that lie in the scene's folder. Raises SceneNotFound."""

@@ -41,6 +41,7 @@ from service.readings_in_scene import contradictions, fused, scene_priors
 from service.registration.registration import Registration
 from service.render.render_counter import Counted
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
+from service.scene_formats.manifest import told_by_manifest
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world
 from service.types import Pose, Query
 
@@ -327,7 +328,7 @@ def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
         return ()
     return (
         f"the size of the photos that the scene was trained with is unknown: {assumed} px is assumed, which can shift "
-        'the pose a little; say "training_size" in scene.json.',
+        "the pose a little; " + told_by_manifest('"training_size": [width, height]') + ".",
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
@@ -144,7 +143,12 @@ def test_places_lie_around_the_cameras_and_within_the_room(measured):
 def test_a_measurement_is_the_same_again_and_can_be_cancelled(measured):
     loaded = measured[0]
     few = replace(SMALL, trials=2)
-    one, other = (measured_coverage(loaded, Measurement(config=few)) for _ in range(2))
+    told: list[CoverageMap] = []
+    one, other = (measured_coverage(loaded, Measurement(partial=told.append, config=few)) for _ in range(2))
+    # What is told while it is measured: the trials so far, in any order, of a map that else is the same.
+    assert [len(part.trials) for part in told] == [1, 2, 1, 2]
+    assert {encode(trial) for trial in told[1].trials} == {encode(trial) for trial in one.trials}
+    assert np.array_equal(told[0].plan_from_world, one.plan_from_world)
     assert encode(replace(one, seconds=0.0)) == encode(replace(other, seconds=0.0))
     assert one.title.startswith("Coverage, upper bound")
     cancelled = threading.Event()
@@ -330,16 +334,21 @@ def test_a_broken_list_of_held_out_photos_is_named(tmp_path):
 
 
 def test_the_api_measures_in_the_background_and_tells_what_went_wrong(monkeypatch, plugins, tmp_path):
-    go_on = threading.Event()
+    go_on, may_end = threading.Event(), threading.Event()
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr("service.scene_manager.scene_coverage.time", clock)
 
     def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         assert how.progress
-        time.sleep(0.5)
+        clock.now += 0.5
         how.progress(0, 10)
-        time.sleep(0.3)
+        clock.now += 0.3
+        assert how.partial
+        how.partial(plan_of([trial(True, 1.0, heading=np.pi / 2), trial(False, 0.5)]))
         how.progress(3, 10)
         until(lambda: go_on.is_set() or how.cancel.is_set(), 30)
         if how.cancel.is_set():
+            may_end.wait(30)
             raise Cancelled
         return replace(plan_of([trial(True, 1.0)]), scene_sha256=loaded.scene.info.sha256)
 
@@ -352,15 +361,25 @@ def test_the_api_measures_in_the_background_and_tells_what_went_wrong(monkeypatc
     app = create_app(settings(scenes=[folder], cache_dir=None), {"room": make_scene()})
     with serving(app) as client:
         path, counts = "/scenes/room/coverage", {"done": 0, "total": 0, "remaining_s": None}
-        assert client.get(path).json() == {"state": "none", "map": None, "error": None} | counts
+        nothing = {"state": "none", "map": None, "tried": None, "error": None} | counts
+        assert client.get(path).json() == nothing
         assert client.post(path).status_code == 202
         until(lambda: client.get(path).json()["done"] == 3, 30)
         assert client.post(path).json()["total"] == 10  # the same measurement
-        # 3 of 10 took 0.3 s and a little, after 0.5 s of preparation: 7 more take 0.7 s.
-        assert 0.7 <= client.get(path).json()["remaining_s"] < 0.7 * 0.8 / 0.3
+        # 3 of 10 took 0.3 s, after 0.5 s of preparation: 7 more take 0.7 s.
+        assert client.get(path).json()["remaining_s"] == pytest.approx(0.7)
+        tried = client.get(path).json()["tried"]
+        assert tried["plan_from_world"] == np.eye(3).tolist()
+        said = [(one["position"][0], round(one["heading_deg"]), one["found"]) for one in tried["trials"]]
+        assert said == [(1.0, 90, True), (0.5, 0, False)]
         assert client.get("/scenes/room").json()["jobs"] == 1  # it keeps the scene in memory
+        # A measurement that is asked for before a cancelled one has ended is another, and isn't lost with that.
         assert client.delete(path).status_code == 200
-        until(lambda: client.get(path).json() == {"state": "none", "map": None, "error": None} | counts, 30)
+        assert client.post(path).json()["done"] == 0
+        may_end.set()
+        until(lambda: client.get(path).json()["done"] == 3, 30)
+        assert client.delete(path).status_code == 200
+        until(lambda: client.get(path).json() == nothing, 30)
         until(lambda: client.get("/scenes/room").json()["jobs"] == 0, 30)
         assert client.delete(path).json()["state"] == "none"  # nothing is measured
         assert client.delete("/scenes/none/coverage").status_code == 404

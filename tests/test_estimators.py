@@ -28,7 +28,7 @@ from service.pose.retrieval.view_placement import PlacementConfig
 from service.pose.retrieval.viewpoints import ViewpointConfig
 from service.render.render_counter import Counted
 from service.results import Candidates, IterationRecord, MatchVectors, Reason, Status
-from service.scene_manager.warm_up import warm_up
+from service.scene_manager.warm_up import overview, warm_up
 from service.types import Camera, Intrinsics, Pose, Query
 
 LENS = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2)
@@ -299,9 +299,14 @@ def test_without_training_cameras_the_room_is_found_from_the_inside(
     monkeypatch.setattr("service.estimators.view_index.prepared_index", partial(prepared_index, viewpoints=few))
     bare = LoadedScene.of(replace(room.scene, cameras=()))
     half = np.array([2.0, 1.5, 1.25])
+    # The scene's picture is taken from outside until there is an index, for which it doesn't wait.
+    before = overview(bare, 480)
     views = bare.prepare(DEFAULT).views
     inside = [np.all(np.abs(view.camera.pose.position_in_world) < half) for view in views]
     assert np.mean(inside) > 0.5
+    shown = overview(bare, 480)
+    assert np.any(np.abs(before.pose.position_in_world) > half)
+    assert np.all(np.abs(shown.pose.position_in_world) < half)
     located = [localize(photo_at(bare, unseen_pose(seed)), bare) for seed in range(3)]
     for seed, found in enumerate(located):
         assert found.verdict.status is Status.LOCALIZED

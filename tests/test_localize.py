@@ -131,6 +131,8 @@ def test_where_the_size_of_training_is_unknown_the_photos_is_assumed_and_told(
     found = localize(replace(QUERY, photo_intrinsics=LENS.resized(photo_px, photo_px // 2)), bare)
     assert nothing.assumed_px == assumed_px
     assert f"{assumed_px} px is assumed" in found.warnings[-1]
+    # Also a scene that was uploaded as a bare file can follow it.
+    assert "scene.json beside the scene file, both in one folder or ZIP" in found.warnings[-1]
 
 
 def test_the_lens_of_the_last_record_is_the_answers(monkeypatch: pytest.MonkeyPatch, loaded: LoadedScene) -> None:

@@ -912,29 +912,54 @@ def test_a_scenes_coverage_is_measured_and_drawn(browser: Browser, url: str, mon
 
     def measured(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         assert how.progress
+        assert how.partial
+        how.partial(mapped(loaded, trials[:3]))
         how.progress(3, 10)
         while not go_on.wait(0.05):
             if how.cancel.is_set():
                 raise Cancelled
+        return mapped(loaded, trials * 9)
+
+    def mapped(loaded: LoadedScene, trials: list[Trial]) -> CoverageMap:
         places = np.array([[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]])
-        cameras = [(x, level_at(x, 90 * k)) for k in range(4) for x in (0, 20)]
-        trials = [Trial(pose, Status.LOCALIZED, x == 0, 0.1, 0.01, 0.1) for x, pose in cameras]
         shape = np.ones((2, 4), bool)
         return CoverageMap(
             loaded.scene.info.sha256, np.diag([-1.0, -1, 1]), 0.5, places, np.arange(4) * np.pi / 2, shape, shape * 0.1,
-            tuple(trials * 9), (), Calibration(), 1.0,
+            tuple(trials), (), Calibration(), 1.0,
         )  # fmt: skip
 
+    def hold(route: Route) -> None:
+        held.append(route)
+
+    held: list[Route] = []
+    cameras = [(x, level_at(x, 90 * k)) for k in range(4) for x in (0, 20)]
+    trials = [Trial(pose, Status.LOCALIZED, x == 0, 0.1, 0.01, 0.1) for x, pose in cameras]
     monkeypatch.setattr("service.scene_manager.scene_coverage.measured_coverage", measured)
     for scheme in ("light", "dark"):
         page = browser.new_page(viewport={"width": 390, "height": 844}, color_scheme=scheme)  # type: ignore[arg-type]
         page.set_default_timeout(PATIENCE_MS)
         page.goto(f"{url}/")
+        if scheme == "light":
+            page.route("**/anchors", hold)
         page.get_by_role("link", name="Plan and coverage of room").click()
         if scheme == "light":
             expect(page.get_by_text("Not measured yet")).to_be_visible()
-            page.get_by_role("button", name="Measure coverage").click()
+            # The page is drawn again between press and release, when jobs and anchors come.
+            expect(page.locator("image.ground")).to_be_attached()
+            page.locator("svg.plan").evaluate("svg => { svg.dataset.first = ''; }")
+            page.get_by_role("button", name="Measure coverage").hover()
+            page.mouse.down()
+            page.wait_for_timeout(100)
+            held[0].continue_()
+            expect(page.locator("svg.plan[data-first]")).to_have_count(0)
+            page.mouse.up()
             expect(page.get_by_text("3 of 10 test renders")).to_contain_text("s left")
+            # Two renders at x = 0, one at 20, which is to the left: the plan is turned.
+            expect(page.locator("circle.tried.found")).to_have_count(2)
+            places = [page.locator(f"circle.tried.{kind}").first.get_attribute("cx") for kind in ("found", "missed")]
+            assert float(places[0] or 0) > float(places[1] or 0)
+            expect(page.get_by_role("list", name="Legend")).to_contain_text("tried: not found")
+            _audit(page)
             page.get_by_role("button", name="Cancel").click()
             page.get_by_role("button", name="Measure coverage").click()
             expect(page.get_by_text("3 of 10 test renders")).to_be_visible()

@@ -15,7 +15,7 @@ from service.coverage.calibration import Calibration, calibrated
 from service.coverage.coverage_map import CoverageMap, Trial
 from service.coverage.degraded_renders import DEGRADATION, DegradationConfig, degraded_render
 from service.coverage.held_out_photos import HeldOutPhoto
-from service.coverage.plan import PLAN, PlanConfig, find_places, novelty, spread
+from service.coverage.plan import PLAN, Places, PlanConfig, find_places, novelty, spread
 from service.geometry import pose_distance
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Cancelled, Request, localize_in_scene
@@ -51,6 +51,8 @@ class Measurement:
     held_out: Sequence[HeldOutPhoto] = ()
     progress: Callable[[int, int], None] | None = None
     """Called with the photos that are done, and all: with 0 before the first, then from several threads."""
+    partial: Callable[[CoverageMap], None] | None = None
+    """Called, before `progress`, with the map's plan and the photos tried so far; from several threads."""
     cancel: threading.Event = field(default_factory=threading.Event)
     config: CoverageConfig = COVERAGE
 
@@ -60,7 +62,7 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
 
     Raises Cancelled after `how.cancel` was set.
     """
-    began, config, origin = time.perf_counter(), how.config, loaded.scene.info.origin_in_world
+    began, config = time.perf_counter(), how.config
     index = loaded.prepare(DEFAULT_ESTIMATOR)
     # Once for the scene; else the first photo that needs them would spend its budget on them.
     index.free_views.of(loaded.searched, loaded.rasterizer, loaded.matcher, index.views)
@@ -69,7 +71,8 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
     # A fixed seed: a scene has the same places whenever its map is measured.
     places = find_places(loaded.searched, loaded.rasterizer, captured, distance, np.random.default_rng(0), config.plan)
     pairs = spread(places, config.trials)
-    runner = _Runner(loaded, how, captured, distance, len(pairs) + len(how.held_out))
+    empty = _without_trials(loaded, places)
+    runner = _Runner(loaded, how, captured, distance, empty, len(pairs) + len(how.held_out))
     if how.progress:
         how.progress(0, len(pairs) + len(how.held_out))
     # Threads suffice: most of the time is spent in kernels, which release the GIL.
@@ -77,22 +80,27 @@ def measured_coverage(loaded: LoadedScene, how: Measurement) -> CoverageMap:
         cameras = [places.cameras[cell][heading] for cell, heading in pairs]
         trials = tuple(pool.map(runner.try_render, cameras, range(len(cameras))))
         real = tuple(pool.map(runner.try_photo, how.held_out))
-    found = CoverageMap(
-        loaded.scene.info.sha256,
-        places.plan_from_world,
-        places.cell,
-        places.positions + np.array(origin),
-        places.headings_rad,
-        places.sees_scene,
-        places.novelties,
-        trials,
-        real,
-        Calibration(),
-        0.0,
-    )
+    found = replace(empty, trials=trials, real_trials=real)
     # The fit needs the probabilities of the map without a calibration, hence two steps.
     calibration = calibrated(found.rates_near(real), np.array([trial.found for trial in real], bool))
     return replace(found, calibration=calibration, seconds=time.perf_counter() - began)
+
+
+def _without_trials(loaded: LoadedScene, places: Places) -> CoverageMap:
+    """Return the map of a measurement that has tried nothing yet."""
+    return CoverageMap(
+        loaded.scene.info.sha256,
+        places.plan_from_world,
+        places.cell,
+        places.positions + np.array(loaded.scene.info.origin_in_world),
+        places.headings_rad,
+        places.sees_scene,
+        places.novelties,
+        (),
+        (),
+        Calibration(),
+        0.0,
+    )
 
 
 def _distance(views: Sequence[View]) -> float:
@@ -105,11 +113,18 @@ class _Runner:
     """Localizes photos; safe from several threads."""
 
     def __init__(
-        self, loaded: LoadedScene, how: Measurement, captured: Sequence[Camera], distance: float, total: int
+        self,
+        loaded: LoadedScene,
+        how: Measurement,
+        captured: Sequence[Camera],
+        distance: float,
+        empty: CoverageMap,
+        total: int,
     ) -> None:
-        self._captured, self._distance = captured, distance
+        self._captured, self._distance, self._empty = captured, distance, empty
         self._loaded, self._how, self._total = loaded, how, total
-        self._done, self._lock = 0, threading.Lock()
+        self._tried_so_far: list[Trial] = []
+        self._lock = threading.Lock()
 
     def try_render(self, camera: Camera, seed: int) -> Trial:
         # By the trial's number: which thread takes which trial depends on the machine's load.
@@ -136,13 +151,19 @@ class _Runner:
         verdict = estimate.verdict
         (new,) = novelty([truth], self._captured, self._distance, self._how.config.plan)
         right = degrees <= request.accuracy.deg and units <= request.accuracy.bound_units(self._depth(truth))
-        if self._how.progress:
-            with self._lock:
-                self._done += 1
-                self._how.progress(self._done, self._total)
         found = verdict.status is Status.LOCALIZED and right
         pose = shifted(truth.pose, self._loaded.scene.info.origin_in_world)
-        return Trial(pose, verdict.status, found, degrees, units, float(new), name)
+        trial = Trial(pose, verdict.status, found, degrees, units, float(new), name)
+        self._tell(trial)
+        return trial
+
+    def _tell(self, trial: Trial) -> None:
+        with self._lock:
+            self._tried_so_far.append(trial)
+            if self._how.partial:
+                self._how.partial(replace(self._empty, trials=tuple(self._tried_so_far)))
+            if self._how.progress:
+                self._how.progress(len(self._tried_so_far), self._total)
 
     def _depth(self, truth: Camera) -> float:
         """Return the distance to what is seen at the true pose."""

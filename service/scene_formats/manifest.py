@@ -23,9 +23,15 @@ from service.errors import CorruptScene, SceneError, UnsupportedFormat
 from service.types import GeoAnchor
 
 MANIFEST = "scene.json"
+
 MAX_JSON_BYTES = 64 * 1024 * 1024
 _MAX_NAME_BYTES = 255
 """Of a file, on all usual file systems."""
+
+
+def told_by_manifest(entry: str) -> str:
+    """Return how a user adds an entry to a scene's manifest: a scene that came as a bare file has none."""
+    return f"to tell it, put {entry} into a {MANIFEST} beside the scene file, both in one folder or ZIP"
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from service.coverage.coverage_cache import coverage_file, read_coverage, write_coverage
@@ -67,7 +67,8 @@ class SceneCoverages:
         """Begin to measure a scene's map anew, unless that is under way. Raises SceneError."""
         with self._lock:
             run = self._runs.get(scene_id)
-            if run is not None and run.status.state == "running":
+            # One that is being cancelled leaves no map: who asks now wants another.
+            if run is not None and run.status.state == "running" and not run.cancel.is_set():
                 return run.status
             # Held until it ends, so that it isn't dropped for want of memory.
             (loaded,) = self._scenes.acquire([scene_id]).scenes
@@ -93,14 +94,17 @@ class SceneCoverages:
                 # What came before the trials is done once, and says nothing of those that are left.
                 began = time.monotonic()
             remaining_s = (time.monotonic() - began) * (total / done - 1) if done else None
-            run.status = CoverageStatus("running", done, total, remaining_s)
+            run.status = replace(run.status, done=done, total=total, remaining_s=remaining_s)
+
+        def partial(tried: CoverageMap) -> None:
+            run.status = replace(run.status, partial=tried)
 
         try:
             if run.cancel.is_set():
                 raise Cancelled
             path = self._scenes.entry(scene_id).path
             held_out = held_out_photos(path) if path else []
-            found = measured_coverage(loaded, Measurement(held_out, progress, run.cancel))
+            found = measured_coverage(loaded, Measurement(held_out, progress, partial, run.cancel))
             file = self._file(loaded, held_out)
             if file:
                 write_coverage(found, file)
@@ -109,7 +113,8 @@ class SceneCoverages:
         except Cancelled:
             # Without it `of` answers with the stored map, if there is one.
             with self._lock:
-                del self._runs[scene_id]
+                if self._runs[scene_id] is run:
+                    del self._runs[scene_id]
         except Exception as error:  # one bad scene must not take the others with it
             unexpected = not isinstance(error, SplatfixError)
             _log.error("no coverage map of scene %s: %s", scene_id, error, exc_info=unexpected)

@@ -119,5 +119,7 @@ class CoverageStatus:
     remaining_s: float | None = None
     """Estimated wall time until it ends; None: not known."""
     found: CoverageMap | None = None
+    partial: CoverageMap | None = None
+    """While it is measured: the map's plan with the renders tried so far."""
     failure: Failure | None = None
     """Why there is none."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from service.errors import InvalidPrior
 from service.geometry import look_at
-from service.loaded_scene import LoadedScene
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import Request, localize
 from service.pose.retrieval.index import ViewIndex
 from service.types import Camera, Intrinsics, Query
@@ -41,17 +41,27 @@ def warm_up(loaded: LoadedScene, estimator: str) -> None:
 
 def _camera(loaded: LoadedScene, estimator: str) -> Camera:
     """Return the indexed view with the most features, from which a photo is found at once; else an overview."""
-    index = loaded.prepare(estimator)
-    if not isinstance(index, ViewIndex) or not index.views:
-        return overview(loaded, WARM_UP_PX)
-    camera = max(index.views, key=lambda view: len(view.points_in_world)).camera
-    return Camera(camera.intrinsics.with_long_side(WARM_UP_PX), camera.pose)
+    camera = _richest_view(loaded.prepare(estimator))
+    return overview(loaded, WARM_UP_PX) if camera is None else _sized(camera, WARM_UP_PX)
 
 
 def overview(loaded: LoadedScene, long_side: int) -> Camera:
-    """Return a camera that shows what the scene is: a training camera, else one outside."""
+    """Return a camera that shows what the scene is: a training camera, else the indexed view with the most features,
+    which shows a room from inside; while there is no index yet, one outside."""
     cameras = loaded.scene.cameras
-    camera = cameras[len(cameras) // 2].camera if cameras else _outside(loaded)
+    if cameras:
+        return _sized(cameras[len(cameras) // 2].camera, long_side)
+    return _sized(_richest_view(loaded.prepared(DEFAULT_ESTIMATOR)) or _outside(loaded), long_side)
+
+
+def _richest_view(prepared: object) -> Camera | None:
+    """Return the camera of the indexed view with the most features; None if this is no index, or an empty one."""
+    if not isinstance(prepared, ViewIndex) or not prepared.views:
+        return None
+    return max(prepared.views, key=lambda view: len(view.points_in_world)).camera
+
+
+def _sized(camera: Camera, long_side: int) -> Camera:
     return Camera(camera.intrinsics.with_long_side(long_side), camera.pose)
 
 

@@ -125,7 +125,8 @@ def delete_scene(scene_id: str, app_state: AppStateOf) -> None:
 )
 @route_policy(role="read")
 async def scene_thumbnail(scene_id: str, app_state: AppStateOf) -> Response:
-    """Return a small image of the scene from its middle training camera."""
+    """Return a small image of the scene from its middle training camera; without cameras, once it is prepared, from the
+    view with the most features, before that from outside."""
     draw = partial(app_state.engine.thumbnail, scene_id)
     return Response(await app_state.render_in_thread(scene_id, draw), media_type="image/jpeg")
 

@@ -36,6 +36,14 @@ class CoverageTrialOut(Model):
     position_units: float
 
 
+class CoverageTriedOut(Model):
+    """The photos that a measurement has tried so far."""
+
+    plan_from_world: list[list[float]]
+    """3x3 rotation; the third axis of the plan is up."""
+    trials: list[CoverageTrialOut]
+
+
 class CoverageMapOut(Model):
     """Where in a scene a photo would be found, by place in plan view and by heading."""
 
@@ -75,6 +83,8 @@ class CoverageOut(Model):
     remaining_s: float | None
     """Estimated time until the measurement ends; null: not known, or none runs."""
     map: CoverageMapOut | None
+    tried: CoverageTriedOut | None
+    """While it is measured, from the first photo on; else null."""
     error: Problem | None
     """Why it could not be measured."""
 
@@ -89,8 +99,15 @@ def coverage_status_out(status: CoverageStatus, instance: str) -> CoverageOut:
         total=status.total,
         remaining_s=status.remaining_s,
         map=found,
+        tried=status.partial and tried_out(status.partial),
         error=error,
     )
+
+
+def tried_out(partial: CoverageMap) -> CoverageTriedOut:
+    """Convert what a measurement has tried so far."""
+    trials = [_trial_out(trial, partial) for trial in partial.trials]
+    return CoverageTriedOut(plan_from_world=partial.plan_from_world.tolist(), trials=trials)
 
 
 def coverage_out(found: CoverageMap) -> CoverageMapOut:

@@ -28,7 +28,7 @@ _EXAMPLES: tuple[tuple[Exception, str], ...] = (
         e.InvalidAccuracy(
             "scene 'studio' has no scale, so metres mean nothing in it.",
             where="accuracy.metres",
-            hint='Ask for units or share, or say "metres_per_unit" in its scene.json.',
+            hint='Ask for units or share, or put "metres_per_unit" into a scene.json beside the scene file.',
         ),
         "/localize",
     ),

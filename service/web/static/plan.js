@@ -61,15 +61,16 @@ export function drawnPoses(job) {
 
 /**
  * Draw a plan. `map`: a coverage map or null; `cameras`, `jobs` (each with `matrix`, `title`, `href`, `status`) and
- * `anchors` (each with `position`, `name`); `ground`: a PlanGround to draw beneath, or null; `size`: of the longer side
+ * `anchors` (each with `position`, `name`); `tried`: photos of a measurement, as jobs without a page; `ground`: a PlanGround to draw beneath, or null; `size`: of the longer side
  * in pixels, as it is shown: texts are drawn for it.
  */
-export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, ground = null, size = SIZE }) {
+export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, tried = [], ground = null, size = SIZE }) {
   const cells = (map?.cells ?? []).map(cell => ({ ...pointInPlan(axes, cell.position), cell }));
   const views = cameras.map(matrix => inPlan(axes, matrix));
   const found = jobs.map(job => ({ ...inPlan(axes, job.matrix), job }));
   const points = anchors.map(anchor => ({ ...pointInPlan(axes, anchor.position), anchor }));
-  let all = [...cells, ...views, ...found, ...points];
+  const trials = tried.map(trial => ({ ...inPlan(axes, trial.matrix), trial }));
+  let all = [...cells, ...views, ...found, ...points, ...trials];
   if (!cells.length && !views.length && ground) all = [...all, ...ground.corners];
   if (!all.length) return null;
   const reach = (map?.cell ?? 0) * 0.75;
@@ -86,6 +87,8 @@ export function drawPlan({ axes, map, cameras, jobs, anchors, metresPerUnit, gro
     ground ? svg("image", { class: "ground", width, height: shown, href: ground.picture(framed, width, eye) }) : null,
     svg("g", { class: "cells" }, cells.map(c => star(px(c), 0.46 * map.cell * scale, map.headings_deg, c.cell.probabilities))),
     svg("g", { class: "cameras" }, views.map(v => arrow(px(v), v, 0.7 * ray))),
+    svg("g", { class: "trials" }, trials.map(t => svg("g", {}, svg("title", {}, t.trial.title),
+      arrow(px(t), t, ray, `tried ${t.trial.status}`), disc(px(t), 4, `tried ${t.trial.status}`)))),
     svg("g", { class: "jobs" }, found.map(f => svg("a", { href: f.job.href },
       svg("title", {}, f.job.title), arrow(px(f), f, 1.4 * ray, `job ${f.job.status}`), disc(px(f), 5, `job ${f.job.status}`)))),
     svg("g", { class: "anchors" }, points.map(p => [disc(px(p), 4, "anchor"), label(px(p), p.anchor.name)])),

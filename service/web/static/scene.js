@@ -13,7 +13,11 @@ const JOBS = 100;
 export function show(main, id, query) {
   const plan = h("div", { class: "planbox" });
   const aside = h("div");
-  const state = { id: decodeURIComponent(id), plan, aside, jobs: [], anchors: [], coverage: null, ground: null, point: pointOf(query), stopped: false, timer: 0 };
+  const state = {
+    id: decodeURIComponent(id), plan, aside, jobs: [], anchors: [], coverage: null, ground: null, point: pointOf(query), stopped: false, timer: 0,
+    // Parts that are drawn by themselves: a button that was replaced between press and release would not be clicked.
+    parts: { anchors: h("div"), coverage: h("div"), legend: h("div") }, drawn: {},
+  };
   document.title = "scene – splatfix";
   const title = h("h1", {}, state.id);
   main.append(title, h("div", { class: "columns" }, plan, aside));
@@ -34,22 +38,38 @@ async function begin(state, title) {
   }
   state.scene = scene;
   state.registration = new RegistrationPart(state.id);
+  state.button = h("button", { type: "button", "data-needs": "admin" });
+  state.button.addEventListener("click", () => (state.coverage.state === "running" ? cancel : measure)(state));
+  state.trouble = h("div");
+  const { anchors, coverage, legend } = state.parts;
+  state.aside.replaceChildren(anchors, coverage, h("p", { class: "buttons" }, state.button), state.trouble, legend, state.registration.element);
   await refresh(state);
-  showGround(state).catch(() => {});  // the plan can be read without it
   [state.jobs, state.anchors] = await Promise.all([jobsOf(state.id), service.anchors(state.id)]);
   draw(state);
 }
 
 /** The plan's axes: the map's own, where there is one: without cameras the scene's may be turned against it. */
 function axesOf({ scene, coverage }) {
-  return coverage?.map?.plan_from_world ?? planAxes(scene);
+  return (coverage?.map ?? coverage?.tried)?.plan_from_world ?? planAxes(scene);
+}
+
+/** The photos that a measurement has tried so far, as `drawPlan` takes poses. */
+function triedPoses({ tried }) {
+  return (tried?.trials ?? []).map(({ position, heading_deg: heading, found, photo }) => {
+    const angle = heading * Math.PI / 180, [first, second] = tried.plan_from_world;
+    const look = [0, 1, 2].map(i => Math.cos(angle) * first[i] + Math.sin(angle) * second[i]);
+    return {
+      matrix: position.map((value, i) => [0, 0, look[i], value]), status: found ? "found" : "missed",
+      title: `${photo ?? "test render"}: ${found ? "found" : "not found"}`,
+    };
+  });
 }
 
 /** Draw the Gaussians beneath the plan, again when the axes are others. */
 async function showGround(state) {
   const axes = axesOf(state), key = String(axes);
   if (state.groundKey === key) return;
-  state.groundKey = key;
+  [state.groundKey, state.ground] = [key, null];
   state.ground = await PlanGround.of(service, state.id, axes);
   if (!state.stopped) draw(state);
 }
@@ -102,13 +122,12 @@ async function refresh(state) {
   const before = state.coverage?.state;
   state.coverage = await service.coverage(state.id);
   if (state.stopped) return;
-  if (before === "running" && state.coverage.state === "ready") {
-    say("The coverage map is ready");
-    showGround(state).catch(() => {});
-  }
+  if (before === "running" && state.coverage.state === "ready") say("The coverage map is ready");
+  showGround(state).catch(() => {});  // the plan can be read without it
   draw(state);
+  clearTimeout(state.timer);  // one poll at a time, whoever asked for this
   if (state.coverage.state !== "running") return;
-  state.timer = setTimeout(() => refresh(state).catch(error => state.aside.replaceChildren(trouble(error))), POLL_MS);
+  state.timer = setTimeout(() => refresh(state).catch(error => state.trouble.replaceChildren(trouble(error))), POLL_MS);
 }
 
 /** The newest jobs of a scene whose photos were localized, or uncertain, with their poses. */
@@ -124,23 +143,30 @@ function draw(state) {
   const map = coverage?.map ?? null;
   const cameras = scene.training_cameras.map(camera => camera.world_from_camera);
   const picture = drawPlan({
-    axes: axesOf(state), map, jobs, ground, cameras,
+    axes: axesOf(state), map, jobs, ground, cameras, tried: triedPoses(coverage ?? {}),
     anchors: state.point ? [...state.anchors, { name: "the picked point", position: state.point }] : state.anchors,
     metresPerUnit: scene.metres_per_unit,
   });
   state.plan.replaceChildren(picture ?? h("p", { class: "note" }, "No cameras, no jobs and no coverage map yet: there is nothing to draw."));
-  if (state.aside.contains(document.activeElement) && document.activeElement.tagName === "INPUT") return;  // who types
   state.registration.setAnchors(state.anchors);
-  state.aside.replaceChildren(...anchorParts(state), ...coverageParts(state, map), legend(map, cameras, jobs, state.anchors), state.registration.element);
+  redraw(state, "anchors", [state.anchors, state.point], () => anchorParts(state));
+  redraw(state, "coverage", coverage, () => coverageParts(state, map));
+  redraw(state, "legend", [coverage, jobs.length, state.anchors.length], () => [legend(map, cameras, jobs, state.anchors, coverage)]);
+  const running = coverage?.state === "running";
+  state.button.textContent = running ? "Cancel" : map ? "Measure again" : "Measure coverage";
+}
+
+/** Draw a part anew if what it shows has changed. */
+function redraw({ parts, drawn }, name, shown, elements) {
+  const key = JSON.stringify(shown);
+  if (drawn[name] === key) return;
+  drawn[name] = key;
+  parts[name].replaceChildren(...elements());
 }
 
 function coverageParts(state, map) {
   const { coverage, scene } = state;
   const running = coverage.state === "running";
-  const button = running
-    ? h("button", { type: "button", "data-needs": "admin" }, "Cancel")
-    : h("button", { type: "button", "data-needs": "admin" }, map ? "Measure again" : "Measure coverage");
-  button.addEventListener("click", () => (running ? cancel : measure)(state, button));
   const parts = [h("h2", {}, "Where photos are found")];
   if (map) {
     parts.push(h("p", {}, h("strong", {}, map.title)), facts([
@@ -155,11 +181,12 @@ function coverageParts(state, map) {
   }
   if (running) {
     const total = coverage.total || null;
+    if (total) parts.push(h("p", { class: "quiet" }, "The plan shows what was tried so far; the map of the whole scene is drawn when all is done."));
     parts.push(h("p", { role: "status" }, total ? `${coverage.done} of ${total} test renders and held-out photos tried${left(coverage.remaining_s)}` : `Preparing; then ${LASTS}`),
       h("progress", { "aria-label": "Measuring coverage", max: total ?? 1, ...(total ? { value: coverage.done } : {}) }));
   }
   if (coverage.error) parts.push(trouble({ message: `${coverage.error.detail} ${coverage.error.hint}` }));
-  return [...parts, h("p", { class: "buttons" }, button)];
+  return parts;
 }
 
 /** How a map is read. */
@@ -177,36 +204,39 @@ function left(seconds) {
   return seconds === null ? "" : `; about ${Math.max(1, Math.round(seconds))} s left`;
 }
 
-async function cancel(state, button) {
-  button.disabled = true;
-  try {
+async function cancel(state) {
+  await pressed(state, async () => {
     await service.cancelCoverage(state.id);
     say("The measurement is cancelled");
-  } catch (error) {
-    button.disabled = false;
-    button.after(trouble(error));
-  }
+  });
 }
 
-async function measure(state, button) {
-  button.disabled = true;
+async function measure(state) {
+  await pressed(state, () => service.coverage(state.id, { measure: true }));
+}
+
+/** Do what the button is for, and show what came of it. */
+async function pressed(state, act) {
+  state.button.disabled = true;
+  state.trouble.replaceChildren();
   try {
-    await service.coverage(state.id, { measure: true });
+    await act();
     await refresh(state);
   } catch (error) {
-    button.disabled = false;
-    button.after(trouble(error));
+    state.trouble.replaceChildren(trouble(error));
   }
+  state.button.disabled = false;
 }
 
 /** What the plan draws, and nothing else. */
-function legend(map, cameras, jobs, anchors) {
+function legend(map, cameras, jobs, anchors, coverage) {
   const drawn = new Set(map?.cells.flatMap(cell => cell.probabilities.map(level)));
   const row = (kind, text) => h("li", {}, h("span", { class: `swatch ${kind}`, "aria-hidden": "true" }), text);
   const statuses = ["localized", "uncertain"].filter(status => jobs.some(job => job.status === status));
   return h("ul", { class: "legend", "aria-label": "Legend" },
     LEVELS.filter(([, kind]) => drawn.has(kind)).map(([, kind, text]) => row(kind, text)),
     drawn.has("blind") ? row("blind", "nothing of the scene in view") : [],
+    coverage?.tried ? [row("tried found", "tried: found"), row("tried missed", "tried: not found")] : [],
     cameras.length ? row("camera", "training camera") : [], anchors.length ? row("anchor", "anchor") : [], statuses.map(status => row(`job ${status}`, `job, ${words(status)}`)),
     h("li", { class: "quiet" }, `Seen from above; each ${map ? "wedge and line" : "line"} points where its camera looks.`));
 }

@@ -76,7 +76,8 @@ export class SceneList {
     radio.addEventListener("change", () => choose(scene.id));
     const loaded = scene.gaussians !== null;
     const picture = loaded
-      ? h("img", { src: scene.links.thumbnail, alt: "", width: 320, height: 240, loading: "lazy" })
+      // Without cameras there is a better picture once the scene is prepared.
+      ? h("img", { src: scene.cameras ? scene.links.thumbnail : `${scene.links.thumbnail}?${scene.state}`, alt: "", width: 320, height: 240, loading: "lazy" })
       : h("span", { class: "nopicture" });
     const facts = loaded ? `${count(scene.gaussians)} Gaussians · ${count(scene.cameras)}\u00a0cameras · ${bytes(scene.memory_bytes)} in memory` : "";
     const busy = BUSY.includes(scene.state);
