@@ -338,7 +338,7 @@ def _cautions(query: Query, verdict: Verdict) -> tuple[str, ...]:
     if query.intrinsics_source == "fisheye":
         cautions.append(
             "the photo's lens is a fisheye, not what was sent or assumed: its intrinsics were estimated with the pose. "
-            "Send them with `model` and `distortion` for an exact pose."
+            "Send them with camera model and distortion for an exact pose."
         )
     if verdict.intrinsics_untested:
         cautions.append(

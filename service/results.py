@@ -145,12 +145,12 @@ HINTS: dict[Reason, str] = {
         "The photo fits the scene, but does not determine its focal length, hence its position: send intrinsics."
     ),
     Reason.INTRINSICS_CONTRADICTED: (
-        "The photo fits the scene far better with other intrinsics, which `fitting_intrinsics` lists: check focal "
-        'length, distortion and cropping, or send the intrinsics with trust "approximate".'
+        "The photo fits the scene far better with other intrinsics, which the result lists: check focal length, "
+        "distortion and cropping, or send the intrinsics as approximate."
     ),
     Reason.LENS_UNMODELLED: (
         "The photo's lens is neither a pinhole with one radial coefficient nor a fisheye that could be estimated: "
-        "calibrate it and send the intrinsics with `model` and `distortion`."
+        "calibrate it and send the intrinsics with camera model and distortion."
     ),
     Reason.POSITION_UNCERTAIN: (
         "The photo fits the scene, but hardly determines the camera position: show more of the scene, or nearer things."
@@ -164,8 +164,8 @@ HINTS: dict[Reason, str] = {
         "one."
     ),
     Reason.AMBIGUOUS: (
-        "The photo fits several places, which `alternatives` lists: show more of the scene, or send a prior with a box "
-        "or a Gaussian, or the device's `gps`, `heading` and `up_in_camera`."
+        "The photo fits several places, which the result lists: show more of the scene, or send a prior with a box or "
+        "a Gaussian, or the device's position, heading and gravity."
     ),
     Reason.MIRRORED: (
         "The photo's mirror image fits the scene better: send it as it was taken; front cameras often mirror."

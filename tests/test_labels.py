@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
@@ -12,7 +13,7 @@ import pytest
 import service
 from service.estimators import ESTIMATORS
 from service.labels import TABLES, label
-from service.results import Reason
+from service.results import HINTS, Reason
 from service.types import IntrinsicsSource
 
 ROOT = Path(service.__file__).parent
@@ -74,3 +75,7 @@ def test_words_differ_and_are_no_identifiers(kind) -> None:
     assert len(set(words)) == len(words)
     assert not [text for text in words if "_" in text or not text.strip()]
     assert label(kind, "of_a_plug_in") == "of a plug in"
+
+
+def test_hints_are_words_too() -> None:
+    assert not [hint for hint in HINTS.values() if re.search(r"`|[a-z]_[a-z]", hint)]
