@@ -187,6 +187,8 @@ def test_a_photo_has_a_line_with_its_scene_where_several_were_searched() -> None
     quaternion = np.array(line.split("quaternion_wxyz ")[1].split(), float)
     assert np.linalg.norm(quaternion) == pytest.approx(1, abs=1e-3)
     assert photo_line("a.jpg", one.model_copy(update={"hint": "Go nearer."})) == f"{line}. Go nearer."
+    told = one.model_copy(update={"search_summary": "No feature matches.", "hint": "Go nearer."})
+    assert photo_line("a.jpg", told) == f"{line}. No feature matches. Go nearer."
     rank = RankedScene(id="room", inliers=9)
     several = one.model_copy(update={"hint": "", "scene_ranking": [rank]})
     assert photo_line("a.jpg", several) == line.replace("localized", "localized in room", 1)

@@ -17,7 +17,8 @@ def photo_line(name: str, result: Result) -> str:
     """Return one photo's result as a line."""
     status = f"{result.status} in {result.scene.id}" if result.scene_ranking else result.status
     line = _line(name, status, result.score, result.pose.world_from_camera)
-    return " ".join([f"{line}.", result.hint, *result.advice]) if result.hint else line
+    said = [text for text in (result.search_summary, result.hint, *result.advice) if text]
+    return " ".join([f"{line}.", *said]) if said else line
 
 
 def frame_line(frame: FrameOut) -> str:
