@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
-from service.geometry import so3_log
+from service.geometry import look_at, so3_log
 from service.scene_formats import camera_fit, colmap
 from service.scene_formats.camera_evidence import (
     EVIDENCE,
@@ -24,6 +25,8 @@ from service.scene_formats.camera_evidence import (
 )
 from service.scene_formats.camera_fit import FIT, about, fitted
 from service.scene_formats.frame_candidates import CameraFile, Candidate
+from service.scene_formats.gaussians import RawGaussians
+from service.scene_formats.similarity import moved_pose
 from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 LENS = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -143,6 +146,11 @@ def test_points_are_opaque_gaussians_or_all_where_none_is(opacity: float, kept: 
 # ------------------------------------------------------------------ what decides
 
 
+class PlantedFit(NamedTuple):
+    name: str
+    verified: bool
+
+
 class PlantedTrial:
     """Evidence by a candidate's name and fineness; a candidate is a peak unless it is named."""
 
@@ -167,8 +175,8 @@ class PlantedTrial:
     def same(self, a: Candidate, b: Candidate) -> bool:
         return a is b or "same" in self.flat
 
-    def fit(self, candidate: Candidate, found: Evidence, *, verified: bool) -> tuple[str, bool]:
-        return candidate.name, verified
+    def fit(self, candidate: Candidate, found: Evidence, *, verified: bool) -> PlantedFit:
+        return PlantedFit(candidate.name, verified)
 
     def none(self, by: str, hint: str = "") -> str:
         return by
@@ -270,6 +278,57 @@ def test_without_photos_two_readings_of_what_the_trainer_wrote_leave_a_doubt(mon
     assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.6, None)) == ("model1", False)
     assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.6, None), flat=["same"]) == ("model1", True)
     assert decided(monkeypatch, **nowhere, model1=(0.5, None), model2=(0.29, None)) == ("model1", True)
+
+
+def rooms(count: int, rng: np.random.Generator) -> tuple[RawGaussians, list[NamedCamera]]:
+    """A row of rooms of 4 by 4 by 2.4 units with different furniture, each with 20 level cameras in it."""
+    shells, cameras = [], []
+    for room in range(count):
+        wall = rng.uniform(-1, 1, (1500, 3))
+        side, sign = rng.integers(3, size=1500), rng.choice([-1.0, 1.0], 1500)
+        wall[np.arange(1500), side] = sign
+        box = rng.uniform(-0.3, 0.3, (200, 3)) + np.array([*rng.uniform(-0.5, 0.5, 2), -0.7])
+        middle = np.array([4.5 * room, 0.8 * (room % 3), 0.3 * (room % 2)])
+        shells.append(np.concatenate([wall, box]) * [2, 2, 1.2] + middle)
+        for number in range(20):
+            at = middle + rng.uniform(-0.7, 0.7, 3) * [2, 2, 0.5]
+            turn = 2 * np.pi * number / 20
+            pose = look_at(at, at + np.array([np.cos(turn), np.sin(turn), -0.1]), np.array([0.0, 0.0, 1.0]))
+            cameras.append(NamedCamera(f"{room}/{number}.png", Camera(LENS, pose)))
+    means = np.concatenate(shells).astype(np.float32)
+    n = len(means)
+    quats = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
+    scales, sh = np.full((n, 3), 0.03, np.float32), rng.normal(size=(n, 1, 3)).astype(np.float32)
+    return RawGaussians(means, quats, scales, np.full(n, 0.9, np.float32), sh), cameras
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_cameras_of_a_large_scene_are_judged_part_by_part(turned: bool) -> None:
+    raw, cameras = rooms(30, np.random.default_rng(0))
+    turn = np.eye(4)
+    turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]] if turned else np.eye(3)
+    moved = [replace(n, camera=replace(n.camera, pose=moved_pose(n.camera.pose, turn))) for n in cameras]
+    fit = fitted(raw, CameraFile(tuple(moved)), lambda named: None)
+    assert len(fit.cameras) == len(cameras)
+    # Ten cameras see a third of thirty rooms at most: the whole scene tells nothing.
+    poses = np.stack([n.camera.pose.world_from_camera for n in fit.cameras])
+    right = np.stack([n.camera.pose.world_from_camera for n in cameras])
+    np.testing.assert_allclose(poses[:, :3, 3], right[:, :3, 3], atol=1e-9)
+    if turned:
+        # Cameras all around in plain rooms may look the other way as well.
+        assert fit.is_doubtful or np.allclose(poses, right)
+    else:
+        np.testing.assert_allclose(poses, right, atol=1e-9)
+        assert fit.verified
+        assert not fit.warnings
+
+
+def test_cameras_of_another_large_scene_are_left_out() -> None:
+    raw, cameras = rooms(30, np.random.default_rng(0))
+    beside = np.eye(4)
+    beside[:3, 3] = [3.0, 40.0, -9.0]
+    moved = [replace(n, camera=replace(n.camera, pose=moved_pose(n.camera.pose, beside))) for n in cameras]
+    assert fitted(raw, CameraFile(tuple(moved)), lambda named: None).cameras == ()
 
 
 def test_placements_are_disturbed_by_five_degrees_and_fifteen_hundredths() -> None:

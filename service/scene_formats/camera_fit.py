@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
 
 from service.geometry import so3_exp
 from service.scene_formats.camera_evidence import EVIDENCE, Evidence, EvidenceConfig, Photo, Points, evidence, points_of
+from service.scene_formats.camera_parts import PARTS, Parts
 from service.scene_formats.frame_candidates import PLAIN, CameraFile, Candidate, candidates
 from service.scene_formats.gaussians import RawGaussians
 from service.types import NamedCamera
@@ -90,22 +91,38 @@ def fitted(
 
     `raw` is checked, in the scene file's frame; `background_rgb` is None where no file says it.
     """
-    trial = _Trial(raw, file, photo_of, background_rgb, config)
-    as_is = Candidate("")
     if len(file.cameras) < config.least_cameras or len(raw.means) < config.least_gaussians:
         return CameraFit(file.cameras, np.eye(4), "as the camera file has them; too few to check", False)
+    trial = _Trial(raw, file, photo_of, background_rgb, config)
+    fit = None if file.stated else _as_they_are(trial, config)
+    if fit and fit.verified:
+        return fit
+    if len(file.cameras) >= PARTS.least_cameras:
+        # A choice of the cameras sees little of a large scene, right or not.
+        trial.divide()
+        in_parts = (None if file.stated else _as_they_are(trial, config)) or _corrected(trial, file, config)
+        if in_parts.cameras:
+            return in_parts
+        trial.unite()
+    return fit or _corrected(trial, file, config)
+
+
+def _as_they_are(trial: _Trial, config: FitConfig) -> CameraFit | None:
+    """Return the cameras as their file has them, where that fits well enough to try nothing else."""
+    as_is = Candidate("")
     first = trial.evidence(as_is, EVIDENCE)
     _log.info("cameras as they are: %s", first)
-    if not file.stated:
-        if first.correlation is None and first.geometry >= config.plausible:
-            return trial.fit(as_is, first, verified=first.surrounded)
-        is_clear = first.correlation is not None and first.correlation >= config.clear_correlation
-        if is_clear and trial.is_peak(as_is, first, EVIDENCE, config.tie):
-            return trial.fit(as_is, first, verified=True)
-    found = [(trial.evidence(c, config.coarse), c) for c in candidates(file)]
     if first.correlation is None:
-        return _by_geometry(trial, found, config)
-    return _by_photos(trial, found, config)
+        return trial.fit(as_is, first, verified=first.surrounded) if first.geometry >= config.plausible else None
+    if first.correlation >= config.clear_correlation and trial.is_peak(as_is, first, EVIDENCE, config.tie):
+        return trial.fit(as_is, first, verified=True)
+    return None
+
+
+def _corrected(trial: _Trial, file: CameraFile, config: FitConfig) -> CameraFit:
+    """Return the cameras as the best candidate has them; without cameras where none fits."""
+    found = [(trial.evidence(c, config.coarse), c) for c in candidates(file)]
+    return (_by_geometry if found[0][0].correlation is None else _by_photos)(trial, found, config)
 
 
 def _by_photos(trial: _Trial, coarse: list[tuple[Evidence, Candidate]], config: FitConfig) -> CameraFit:
@@ -168,10 +185,22 @@ class _Trial:
         self._background_rgb, self._config = background_rgb, config
         self._points: dict[int, Points] = {}
         self._photos: dict[str, Photo | None] = {}
+        self._parts: Parts | None = None
         self.likely = 2 * len(file.stated) + len(PLAIN)
         """The first candidates: without a change, stated by files, without a change of the world."""
 
+    def divide(self) -> None:
+        """Ask for evidence part by part from now on."""
+        points = points_of(self._raw, self._background_rgb, replace(EVIDENCE, points=PARTS.points))
+        self._parts = Parts(points, self._file, self._photo)
+
+    def unite(self) -> None:
+        """Ask for evidence of the whole scene again."""
+        self._parts = None
+
     def evidence(self, candidate: Candidate, config: EvidenceConfig) -> Evidence:
+        if self._parts:
+            return self._parts.evidence(candidate, config)
         if config.points not in self._points:
             self._points[config.points] = points_of(self._raw, self._background_rgb, config)
         # Every so many: neighbours see the same.
@@ -183,7 +212,7 @@ class _Trial:
         """Whether the photos fit, and no better by more than `tie` where the cameras are turned and moved."""
         if found.score < self._config.least_correlation:
             return False
-        middle = self._points[config.points].middle
+        middle = self._parts.middle if self._parts else self._points[config.points].middle
         return all(
             self.evidence(candidate.then(about(middle, turn, stretch)), config).score < found.score + tie
             for turn, stretch in _disturbances(self._config)
