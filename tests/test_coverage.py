@@ -27,7 +27,7 @@ from service.coverage.coverage_map import CoverageMap, Trial, heading_of
 from service.coverage.degraded_renders import DEGRADATION, degraded_render
 from service.coverage.held_out_photos import held_out_photos
 from service.coverage.measurement import COVERAGE, Measurement, measured_coverage
-from service.coverage.plan import PLAN, _reached, find_places, novelty, plan_axes, pose_at, spread
+from service.coverage.plan import PLAN, _reached, assumed_up, find_places, novelty, plan_axes, pose_at, spread
 from service.coverage.plan_drawing import drawn_plan, level_colour
 from service.errors import CorruptScene
 from service.geometry import look_at, moved, project, transformed
@@ -195,6 +195,27 @@ def test_headings_and_poses_belong_together():
         x, y = project(above, PHOTO)[0]
         assert x == pytest.approx(160)
         assert y < 120
+
+
+def test_without_cameras_up_is_the_axis_of_those_usual_by_which_a_scene_is_flat() -> None:
+    room = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)) * [6.0, 4.0, 2.5]
+    assert assumed_up(room) == (0.0, 0.0, 1.0)
+    assert assumed_up(room[:, [0, 2, 1]]) == (0.0, -1.0, 0.0)
+    # A cube tells nothing.
+    assert assumed_up(room / [6.0, 4.0, 2.5]) == (0.0, 0.0, 1.0)
+
+
+def test_the_plan_of_a_scene_without_cameras_lies_level(measured) -> None:
+    """Its views are upright by z and by -y: the mean of both would be tilted by half a right angle."""
+    loaded = measured[0]
+    scene = replace(loaded.scene, cameras=(), info=replace(loaded.scene.info, up_in_world=None))
+    ups = [np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])]
+    captured = [
+        Camera(PHOTO, look_at(np.array([x, y, 0.0]), np.array([-x, y + 0.3, 0.1]), up))
+        for x in (-0.5, 0.5) for y in (-0.5, 0.0, 0.5) for up in ups
+    ]  # fmt: skip
+    places = find_places(scene, loaded.rasterizer, captured, 2.0, np.random.default_rng(0), SMALL.plan)
+    assert abs(places.plan_from_world[2]).max() == pytest.approx(1.0)
 
 
 def test_novelty_is_zero_at_a_camera_of_the_capture_and_grows_with_distance_and_turn():

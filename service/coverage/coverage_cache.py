@@ -17,7 +17,7 @@ from service.coverage.measurement import COVERAGE, CoverageConfig
 from service.disk_cache import mark_used
 from service.types import GaussianScene
 
-VERSION = 1
+VERSION = 2
 """Raise it with any change of the code that makes stored maps differ from fresh ones; the key covers the configs."""
 _log = logging.getLogger(__name__)
 

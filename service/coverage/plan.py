@@ -48,6 +48,8 @@ class PlanConfig:
 PLAN = PlanConfig()
 NEAREST = 4
 """Cameras from which a place must be in sight, one of them."""
+FLATTER = 0.8
+"""A scene's extent along -y, relative to that along z, below which -y is taken to be up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,10 @@ def find_places(
     config: PlanConfig = PLAN,
 ) -> Places:
     """Return where photos may be taken; `distance` is the typical one to what `captured`, at least one camera, see."""
-    space, plan = free_space_of(scene), plan_axes(captured, scene.info.up_in_world)
+    space = free_space_of(scene)
+    # Views that were placed without a known up direction are upright by several.
+    assumed = None if scene.cameras else assumed_up(space.points)
+    plan = plan_axes(captured, scene.info.up_in_world or assumed)
     at = np.array([plan @ camera.pose.position_in_world for camera in captured])
     cell, middles = _cells(at[:, :2], config.reach * distance, config.cells)
     headings = np.arange(config.headings) * 2 * np.pi / config.headings
@@ -124,6 +129,15 @@ def _reached(
     clear = space.free_distance(starts, directions, float(apart.max())).reshape(apart.shape)
     # A surface occupies whole cells, so free space ends up to a cell before it.
     return np.asarray((clear >= apart - space.cell).any(1))
+
+
+def assumed_up(points: Float64[np.ndarray, "n 3"]) -> tuple[float, float, float]:
+    """Return the up direction of a scene of which nothing tells it: z, or -y (COLMAP's) if it is much flatter by that.
+
+    Rooms, buildings and streets are wider than high.
+    """
+    _, y, z = np.subtract(*np.quantile(points, [0.95, 0.05], axis=0))
+    return (0.0, -1.0, 0.0) if y < FLATTER * z else (0.0, 0.0, 1.0)
 
 
 def plan_axes(captured: Sequence[Camera], up_in_world: tuple[float, float, float] | None) -> Float64[np.ndarray, "3 3"]:
