@@ -32,8 +32,9 @@ from viewer.viewer_server import Viewer
 
 # Every route has a decision; what is missing here fails the test.
 NOTHING = """
-GET /  GET /live  GET /client.js  GET /ui/x  GET /docs  GET /docs/swagger-ui-bundle.js  GET /docs/swagger-ui.css
+GET /  GET /live  GET /client.js  GET /ui/x  GET /ui/labels.js  GET /docs  GET /docs/swagger-ui-bundle.js
 GET /openapi.json  GET /key  GET /capabilities  GET /version  GET /livez  POST /tokens  GET /viewer-run
+GET /docs/swagger-ui.css
 """
 """Shows no scene and no job."""
 ADMIN = """
