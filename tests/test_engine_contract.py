@@ -196,7 +196,7 @@ def test_held_scenes_stay_until_the_last_one_lets_go(engine):
         engine.remove("room")
     for held in (first, first, second):  # the second time it is nothing
         engine.release(held.token)
-    assert engine.scene("room").jobs == 0
+    until(lambda: engine.scene("room").jobs == 0)
     assert engine.hold(["room", "room"]).ids == ("room",)
     with pytest.raises(SceneNotFound):
         engine.hold(["room", "none"])

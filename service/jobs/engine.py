@@ -165,7 +165,10 @@ class Engine(Protocol):
         ...
 
     def release(self, token: str) -> None:
-        """Let go of scenes that were held; without effect on a token that isn't known (any more)."""
+        """Let go of scenes that were held; without effect on a token that isn't known (any more).
+
+        On other machines that takes effect a moment later.
+        """
         ...
 
     def localize(self, task: LocalizeTask, on_record: OnRecord) -> EngineAnswer:
