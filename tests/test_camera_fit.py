@@ -323,6 +323,26 @@ def test_cameras_of_a_large_scene_are_judged_part_by_part(turned: bool) -> None:
         assert not fit.warnings
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_many_cameras_around_an_object_are_no_large_scene(turned: bool) -> None:
+    """What symmetric cameras around an object leave open, no part of them decides."""
+    rng = np.random.default_rng(0)
+    raw, _ = rooms(1, rng)
+    raw = replace(raw, means=raw.means * np.float32(0.3))
+    orbit = [2.5 * np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
+             for e in (0.2, 0.6) for a in np.linspace(0, 2 * np.pi, 100, endpoint=False)]  # fmt: skip
+    turn = np.eye(4)
+    turn[:3, :3] = np.diag([1, -1, -1]) if turned else np.eye(3)
+    cameras = [Camera(LENS, moved_pose(look_at(at, np.zeros(3), np.array([0.0, 0.0, 1.0])), turn)) for at in orbit]
+    file = CameraFile(tuple(NamedCamera(f"{i}.png", camera) for i, camera in enumerate(cameras)))
+    trial = camera_fit._Trial(raw, file, lambda named: None, None, FIT)
+    trial.divide()
+    assert trial.evidence(Candidate(""), EVIDENCE).geometry == 0
+    fit = fitted(raw, file, lambda named: None)
+    assert fit.cameras
+    assert fit.is_doubtful
+
+
 def test_cameras_of_another_large_scene_are_left_out() -> None:
     raw, cameras = rooms(30, np.random.default_rng(0))
     beside = np.eye(4)

@@ -97,14 +97,20 @@ def fitted(
     fit = None if file.stated else _as_they_are(trial, config)
     if fit and fit.verified:
         return fit
-    if len(file.cameras) >= PARTS.least_cameras:
-        # A choice of the cameras sees little of a large scene, right or not.
-        trial.divide()
-        in_parts = (None if file.stated else _as_they_are(trial, config)) or _corrected(trial, file, config)
-        if in_parts.cameras:
-            return in_parts
-        trial.unite()
-    return fit or _corrected(trial, file, config)
+    if len(file.cameras) < PARTS.least_cameras:
+        return fit or _corrected(trial, file, config)
+    # A choice of the cameras sees little of a large scene, right or not.
+    trial.divide()
+    in_parts = None if file.stated else _as_they_are(trial, config)
+    trial.unite()
+    if fit := in_parts or fit:
+        return fit
+    whole = _corrected(trial, file, config)
+    if whole.verified:
+        return whole
+    trial.divide()
+    corrected = _corrected(trial, file, config)
+    return corrected if corrected.cameras else whole
 
 
 def _as_they_are(trial: _Trial, config: FitConfig) -> CameraFit | None:

@@ -6,12 +6,13 @@ in every part. Wrong ones may do so in some part of a building, but elsewhere th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from service.geometry import project, transformed
 from service.scene_formats.camera_evidence import Evidence, EvidenceConfig, Photo, Points, evidence
 from service.scene_formats.frame_candidates import CameraFile, Candidate, corrected, poses_of
 from service.types import NamedCamera
@@ -31,6 +32,8 @@ class PartsConfig:
     points: int = 600_000
     """Of the whole scene, from which the parts' are taken."""
     least_points: int = 300
+    sample: int = 6000
+    """Points by which it is told how much of the whole scene a camera has in its image."""
     quantile: float = 0.25
     """Over the parts: this one's geometry is returned, and fewer may show nothing at all."""
 
@@ -62,8 +65,10 @@ class Parts:
         positions = corrected(poses_of(self._file.cameras), candidate.axes, self._file.stored_from_opencv)[:, :3, 3]
         step = max(1, parts.cameras // config.cameras)
         geometry, correlations = [], []
-        for number in range(parts.parts):
-            middle = positions[int((number + 0.5) / parts.parts * len(positions))]
+        middles = [int((number + 0.5) / parts.parts * len(positions)) for number in range(parts.parts)]
+        if self._share_in_view(candidate, middles) > config.part:  # an object that is seen from all sides
+            return Evidence(0.0, None)
+        for middle in positions[middles]:
             nearest = np.argsort(np.linalg.norm(positions - middle, axis=1), kind="stable")[: parts.cameras]
             found = self._of_part(candidate, np.sort(nearest)[::step], config)
             geometry.append(found.geometry)
@@ -74,6 +79,17 @@ class Parts:
         poor = float(np.quantile(geometry, parts.quantile))
         # Each camera sees but a part of the scene, which is around it.
         return Evidence(poor, float(np.mean(correlations)) if correlations else None, surrounded=True)
+
+    def _share_in_view(self, candidate: Candidate, chosen: Sequence[int]) -> float:
+        """Return the median share of the whole scene that these cameras have in their images, hidden or not."""
+        points = self._points.positions[:: max(1, len(self._points.positions) // self._config.sample)]
+        shares = []
+        for named in candidate.placed([self._file.cameras[i] for i in chosen], self._file):
+            size = [named.camera.intrinsics.width, named.camera.intrinsics.height]
+            in_camera = transformed(named.camera.pose.camera_from_world, points + self._points.middle)
+            px = project(in_camera[in_camera[:, 2] > 0], named.camera.intrinsics)
+            shares.append(float(((px > 0) & (px < size)).all(1).sum() / len(points)))
+        return float(np.median(shares))
 
     def _of_part(self, candidate: Candidate, chosen: Int64[np.ndarray, "k"], config: EvidenceConfig) -> Evidence:
         """Return what these cameras see of the points around them."""
