@@ -16,14 +16,14 @@ from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, Tools
 from service.matchers import MATCHERS
 from service.pose.features.unknown_background import WHITE, has_white_border, shows_background
-from service.pose.retrieval.floaters import without_floaters
 from service.pose.training_photos.digest import DIGEST, PhotoDigest, TrainingPhoto, digest_of, scene_key
 from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
 from service.render import RASTERIZERS
 from service.scene_formats import load_scene
-from service.scene_formats.cache import mapped_scene, release
+from service.scene_formats.cache import entry_of, mapped_scene, release
 from service.scene_formats.manifest import told_by_manifest
 from service.scene_formats.training_files import training_photo_path
+from service.searched_scene import renderer_of, searched_scene
 from service.types import GaussianScene, Query
 
 log = logging.getLogger(__name__)
@@ -79,10 +79,11 @@ class LoadedScene:
         the rasterizer that was named can't run.
         """
         scene = mapped_scene(folder, cache_dir) if cache_dir else load_scene(folder)
-        loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher)
+        entry = entry_of(scene)
+        loaded = cls.of(scene, cache_dir=cache_dir, rasterizer=rasterizer, matcher=matcher, entry=entry)
         if (folder / DIGEST_FILE).is_file():
             loaded.photo_digest = read_digest(folder / DIGEST_FILE, scene_key(scene))
-        release(scene)  # the rasterizer has its own copy
+        release(scene)  # the rasterizer has its own arrays
         return loaded
 
     @classmethod
@@ -93,11 +94,16 @@ class LoadedScene:
         cache_dir: Path | None = None,
         rasterizer: str | None = None,
         matcher: str = DEFAULT_MATCHER,
+        entry: Path | None = None,
     ) -> LoadedScene:
-        """Bind tools to a scene in memory. Raises UnknownName, and BackendMissing as `load`."""
+        """Bind tools to a scene in memory. Raises UnknownName, and BackendMissing as `load`.
+
+        `entry` is the cache's folder that this very scene is mapped from: what is derived from its Gaussians is kept
+        there. None of a scene that was changed in memory.
+        """
         MATCHERS.load(matcher)  # an unknown one is told before the scene is packed
-        searched = without_floaters(scene)
-        renderer, skipped_rasterizers, warnings = _renderer(searched, rasterizer)
+        searched = searched_scene(scene, entry)
+        renderer, skipped_rasterizers, warnings = _renderer(searched, entry, rasterizer)
         features = images = _matcher(matcher, renderer)
         if isinstance(images, ImageMatcher):
             # Views are retrieved by features of single images, which a matcher of pairs does not have.
@@ -223,15 +229,15 @@ def _matcher(name: str, renderer: Rasterizer) -> Any:
     return create_on(renderer.tensor_device) if create_on else module.create()
 
 
-def _renderer(scene: GaussianScene, name: str | None) -> tuple[Rasterizer, str, tuple[str, ...]]:
+def _renderer(searched: GaussianScene, entry: Path | None, name: str | None) -> tuple[Rasterizer, str, tuple[str, ...]]:
     """Return the rasterizer, why it isn't an earlier one of RASTERIZER_ORDER, and what results should warn of."""
     if name:
-        return RASTERIZERS.load(name).create(scene), "", ()
+        return renderer_of(searched, entry, name), "", ()
     name, skipped_rasterizers = choose_rasterizer()
     try:
-        return RASTERIZERS.load(name).create(scene), skipped_rasterizers, ()
+        return renderer_of(searched, entry, name), skipped_rasterizers, ()
     except BackendMissing as error:  # the GPU's memory may be full
         last = RASTERIZER_ORDER[-1]
         if name == last:
             raise
-        return RASTERIZERS.load(last).create(scene), str(error), (f"rendered with {last}: {error}",)
+        return renderer_of(searched, entry, last), str(error), (f"rendered with {last}: {error}",)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import threading
 import zipfile
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
@@ -16,8 +18,11 @@ import torch
 from api_server import assert_problem, create_app, finished, post, serving, settings, until, until_ready
 from stand_ins import make_scene
 
+from service import searched_scene
 from service.errors import BadInput, CorruptScene, InvalidRequest, UnsupportedFormat
 from service.loaded_scene import LoadedScene
+from service.render import pack
+from service.render.cpu import CpuRasterizer
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
 from service.scene_manager.entry import Entry
@@ -364,6 +369,69 @@ def test_a_second_load_maps_the_same_scene(folder, tmp_path):
         loaded.rasterizer.render([overview(loaded, 64)])[0].rgb for loaded in map(LoadedScene.of, (read, second))
     ]
     assert np.array_equal(*pictures)
+
+
+def test_a_second_load_looks_at_no_gaussian(folder, tmp_path, monkeypatch):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    # Without every second one; their opacities are what a scene without floaters differs in.
+    odd = np.arange(50) % 2 == 1
+
+    def without(scene: GaussianScene) -> GaussianScene:
+        return replace(scene, opacities=np.where(odd, np.float32(0), scene.opacities))
+
+    monkeypatch.setattr(searched_scene, "without_floaters", without)
+    read = load_scene(path)
+    expected = CpuRasterizer(without(read))
+    camera = overview(LoadedScene.of(read), 64)
+    (picture,) = expected.render([camera])
+    LoadedScene.load(path, cache_dir=cache)
+    monkeypatch.setattr(searched_scene, "without_floaters", None)
+    monkeypatch.setattr(pack, "pack", None)
+    loaded = LoadedScene.load(path, cache_dir=cache)
+    assert np.array_equal(loaded.searched.opacities > 0, ~odd)
+    assert np.array_equal(loaded.scene.opacities, read.opacities)
+    for name in ("order", "geometry", "sh", "spheres"):
+        mapped = getattr(loaded.rasterizer.packed, name)
+        assert isinstance(mapped.base, np.memmap)
+        assert np.array_equal(mapped, getattr(expected.packed, name))
+    assert np.array_equal(loaded.rasterizer.render([camera])[0].rgb, picture.rgb)
+    # Gradients write into none of what is mapped.
+    gradients = loaded.rasterizer.scene_gradients(camera, np.ones_like(picture.rgb))
+    assert np.array_equal(gradients.index % 2, np.zeros(len(gradients.index)))
+
+
+@pytest.mark.parametrize("garbage", [b"", b"\x93NUMPY garbage", "half", "another"])
+def test_a_damaged_packed_scene_is_packed_again(folder, tmp_path, garbage):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    LoadedScene.load(path, cache_dir=cache)
+    (file,) = (cache / "scenes").glob("*/packed-*/sh.npy")
+    (opacities,) = (cache / "scenes").glob("*/searched-*/opacities.npy")
+    written = file.read_bytes()
+    if garbage == "another":  # whole files, of another scene
+        np.save(file, np.zeros(16, np.float32))
+        np.save(opacities, np.zeros(3, np.float32))
+    else:
+        file.write_bytes(written[: len(written) // 2] if garbage == "half" else garbage)
+        opacities.write_bytes(b"" if garbage == "half" else garbage)
+    loaded = LoadedScene.load(path, cache_dir=cache)
+    assert loaded.searched is loaded.scene
+    assert np.array_equal(loaded.rasterizer.packed.sh, CpuRasterizer(load_scene(path)).packed.sh)
+    assert file.read_bytes() == written
+    # One folder of each, no drafts.
+    folders = [entry.name.split("-")[0] for entry in file.parents[1].iterdir() if entry.is_dir()]
+    assert sorted(folders) == ["packed", "searched"]
+
+
+def test_a_file_replaced_by_one_of_its_size_and_time_is_read(folder, tmp_path):
+    path, cache = folder / "attic", tmp_path / "cache2"
+    mapped_scene(path, cache)
+    file = path / "scene.ply"
+    stat, other = file.stat(), file.read_bytes()[:-4] + np.float32(0.5).tobytes()
+    (path / "new").write_bytes(other)
+    os.utime(path / "new", ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    (path / "new").replace(file)
+    assert (file.stat().st_size, file.stat().st_mtime_ns) == (stat.st_size, stat.st_mtime_ns)
+    assert mapped_scene(path, cache).info.sha256 == load_scene(path).info.sha256
 
 
 def test_a_changed_or_damaged_scene_is_read_anew(folder, tmp_path):

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import repeat
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from jaxtyping import Float32, Float64
 from service.interfaces import Frame, Rasterizer, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
 from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, blend
-from service.render.pack import LANES, Packed, aligned, fill, pack
+from service.render.pack import LANES, Packed, aligned, fill, mapped_pack, pack
 from service.render.project import RECORD, TILE, project
 from service.render.projection_gradients import ROW, pose_twist, scene_rows, unpack_rows
 from service.render.tiles import fill_tiles, sort_by_depth
@@ -57,6 +58,11 @@ def create(scene: GaussianScene) -> CpuRasterizer:
     return CpuRasterizer(scene)
 
 
+def create_mapped(scene: GaussianScene, folder: Path) -> CpuRasterizer:
+    """Map the packed scene from a folder, which is filled if it is empty: milliseconds at any size the next time."""
+    return CpuRasterizer(scene, mapped_pack(scene, folder))
+
+
 def dilation_for(camera: Camera, info: SceneInfo) -> float:
     """Return the dilation in px^2 for a render: that of training times (f_render / f_train)^2."""
     if info.training_focal_px:
@@ -75,9 +81,9 @@ class CpuRasterizer(Rasterizer):
 
     name = "cpu"
 
-    def __init__(self, scene: GaussianScene) -> None:
+    def __init__(self, scene: GaussianScene, packed: Packed | None = None) -> None:
         self.scene = scene
-        self.packed = pack(scene)
+        self.packed = packed or pack(scene)
         self._background = np.asarray(scene.info.background_rgb, np.float32)
         self._local = threading.local()
 

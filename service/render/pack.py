@@ -13,12 +13,16 @@ computed once. The last chunk is filled up with Gaussians that are never visible
 
 from __future__ import annotations
 
+import logging
+import shutil
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32, Int32
 
 from service.jit import kernel
+from service.mapped_arrays import open_arrays, write_arrays
 from service.types import GaussianScene
 
 LANES = 16
@@ -30,6 +34,10 @@ VISIBLE_SIGMAS = 3.33
 """exp(-x^2 / 2) = 1/255 at x = 3.33: beyond it even an opaque Gaussian is skipped."""
 NEVER = -1e9
 """log2 of the opacity of a Gaussian that is never visible."""
+VERSION = 1
+"""Of the layout in files."""
+_ARRAYS = ("order", "geometry", "sh", "spheres")
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +74,56 @@ def aligned(count: int, dtype: type = np.float32) -> np.ndarray:
 def pack(scene: GaussianScene) -> Packed:
     """Order the Gaussians along a space-filling curve and write them in the kernels' layout."""
     order = morton_order(scene.means)
-    padded = -(-scene.count // LANES) * LANES
+    layout = _layout(scene)
+    (padded,) = layout["order"][0]
     order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])
-    chunks = padded // LANES
-    coefficients = scene.sh.shape[1] * 3
-    packed = Packed(
-        scene.count,
-        scene.sh_degree,
-        order,
-        aligned(chunks * GEOMETRY * LANES),
-        aligned(chunks * coefficients * LANES),
-        np.empty((-(-chunks // CHUNKS_PER_BLOCK), 4), np.float32),
-    )
+    geometry, sh = (aligned(layout[name][0][0]) for name in ("geometry", "sh"))
+    packed = Packed(scene.count, scene.sh_degree, order, geometry, sh, np.empty(*layout["spheres"]))
     fill(packed, scene)
     return packed
+
+
+def mapped_pack(scene: GaussianScene, folder: Path) -> Packed:
+    """Return the packed scene, mapped from the arrays in a folder; packs it and writes them if they aren't there.
+
+    The folder is of this scene alone (see `service/searched_scene.py`). What is damaged is written again; where it
+    can't be written, the packed scene is in memory.
+    """
+    try:
+        return _opened(scene, folder)
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        _log.warning("%s is rebuilt: %s", folder, error)
+        shutil.rmtree(folder, ignore_errors=True)
+    packed = pack(scene)
+    try:
+        write_arrays(folder, {name: getattr(packed, name) for name in _ARRAYS})
+        return _opened(scene, folder)
+    except OSError as error:
+        _log.warning("the packed scene is not cached: %s", error)
+        return packed
+
+
+def _opened(scene: GaussianScene, folder: Path) -> Packed:
+    # As if writable, so that kernels aren't compiled a second time for read-only arrays; none of them writes.
+    arrays = {name: np.asarray(array) for name, array in open_arrays(folder, _ARRAYS, "c").items()}
+    packed = Packed(scene.count, scene.sh_degree, **arrays)
+    for name, (shape, dtype) in _layout(scene).items():
+        if (arrays[name].shape, arrays[name].dtype) != (shape, dtype):
+            raise ValueError(f"{name} is {arrays[name].dtype} of {arrays[name].shape}, not {dtype} of {shape}")
+    return packed
+
+
+def _layout(scene: GaussianScene) -> dict[str, tuple[tuple[int, ...], type]]:
+    """Return shape and type of each packed array."""
+    chunks = -(-scene.count // LANES)
+    return {
+        "order": ((chunks * LANES,), np.int32),
+        "geometry": ((chunks * GEOMETRY * LANES,), np.float32),
+        "sh": ((chunks * scene.sh.shape[1] * 3 * LANES,), np.float32),
+        "spheres": ((-(-chunks // CHUNKS_PER_BLOCK), 4), np.float32),
+    }
 
 
 def fill(packed: Packed, scene: GaussianScene) -> None:

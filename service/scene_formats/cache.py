@@ -1,9 +1,11 @@
 """Cache of loaded scenes: their arrays as memory-mapped files, so that opening one takes milliseconds at any size.
 
-    CACHE/scenes/KEY/  means.npy quats.npy scales.npy opacities.npy sh.npy  scene.json (all else)
+    CACHE/scenes/KEY/  means.npy quats.npy scales.npy opacities.npy sh.npy poses.npy  scene.json (all else)
 
-The key is a hash of the names, sizes and modification times of the scene's files, which are not read for it. Arrays
-are written by `numpy.save` and opened without pickle; a damaged or outdated entry is rebuilt.
+The key is a hash of the names, sizes, modification times and inodes of the scene's files, which are not read for it:
+the digest in `SceneInfo.sha256` is of the time they were read. A file that is replaced has another inode, one that is
+written has another time. A damaged or outdated entry is rebuilt. What is derived from a scene's Gaussians is kept in
+its entry, too (`entry_of`), and goes with it.
 """
 
 from __future__ import annotations
@@ -11,7 +13,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import mmap
-import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,21 +22,24 @@ import numpy as np
 
 from service.codec import decode, encode
 from service.disk_cache import mark_used
+from service.mapped_arrays import open_arrays, write_arrays
 from service.scene_formats.folder import load_scene
 from service.scene_formats.layouts import files_of
-from service.types import GaussianScene, NamedCamera, SceneInfo
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
-_VERSION = 3
+_VERSION = 4
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class _Facts:
-    """All of a scene but its arrays."""
+    """All of a scene but its arrays. Thousands of cameras share a lens or a few, and their poses are an array, too."""
 
     info: SceneInfo
-    cameras: tuple[NamedCamera, ...]
+    camera_names: tuple[str, ...]
+    lens_of_camera: tuple[int, ...]
+    lenses: tuple[Intrinsics, ...]
 
 
 def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
@@ -61,41 +65,54 @@ def mapped_scene(path: Path, cache_dir: Path) -> GaussianScene:
     return scene
 
 
+def entry_of(scene: GaussianScene) -> Path | None:
+    """Return the cache's folder that a scene is mapped from; None: it isn't mapped."""
+    mapping = _mapping(scene.means)
+    return None if mapping is None else Path(mapping.filename).parent
+
+
 def release(scene: GaussianScene) -> None:
     """Return the memory of a mapped scene's arrays to the system; pages that are used again are read from disk."""
     for name in _ARRAYS:
-        array: Any = getattr(scene, name)
-        # Through the views (slices, reshapes) down to the mapping itself.
-        while array is not None and not isinstance(array, np.memmap):
-            array = array.base
-        if array is not None and hasattr(mmap, "MADV_DONTNEED"):
-            array._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+        mapping = _mapping(getattr(scene, name))
+        if mapping is not None and hasattr(mmap, "MADV_DONTNEED"):
+            mapping._mmap.madvise(mmap.MADV_DONTNEED)  # type: ignore[attr-defined]
+
+
+def _mapping(array: Any) -> Any:
+    """Return the memory map that an array is a view of (through slices and reshapes), None if it is of none."""
+    while array is not None and not isinstance(array, np.memmap):
+        array = array.base
+    return array
 
 
 def _key(path: Path) -> str:
     """Hash the stamps of all files that `load_scene` may read."""
-    stamps = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in sorted(set(files_of(path)))]
+    stats = [(str(file), file.stat()) for file in sorted(set(files_of(path)))]
+    stamps = [(name, stat.st_size, stat.st_mtime_ns, stat.st_ino) for name, stat in stats]
     return hashlib.sha256(repr((_VERSION, str(path.resolve()), stamps)).encode()).hexdigest()[:32]
 
 
 def _opened(folder: Path) -> GaussianScene:
     facts = decode(_Facts, (folder / "scene.json").read_text("utf-8"))
-    arrays = {name: np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
-    scene = GaussianScene(**arrays, info=facts.info, cameras=facts.cameras)
+    arrays = open_arrays(folder, _ARRAYS)
+    poses = np.load(folder / "poses.npy", allow_pickle=False)
+    cameras = tuple(
+        NamedCamera(name, Camera(facts.lenses[lens], Pose(pose)))
+        for name, lens, pose in zip(facts.camera_names, facts.lens_of_camera, poses, strict=True)
+    )
+    scene = GaussianScene(**arrays, info=facts.info, cameras=cameras)
     if len({len(array) for array in arrays.values()}) != 1:
         raise ValueError("arrays of different lengths")
     return scene
 
 
 def _write(folder: Path, scene: GaussianScene) -> None:
-    # Written beside its place and renamed: another process sees all of it or nothing.
-    draft = folder.with_name(f"{folder.name}.{os.getpid()}")
-    shutil.rmtree(draft, ignore_errors=True)
-    draft.mkdir(parents=True)
-    try:
-        for name in _ARRAYS:
-            np.save(draft / f"{name}.npy", getattr(scene, name), allow_pickle=False)
-        (draft / "scene.json").write_text(encode(_Facts(scene.info, scene.cameras)), "utf-8")
-        draft.replace(folder)
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
+    cameras = [named.camera for named in scene.cameras]
+    lenses = {camera.intrinsics: None for camera in cameras}
+    places = {lens: place for place, lens in enumerate(lenses)}
+    lens_of_camera = tuple(places[camera.intrinsics] for camera in cameras)
+    facts = _Facts(scene.info, tuple(named.name for named in scene.cameras), lens_of_camera, tuple(lenses))
+    poses = np.array([camera.pose.world_from_camera for camera in cameras]).reshape(-1, 4, 4)
+    arrays = {name: getattr(scene, name) for name in _ARRAYS} | {"poses": poses}
+    write_arrays(folder, arrays, {"scene.json": encode(facts)})
