@@ -42,6 +42,28 @@ class FileEvent:
         return True
 
 
+class PlannedNumbers:
+    """A generator whose uniform numbers lie at this share of their range and whose normal ones so many sigmas away."""
+
+    def __init__(self, share: float = 0.5, sigmas: float = 0.0) -> None:
+        self.share, self.sigmas = share, sigmas
+
+    def uniform(self, low=0.0, high=1.0, size=None):
+        return np.full(() if size is None else size, low + self.share * (np.asarray(high) - low))[()]
+
+    def normal(self, mean=0.0, sigma=1.0, size=None):
+        return np.full(() if size is None else size, mean + self.sigmas * sigma)[()]
+
+    def standard_normal(self, size=None, dtype=np.float64):
+        return np.asarray(self.normal(size=size), dtype)[()]
+
+    def choice(self, values, size=None, p=None):
+        """Return the last values, or of the numbers below one each in turn."""
+        if isinstance(values, int):
+            return np.arange(size) % values
+        return np.resize(np.asarray(values)[-1:], size)
+
+
 class FlatRasterizer(Rasterizer):
     """Every picture is mid-grey."""
 

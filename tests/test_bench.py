@@ -12,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from stand_ins import PlannedNumbers
+
 from service.accuracy import Accuracy
 from service.bench import localize as bench
 from service.bench import modifications
@@ -349,9 +351,18 @@ class TestStarts:
     )
     @given(seed=st.integers(0, 1000))
     def test_world_frame(self, kind, degrees, lengths, seed):
-        """Undone by hand in the normalized frame: start = T Rz Ry Rx gt."""
+        angles, shift = self.change(kind, np.random.default_rng(seed))
+        assert np.all((shift >= lengths[0] - 1e-9) & (shift <= lengths[1] + 1e-9))
+        assert np.all((angles >= degrees[0] - 1e-6) & (angles <= degrees[1] + 1e-6))
+        for end in (0, 1):
+            angles, shift = self.change(kind, PlannedNumbers(end))
+            assert angles == pytest.approx(np.full(3, degrees[end]), abs=1e-6)
+            assert shift == pytest.approx(np.full(3, lengths[end]), abs=1e-9)
+
+    def change(self, kind, rng):
+        """Return angles and shift of a start, undone by hand in the normalized frame: start = T Rz Ry Rx gt."""
         truth = poses()[1]
-        start = start_pose(kind, truth, self.UNITS, self.CAMERAS, np.random.default_rng(seed))
+        start = start_pose(kind, truth, self.UNITS, self.CAMERAS, rng)
         assert start is not None
         normalized = self.UNITS.normalized_from_world()
         both = []
@@ -361,12 +372,9 @@ class TestStarts:
             matrix[:3, 3] = (normalized @ [*pose.position_in_world, 1])[:3]
             both.append(matrix)
         change = both[0] @ np.linalg.inv(both[1])
-        assert np.all(np.abs(change[:3, 3]) >= lengths[0] - 1e-9)
-        assert np.all(np.abs(change[:3, 3]) <= lengths[1] + 1e-9)
         r = change[:3, :3]  # Rz Ry Rx, taken apart
         angles = np.degrees([np.arctan2(r[2, 1], r[2, 2]), -np.arcsin(r[2, 0]), np.arctan2(r[1, 0], r[0, 0])])
-        assert np.all(np.abs(angles) >= degrees[0] - 1e-6)
-        assert np.all(np.abs(angles) <= degrees[1] + 1e-6)
+        return np.abs(angles), np.abs(change[:3, 3])
 
     def test_as_far_as_the_protocol_says(self):
         """Three turns of up to 30 degrees are some 30 together; 4 units from the focus that is over a unit off."""
@@ -597,6 +605,34 @@ class TestRoom:
         shares = [np.mean(flat & np.isclose(means[:, 2], level)) for level in (1.5, -1.5)]
         beneath = 1.2 * 1.8 + 1.0 * 2.2 + 2.4 * 0.8 + 2.0 * 0.7 + 0.8 * 0.8 + 0.9 * 0.9
         assert shares == pytest.approx([48 / area, (48 + beneath) / area], abs=0.01)
+
+    def test_gaussians_that_are_a_sigma_larger_brighter_and_more_coloured(self, monkeypatch):
+        monkeypatch.setattr(render_bench.np.random, "default_rng", lambda seed: PlannedNumbers(sigmas=1.0))
+        room = render_bench.synthetic_room(400, sh_degree=1)
+        wide = 0.8 * np.sqrt(238.82 / 400) * np.exp(0.35)  # the area by hand, above
+        assert room.scales == pytest.approx(np.tile([wide, wide, 0.1 * wide], (400, 1)), rel=1e-5)
+        assert room.opacities == pytest.approx(np.full(400, 0.924142), abs=1e-6)  # the logistic function at 1 + 1.5
+        # A tenth, with centres that are drawn from all of the room, is in the middle; the others in their faces'.
+        assert np.count_nonzero(np.all(room.means == 0, axis=1)) == 40
+        x, y, z = room.means[0].astype(float)
+        assert (x, y, z) == (-4, 0, 0)
+        # Red varies with x, green with y, blue with z, and all with x.
+        assert room.sh[0, 0] == pytest.approx(1.2 * np.sin([1.3 * -4 - 4, -4, -4]), abs=1e-5)
+        assert room.sh[:, 1:] == pytest.approx(np.full((400, 3, 3), 0.05))
+
+    def test_opacities_are_between_none_and_full(self):
+        room = render_bench.synthetic_room(2000)
+        assert 0 < room.opacities.min() < 0.2
+        assert 0.95 < room.opacities.max() < 1
+
+    def test_any_normal_is_the_thin_axis(self):
+        normals = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [0, -1, 0], [0.6, 0, -0.8], [0.48, 0.6, 0.64]])
+        for share in (0.0, 0.3):
+            turned = rotation_from_quat(render_bench._rotations_to(normals, PlannedNumbers(share)))
+            assert turned[:, :, 2] == pytest.approx(normals, abs=1e-12)
+            # The upright one is turned about its own axis by twice what is drawn of half a turn.
+            angle = 2 * np.pi * share
+            assert turned[0, :, 0] == pytest.approx([np.cos(angle), np.sin(angle), 0], abs=1e-12)
 
     def test_cameras_are_inside_and_see_7_to_10_percent(self):
         room = render_bench.synthetic_room(20_000)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 
 from service.bench.localize import load_bench_scene
+from service.bench.peer import comparison
 from service.bench.peer.comparison import MIN_INLIERS, PEERS, Task, figures, run
 from service.bench.peer.photo_map import PhotoMap, Points, PosedPhoto
 from service.bench.peer.photo_matching import (
@@ -24,11 +27,12 @@ from service.bench.peer.photo_matching import (
     pairs_of_cameras,
 )
 from service.bench.peer.words import Words
-from service.bench.pose_metrics import Outcome
+from service.bench.pose_metrics import Outcome, Units
 from service.errors import BackendMissing, SceneNotFound, UnknownName
 from service.geometry import pose_distance, so3_exp
+from service.photos.images import encode_image
 from service.results import Status
-from service.types import Camera, Intrinsics, Pose
+from service.types import Camera, Intrinsics, NamedCamera, Pose
 
 STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
 K = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
@@ -200,6 +204,74 @@ def test_unknown_methods_and_missing_packages_are_named(tmp_path: Path, monkeypa
     with pytest.raises(BackendMissing) as missing:
         import service.bench.peer.colmap  # noqa: F401
     assert "splatfix[peer]" in (missing.value.hint or "")
+
+
+def test_each_photo_is_timed_after_one_that_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, step in (("perf_counter", 0.5), ("process_time", 0.25)):  # seconds from one look to the next
+        ticks = itertools.count()
+        monkeypatch.setattr(comparison.time, name, lambda ticks=ticks, step=step: step * next(ticks))
+    asked: list[str] = []
+    beside = np.eye(4)
+    beside[2, 3] = 0.1
+    trials: list[Any] = [SimpleNamespace(photo=name, truth=Camera(K, Pose(np.eye(4)))) for name in "ab"]
+    scene: Any = SimpleNamespace(units=Units(np.zeros(3), 2.0, False))
+
+    def localize_one(trial: Any) -> comparison.Answer:
+        asked.append(trial.photo)
+        return (Pose(beside), Status.LOCALIZED) if trial.photo == "a" else (None, Status.NOT_LOCALIZED)
+
+    one, other = comparison.measured(scene, trials, localize_one)
+    assert asked == ["a", "a", "b"]
+    assert one == Outcome(Status.LOCALIZED, 0.0, pytest.approx(0.2), 500.0, 250.0)
+    assert other == Outcome(Status.NOT_LOCALIZED, 180.0, np.inf, 500.0, 250.0)
+
+
+@pytest.mark.parametrize(("method", "ranked"), [("sift_best10", True), ("dog_direct", False)])
+def test_a_peers_answer_counts_from_twelve_inliers_on(method: str, ranked: bool, monkeypatch, tmp_path: Path) -> None:
+    asked: list[Any] = []
+    answers = [None, (Pose(np.eye(4)), 11), (Pose(np.eye(4)), 12)]
+
+    class Map(SimpleNamespace):
+        def localize(self, photo: PosedPhoto, peer: Any, best_photos: int) -> tuple[Pose, int] | None:
+            asked.append((photo.camera.intrinsics, best_photos))
+            return answers.pop(0)
+
+    def of(photos: Any, peer: Any, ranks_photos: bool) -> Map:
+        asked.append((photos, peer, ranks_photos))
+        return Map(facts=SimpleNamespace(build_cpu_s=3.0, points=40), nbytes=77)
+
+    monkeypatch.setitem(sys.modules, "service.bench.peer.colmap", SimpleNamespace(Colmap=lambda sift: sift))
+    monkeypatch.setattr(comparison, "training_photos", lambda scene, folder: folder)
+    monkeypatch.setattr(comparison.PhotoMap, "of", of)
+    scene: Any = SimpleNamespace(background_rgb=(0.0, 0.0, 0.0))
+    facts, localize_one = comparison._peer(scene, Task(tmp_path), PEERS[method])
+    assert facts == {"build_cpu_s": 3.0, "map_bytes": 77, "points": 40}
+    data = encode_image(np.zeros((240, 320, 3), np.uint8), "png")
+    trial: Any = SimpleNamespace(data=data, intrinsics=K, truth=camera(0))
+    found = [localize_one(trial)[1] for _ in range(3)]
+    assert found == [Status.NOT_LOCALIZED, Status.UNCERTAIN, Status.LOCALIZED]
+    assert asked == [(tmp_path, PEERS[method].sift, ranked), *[(K, 10 if ranked else 0)] * 3]
+
+
+def test_training_photos_are_those_that_lie_there_in_their_cameras_shape(tmp_path: Path) -> None:
+    # Half as large; too high by less and by more than a hundredth; no picture; not there.
+    sizes = {"half.png": (120, 160), "bent.png": (161, 213), "other.png": (120, 163)}
+    for name, size in sizes.items():
+        (tmp_path / name).write_bytes(encode_image(np.zeros((*size, 3), np.uint8), "png"))
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    cameras = [NamedCamera(name, camera(0)) for name in (*sizes, "broken.png", "missing.png")]
+    info = SimpleNamespace(origin_in_world=(100.0, 20.0, 3.0))
+    scene: Any = SimpleNamespace(
+        background_rgb=(0.0, 0.0, 0.0), loaded=SimpleNamespace(scene=SimpleNamespace(info=info, cameras=cameras))
+    )
+    photos = comparison.training_photos(scene, tmp_path)
+    assert [each.grey.shape for each in photos] == [(120, 160), (161, 213)]
+    first = photos[0].camera
+    assert first.pose.position_in_world == pytest.approx(camera(0).pose.position_in_world + [100.0, 20.0, 3.0])
+    assert (first.intrinsics.fx, first.intrinsics.cx) == (150.0, 80.0)
+    cameras[1:3] = []
+    with pytest.raises(SceneNotFound, match="fewer than two photos"):
+        comparison.training_photos(scene, tmp_path)
 
 
 @pytest.mark.skipif(not find_spec("pycolmap"), reason="pycolmap isn't installed: pip install 'splatfix[peer]'")

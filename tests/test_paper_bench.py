@@ -544,6 +544,13 @@ def test_the_first_query_is_answered_untimed(scene, monkeypatch):
     assert asked == ["first"]
 
 
+def test_progress_counts_answers_and_those_within_the_bounds():
+    progress = runs.Progress()
+    for degrees in (1.0, 90.0, 2.0):
+        runs._count(progress, line(degrees=degrees))
+    assert (list(progress.done.values()), list(progress.within.values())) == ([3], [2])
+
+
 def test_lines_of_several_versions_are_told_apart():
     scene = {"gaussians": 1000, "test_photos": 2, "layout": "scene"}
     config = {"scenes": {"s": scene}, "general": {"seed": 0, "matcher": "xfeat"}}
