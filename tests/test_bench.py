@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-
 from stand_ins import PlannedNumbers
 
 from service.accuracy import Accuracy

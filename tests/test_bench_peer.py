@@ -267,7 +267,7 @@ def test_training_photos_are_those_that_lie_there_in_their_cameras_shape(tmp_pat
     photos = comparison.training_photos(scene, tmp_path)
     assert [each.grey.shape for each in photos] == [(120, 160), (161, 213)]
     first = photos[0].camera
-    assert first.pose.position_in_world == pytest.approx(camera(0).pose.position_in_world + [100.0, 20.0, 3.0])
+    assert first.pose.position_in_world == pytest.approx(np.add(camera(0).pose.position_in_world, [100, 20, 3]))
     assert (first.intrinsics.fx, first.intrinsics.cx) == (150.0, 80.0)
     cameras[1:3] = []
     with pytest.raises(SceneNotFound, match="fewer than two photos"):
