@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import io
+import itertools
 import json
 import os
 import pkgutil
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -30,6 +32,7 @@ import service
 import service.__main__
 from service import jit
 from service.accuracy import Accuracy
+from service.bench.rigs import MODIFICATIONS as RIG_MODIFICATIONS
 from service.cli.render import render
 from service.geometry import moved, pose_distance
 from service.scene_manager.anchor_store import Anchor, FileAnchorStore
@@ -436,6 +439,89 @@ def test_bench_paper_shows_how_far_it_is():
     assert "4 of 30 queries, 13 minutes to go" in told
 
 
+def test_bench_paper_says_once_a_minute_how_far_it_is_where_no_table_can_be_drawn(monkeypatch, capsys):
+    from service.bench.paper.runs import Progress
+    from service.cli import bench_paper
+
+    seconds = iter([100.0, 130.0, 160.0, 160.5, 161.0, 220.4, 220.6, 221.0])
+    monkeypatch.setattr(bench_paper, "time", SimpleNamespace(monotonic=lambda: next(seconds)))
+    standing = Progress(total={("fern", "a"): 30, ("fern", "b"): 6}, done={("fern", "a"): 3}, expected_s=40.0)
+    with bench_paper._live_table() as show:
+        for _ in range(5):  # 30, 60, 60.5, 59.4 and 59.6 seconds after the last line
+            show(standing)
+    assert capsys.readouterr().err.splitlines() == ["3 of 36 queries, 22 minutes to go"]
+
+
+def test_bench_peer_has_a_line_for_each_scene_and_method(splatfix, monkeypatch, tmp_path):
+    from service.bench.peer import comparison
+
+    given: list = []
+    row = {
+        "scene": "chair-of-materials", "method": "dog_direct", "photos": 20, "right_1deg_0p01": 7,
+        "right_5deg_0p05": 9, "false_localized": 2, "median_rotation_deg": 1.23456,
+        "median_translation_units": 0.012345, "cpu_ms_p50": 432.4, "build_cpu_s": 12.34, "peak_bytes": 1_234_000_000,
+    }  # fmt: skip
+
+    def run(tasks, methods, progress):
+        given.append((tasks, methods))
+        progress(1, 2)
+        yield row
+
+    monkeypatch.setattr(comparison, "run", run)
+    flags = ("--layout", "scene", "--modify", "gain=2", "--seed", "3", "--json", tmp_path / "o.json")
+    code, told, complaints = splatfix("bench", "peer", "A", "B", *flags)
+    assert code == 0
+    assert "core" in complaints
+    tasks = [comparison.Task(Path(name), None, "scene", ("gain=2",), 3) for name in "AB"]
+    assert given == [(tasks, comparison.METHODS)]
+    assert json.loads((tmp_path / "o.json").read_text()) == [row]
+    names, figures = told.splitlines()
+    assert names.split()[:2] == ["scene", "method"]
+    assert figures.split() == [
+        "chair-of-mat", "dog_direct", "7/20", "9/20", "2", "1.235", "0.01235", "432", "12.3", "1234",
+    ]  # fmt: skip
+    assert splatfix("bench", "peer", "A", "--data", "D", "--method", "sift_best10")[0] == 0
+    assert given[1] == ([comparison.Task(Path("A"), Path("D"))], ["sift_best10"])
+    code, _, complaint = splatfix("bench", "peer", "A", "B", "--data", "D")
+    assert (code, "Name one scene" in complaint) == (2, True)
+
+
+def test_bench_fleet_has_a_row_for_each_fleet(splatfix, monkeypatch, tmp_path):
+    from service.bench import fleet_simulation
+
+    model = fleet_simulation.FleetModel(100, 2000, failures_per_hour=20.0)
+    found = fleet_simulation.FleetFigures(0.123, 1.239, 4.0, 0.01234, 0.5, 0.616, 0, 9)
+    monkeypatch.setattr(fleet_simulation, "run", lambda: [(model, found)])
+    code, told, _ = splatfix("bench", "fleet", "--json", tmp_path / "o.json")
+    assert code == 0
+    cells = [cell.strip() for cell in told.splitlines()[3].strip("│ ").split("│")]
+    assert cells == ["100", "2000", "20", "20", "0.12", "1.24", "4.00", "0.0123", "62%"]
+    (written,) = json.loads((tmp_path / "o.json").read_text())
+    assert (written["model"]["scenes"], written["figures"]["p95_s"]) == (2000, 1.239)
+
+
+def test_benches_draw_and_write_the_files_that_are_named(splatfix, monkeypatch, tmp_path):
+    from service.bench.paper import figures
+    from service.pose.verification import gate_model
+
+    drawn: list = []
+    parts = {name: {"scenes": 1, "reliability": [name]} for name in ("with_matches", "photometric", "tracked")}
+    shipped = json.loads(Path(gate_model.__file__).with_name("model.json").read_text())
+    monkeypatch.setattr("service.bench.gate.run", lambda *_, **__: {**parts, "model": shipped})
+    monkeypatch.setattr("service.bench.scale.run", lambda *_, **__: [{"seconds": 1.5}])
+    for name in ("reliability", "growth"):
+        monkeypatch.setattr(figures, name, lambda values: drawn.append(values) or b"a picture")
+    files = {"--model": tmp_path / "m.json", "--plot": tmp_path / "g.png"}
+    code, told, _ = splatfix("bench", "gate", "S", *itertools.chain(*files.items()))
+    assert code == 0
+    assert "reliability" not in told
+    assert json.loads(files["--model"].read_text()) == shipped
+    assert splatfix("bench", "scale", "S", "--plot", tmp_path / "s.png")[0] == 0
+    # What tracked poses have is not drawn: they aren't judged by a probability alone.
+    assert drawn == [{"with_matches": ["with_matches"], "photometric": ["photometric"]}, [{"seconds": 1.5}]]
+    assert (tmp_path / "g.png").read_bytes() == (tmp_path / "s.png").read_bytes() == b"a picture"
+
+
 @pytest.mark.parametrize(
     ("flags", "bench", "asked"),
     [
@@ -448,6 +534,12 @@ def test_bench_paper_shows_how_far_it_is():
         ("ablation S T --part mirror", "ablation", {"parts": ["mirror"]}),
         ("gate S", "gate", {"seed": 0, "": [Path("S")]}),
         ("gate S --seed 4", "gate", {"seed": 4}),
+        (
+            "rigs S --occluders T",
+            "rigs",
+            {"rigs": 30, "photos": 4, "variants": 2, "seed": 0, "modify": RIG_MODIFICATIONS},
+        ),
+        ("rigs S --occluders T --modify blur=2", "rigs", {"modify": ("blur=2",), "": Path("S")}),
         ("track S", "track", {"frames": 300, "seed": 0, "intrinsics": "given"}),
         ("track S --frames 7 --seed 2 --intrinsics withheld", "track", {"frames": 7, "seed": 2}),
     ],
@@ -458,7 +550,8 @@ def test_every_bench_is_handed_its_flags_and_writes_what_it_returns(
     """And says on which processor: without that times mean nothing."""
     rows = [{"part": "whole", "seconds": 1.23456}]
     outcome = {"with_matches": {"scenes": 1}, "photometric": {}, "tracked": {}} if bench == "gate" else rows
-    outcome = {"localized": 7, "per_frame": []} if bench == "track" else outcome
+    left_out = {"track": "per_frame", "rigs": "per_query"}.get(bench)
+    outcome = {"localized": 7, left_out: []} if left_out else outcome
     given: dict = {}
 
     def run(*positional, progress, **options):
@@ -473,9 +566,12 @@ def test_every_bench_is_handed_its_flags_and_writes_what_it_returns(
     assert given | asked == given
     assert json.loads((tmp_path / "o.json").read_text()) == outcome
     assert re.search(
-        {"gate": "scenes +1", "track": "localized +7", "ablation": r"\| whole \|"}.get(bench, "1.235"), told
+        {"gate": "scenes +1", "track": "localized +7", "rigs": "localized +7", "ablation": r"\| whole \|"}.get(
+            bench, "1.235"
+        ),
+        told,
     )
-    assert "per_frame" not in told
+    assert str(left_out) not in told
     assert "core" in complaints
 
 
