@@ -664,9 +664,11 @@ class TestRoom:
                 assert scene.info.training_focal_px == render_bench.room_cameras(16)[0].intrinsics.fx
 
             def render(self, cameras, **options):
+                calls.append(len(cameras))
                 self.camera = cameras[-1]
 
             def pose_gradient(self, camera, d_rgb, d_depth=None, d_alpha=None):
+                calls.append(0)
                 assert camera is self.camera
                 assert d_rgb.shape == (12, 16, 3)
 
@@ -677,9 +679,11 @@ class TestRoom:
         monkeypatch.setattr(render_bench.os, "cpu_count", lambda: 2)
         clock = iter(np.arange(0, 1e4, 0.5))  # every call takes half a second
         monkeypatch.setattr(render_bench.time, "perf_counter", lambda: next(clock))
-        shown = []
+        shown, calls = [], []
         rows = render_bench.run(repeats=2, cases=((50, 16),), progress=lambda *now: shown.append(now))
         assert shown == [(1, 1)]
+        # Three times of each camera, each with two gradients, and three times of all together.
+        assert [calls.count(n) for n in (0, 1, 6)] == [36, 18, 3]
         assert [(r["stage"], r["threads"]) for r in rows] == [
             ("forward", 1),
             ("pose_gradient", 1),

@@ -247,14 +247,16 @@ def test_a_session_with_odometry_counts_frames_that_the_client_carried_on() -> N
     # The fourth frame has an answer with a wrong pose of its own, which counts whatever the odometry says.
     wrong = moved(shots[3].pose, np.array([0, 0, 0, 1.0, 0, 0])).world_from_camera.tolist()
     told.answers[3], told.heard_at[3] = replace(answer(3, shots[3]), world_from_camera=wrong), 3.5 / 30
+    matrix = shots[4].pose.world_from_camera.tolist()
+    told.answers[4], told.heard_at[4] = replace(answer(4, shots[4]), world_from_camera=matrix), 4.5 / 30
     found = live.figures(told, UNITS, LENS)
     assert found["right"] == 7 / 8
-    assert found["right_of_answered"] == 1 / 2
+    assert found["right_of_answered"] == 2 / 3
     assert found["wrong_localized"] == 1
     assert found["overlay_share"] == 7 / 8
     told.shots = [replace(shot, odom=None) for shot in shots]
     found = live.figures(told, UNITS, LENS)
-    assert found["right"] == 1 / 8
+    assert found["right"] == 2 / 8
     assert "overlay_share" not in found
 
 

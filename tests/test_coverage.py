@@ -261,6 +261,7 @@ def test_trials_are_spread_over_places_and_headings(measured):
     loaded = measured[0]
     captured = [named.camera for named in loaded.scene.cameras]
     places = find_places(loaded.scene, loaded.rasterizer, captured, 2.0, np.random.default_rng(0), SMALL.plan)
+    assert places.headings_rad == pytest.approx([0, np.pi / 2, np.pi, 1.5 * np.pi])
     pairs = spread(places, 30)
     assert len({tuple(pair) for pair in pairs.tolist()}) == 30
     assert set(pairs[:, 1].tolist()) == {0, 1, 2, 3}

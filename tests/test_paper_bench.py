@@ -252,6 +252,25 @@ class TestTables:
     def named(self, name: str) -> tables.Table:
         return next(table for table in tables.tables(self.LINES, CONFIG) if table.name == name)
 
+    @pytest.mark.parametrize(
+        ("name", "bound", "degrees", "units"),
+        [
+            ("table1", "< 5 deg", 5.0, 9.0), ("table1", "< 0.05 units", 90.0, 0.05),
+            ("table1", "< 0.01 units", 90.0, 0.01), ("table5", "< 5 deg", 5.0, 9.0), ("table5", "< 1 deg", 1.0, 9.0),
+            ("table5", "< 0.05", 90.0, 0.05), ("table5", "< 0.01", 90.0, 0.01),
+        ],
+    )  # fmt: skip
+    def test_what_is_just_at_a_bound_is_within_it(self, name, bound, degrees, units):
+        method = {"table1": "mc_do:l1", "table5": "mc_do:mc"}[name]
+        pairs = ((degrees, units), (1.01 * degrees, 1.01 * units))
+        lines = [line(study=name, method=method, trial=i, degrees=d, units=u) for i, (d, u) in enumerate(pairs)]
+        (table,) = (table for table in tables.tables(lines, CONFIG) if table.name == name)
+        if name == "table1":
+            (share,) = (row[table.header.index("chair")] for row in table.rows if row[0] == bound)
+        else:
+            share = table.rows[0][table.header.index(bound)]
+        assert share == "1/2 = .50"
+
     def test_success_beside_what_was_published(self):
         table = self.named("table2_hard")
         assert table.header == ("scene", "bound", "", "view_index", "mc_do", "icomma*")

@@ -19,7 +19,7 @@ from service.estimators import ESTIMATORS
 from service.geometry import pose_distance
 from service.matchers import MATCHERS
 from service.photos.images import encode_image
-from service.plugins import PluginRegistry
+from service.plugins import BUILT_IN, FOLDER, PLUGINS_DIR, PluginRegistry
 from service.scene_formats import SCENE_FORMATS, load_scene
 from service.scene_formats.discovery import find_scenes
 from service.scene_formats.formats import is_scene_file
@@ -198,7 +198,7 @@ def test_an_estimator_whose_options_have_no_schema_does_not_hide_the_others(inst
     assert listed["view_index"].source == "built-in"
 
 
-def test_doctor_lists_plugins_with_where_they_come_from(install):
+def test_doctor_lists_plugins_with_where_they_come_from(install, monkeypatch):
     entries = {"added": "doctors_matcher", "broken": "a_module_that_nobody_has"}
     install("doctors-matchers", "splatfix.matchers", entries, doctors_matcher=MATCHER)
     found = {finding.subject: finding for finding in plugin_findings()}
@@ -207,6 +207,9 @@ def test_doctor_lists_plugins_with_where_they_come_from(install):
     assert not found["matcher broken"].needed
     assert found["matcher broken"].detail.startswith("ModuleNotFoundError")
     assert (found["matcher sift"].ok, found["matcher sift"].detail) == (True, "available")
+    monkeypatch.setattr(PluginRegistry, "source", lambda self, name: FOLDER if name == "sift" else BUILT_IN)
+    found = {finding.subject: finding.detail for finding in plugin_findings()}
+    assert (found["matcher sift"], found["matcher added"]) == (f"available (from {PLUGINS_DIR})", "available")
 
 
 def write_npz(path: Path, room: Path) -> None:

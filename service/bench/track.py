@@ -71,14 +71,13 @@ def run(
     if len(training) < 2:
         raise SceneNotFound("a path needs a scene with two training cameras or more.", where=str(folder))
     request = Request(seed=seed)
-    loaded.prepare(request.estimator)
     units = units_of(training, lambda camera: centre_depth(loaded.rasterizer, camera))
     path = smooth_path([camera.pose for camera in training], units, frames, config)
     camera = replace(training[0].intrinsics.with_long_side(config.long_side_px), model="PINHOLE", distortion=())
     given = camera if intrinsics == "given" else None
     tracker = Tracker(loaded, request)
     steps = []
-    # The first localization compiles and allocates; its time isn't counted.
+    # The first localization compiles, allocates and makes the index; its time isn't counted.
     first = next(_render_frames(path, camera, loaded.rasterizer, seed, config))
     Tracker(loaded, request).track(read_query(first, intrinsics=given, long_side=PHOTO_LONG_SIDE))
     for number, data in enumerate(_render_frames(path, camera, loaded.rasterizer, seed, config)):
