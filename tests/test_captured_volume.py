@@ -124,6 +124,8 @@ def test_a_pose_beside_a_view_needs_no_render(away: float, turn_deg: float, besi
     pose = Pose(pose.world_from_camera + np.array([[0, 0, 0, away]] + [[0.0] * 4] * 3))
     assert _is_beside_a_view(pose, [view], CAPTURE) == beside
     assert not _is_beside_a_view(pose, [empty], CAPTURE)
+    one: Any = SimpleNamespace(camera=view.camera, points_in_world=points[1:2])
+    assert _is_beside_a_view(pose, [one], CAPTURE) == beside
 
 
 def zoomed(size: Intrinsics, factor: float) -> Intrinsics:

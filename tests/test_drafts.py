@@ -158,15 +158,3 @@ def test_bytes_are_on_disk_before_they_are_called_by_their_name(write, name, dat
     assert synced[0] == (data, name.startswith("j."))
     if name != "a.json":
         assert synced[1:] == [(None, True)]  # its name
-
-
-def test_a_photo_that_is_not_written_whole_is_not_there(tmp_path: Path, monkeypatch) -> None:
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, "no space left")
-
-    store = FolderPhotoStore(tmp_path / "new" / "photos")
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(StorageFailed, match="no space left"):
-        store.accept("j", DATA)
-    store.discard_original("j", DATA)
-    assert left(tmp_path) == []

@@ -11,11 +11,21 @@ import pytest
 from memory_stores import MemoryJobStore
 from test_store_contracts import new_job, record, result
 
-from service.errors import JobNotFound, JobNotReady, QueueFull, RecordNotFound, SceneTooLarge, StorageFailed
-from service.jobs import photo_store, service, trajectory
+from service.errors import (
+    InvalidImage,
+    JobNotFound,
+    JobNotReady,
+    QueueFull,
+    RecordNotFound,
+    SceneNotReady,
+    SceneTooLarge,
+    StorageFailed,
+)
+from service.jobs import acceptance, photo_store, service, trajectory
 from service.jobs.acceptance import Acceptance
+from service.jobs.job_order import JobOrder
 from service.jobs.live_job import LiveJob
-from service.jobs.model import Batch, Ending
+from service.jobs.model import Batch, Ending, JobSpec
 from service.jobs.photo_store import FolderPhotoStore
 from service.jobs.scene_wait import SceneWait
 from service.jobs.service import Jobs
@@ -149,6 +159,117 @@ def test_a_deadline_ends_the_wait(monkeypatch):
     waiting.queued.clear()
     waiting.wait.expire()  # nobody waits any more
     assert waiting.cleaned == ["late"]
+
+
+# ------------------------------------------------------------------ orders
+
+
+class Taking:
+    """An acceptance whose other parts note what they are asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done: list[tuple[str, Any]] = []
+        self.held: Any = SimpleNamespace(token="token", ids=("s",), background_rgb=(0.5, 0.5, 0.5))
+        self.store, self.waiting, self.next = MemoryJobStore(), 0, "new"
+        note: Any = lambda name: lambda *what, **more: self.done.append((name, *what, *more.values()))  # noqa: E731
+        engine: Any = SimpleNamespace(
+            hold=self.hold, release=note("released"), require=lambda scene: SimpleNamespace(metres_per_unit=None),
+            scene=lambda name: SimpleNamespace(id=f"id of {name}"),
+        )  # fmt: skip
+        queue: Any = SimpleNamespace(reserve=note("reserved"), release=note("place back"), submit=note("queued"))
+        wait: Any = SimpleNamespace(submit=note("waits"))
+        self.photos: Any = SimpleNamespace(accept=note("photo"), delete=note("photo deleted"))
+        self.live: dict[str, LiveJob] = {}
+        worker: Any = SimpleNamespace(live=self.live, note_storage=note("disk"))
+        config: Any = SimpleNamespace(max_frames=3)
+        self.accept = Acceptance(config, engine, self.store, self.photos, queue, wait, worker, None).accept
+        self.read: Any = lambda *_: SimpleNamespace(query=None)
+        monkeypatch.setattr(acceptance, "read_photo", lambda *asked: self.read(*asked))
+        monkeypatch.setattr(
+            acceptance, "new_job", lambda order, scene, _: new_job(self.next, scene=scene, **self.of(order))
+        )
+
+    def of(self, order: JobOrder) -> dict[str, Any]:
+        return {"client": order.client, "idempotency_key": order.idempotency_key, "digest": order.digest}
+
+    def hold(self, asked: Any) -> Any:
+        if self.held is None:
+            raise SceneNotReady("not in memory.")
+        return self.held
+
+    def names(self) -> list[str]:
+        return [each[0] for each in self.done]
+
+
+@pytest.fixture
+def taking(monkeypatch: pytest.MonkeyPatch) -> Taking:
+    return Taking(monkeypatch)
+
+
+ORDER = JobOrder(b"jpeg", "p.jpg", "0", replace(JobSpec("e"), scene="s"), "c", "key", "digest")
+
+
+def test_an_order_is_on_disk_before_it_is_queued_and_known_by_its_key(taking):
+    job = taking.accept(ORDER)
+    assert taking.names() == ["reserved", "photo", "queued"]
+    assert taking.live[job.id].held is taking.held
+    assert taking.accept(ORDER).id == job.id
+    assert len(taking.done) == 3
+
+
+def test_an_order_whose_scene_is_not_in_memory_waits_for_it(taking):
+    taking.held = None
+    job = taking.accept(ORDER)
+    assert taking.names() == ["reserved", "photo", "waits"]
+    assert taking.done[-1] == ("waits", taking.live[job.id], "s", True)
+    assert taking.live[job.id].scene == "id of s"
+
+
+def test_a_photo_that_can_not_be_read_lets_its_scenes_go(taking):
+    def broken(*_: Any) -> Any:
+        raise InvalidImage("no photo.")
+
+    taking.read = broken
+    with pytest.raises(InvalidImage):
+        taking.accept(ORDER)
+    assert taking.done == [("released", "token")]
+    assert not taking.live
+
+
+def test_of_two_requests_with_one_key_at_the_same_time_one_becomes_a_job(taking):
+    def meanwhile(*_: Any) -> str:
+        taking.store.accept(new_job("other", **taking.of(ORDER)))
+        return "photo"  # decoded
+
+    taking.read = meanwhile
+    assert taking.accept(ORDER).id == "other"
+    assert taking.done[1:] == [
+        ("photo", "new", b"jpeg"),
+        ("place back",),
+        ("photo deleted", "new"),
+        ("released", "token"),
+    ]
+    assert not taking.live
+
+
+def test_a_full_disk_leaves_neither_a_place_nor_a_photo(taking):
+    def full(*_: Any) -> None:
+        raise StorageFailed("full.")
+
+    taking.photos.accept = full
+    with pytest.raises(StorageFailed):
+        taking.accept(ORDER)
+    assert taking.names() == ["reserved", "disk", "place back", "photo deleted", "released"]
+
+
+def test_a_clients_share_is_counted_before_its_job_is_stored(taking):
+    limited = replace(ORDER, most_queued=1)
+    assert taking.accept(limited).id == "new"
+    taking.next = "second"
+    with pytest.raises(QueueFull, match="1 jobs of this key, its share"):
+        taking.accept(replace(limited, idempotency_key=None))
+    assert taking.names()[3:] == ["released"]
+    assert taking.accept(replace(limited, idempotency_key=None, most_queued=2)).id == "second"
 
 
 # ------------------------------------------------------------------ photos

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from service.device_readings import DeviceReadings, GpsPosition, Heading
 from service.errors import InvalidRequest
 from service.geodesy import enu_from_geographic
 from service.geometry import look_at, quat_from_rotation, so3_exp
-from service.photos.exif_gps import with_readings
+from service.photos.exif_gps import exif_place, with_readings
 from service.photos.images import open_photo, query_of
 from service.registration.gathering import GatherOptions, LocalizedPhoto, gathered
 from service.registration.known_places import exif_places, place_table, scene_points, trajectory_places
@@ -172,6 +174,59 @@ def test_gps_in_exif_with_altitude_and_heading():
     hostile = {1: "N", 2: "x", 3: "E", 4: (1, 2), 6: b"?"}
     assert exif_places.read([("a", hostile)], 0.0).places == ()
     assert exif_places.read([("a", {2: (0, 0, 0), 4: (0, 0, 0)})], 0.0).places == ()
+
+
+PLACE = {1: "N", 2: (47, 0, 0), 3: "E", 4: (8, 0, 0)}
+"""By the numbers that EXIF 2.32 gives the tags."""
+
+
+@pytest.mark.parametrize(
+    ("tags", "latitude", "longitude"),
+    [
+        ({2: (90, 0, 0), 4: (180, 0, 0)}, 90.0, 180.0), ({2: (90, 0, 1)}, None, None), ({4: (180, 0, 1)}, None, None),
+        ({1: "south", 2: (47, 30, 36), 3: "w", 4: (8, 6, 0)}, -47.51, -8.1), ({2: (-1, 0, 0)}, None, None),
+        ({2: (0, 0, 0)}, 0.0, 8.0), ({4: (0, 0, 0)}, 47.0, 0.0), ({2: (0, 0, 0), 4: (0, 0, 0)}, None, None),
+        ({2: (0, 0, 36), 4: (0, 0, 0)}, 0.01, 0.0), ({2: (47, 0)}, None, None), ({4: (8, 0, float("nan"))}, None, None),
+    ],
+)  # fmt: skip
+def test_a_place_is_in_degrees_within_the_earths(tags, latitude, longitude):
+    found = exif_place(PLACE | tags)
+    if latitude is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert (found.latitude_deg, found.longitude_deg) == pytest.approx((latitude, longitude))
+
+
+@pytest.mark.parametrize(
+    ("tags", "told"),
+    [
+        ({}, {"sigma_m": 5.0, "altitude_m": None, "heading_deg": None, "heading_sigma_deg": 15.0}),
+        ({31: 0.01}, {"sigma_m": 0.01}), ({31: 0.009}, {"sigma_m": 5.0}), ({31: 1000}, {"sigma_m": 1000.0}),
+        ({31: 1001}, {"sigma_m": 5.0}), ({6: 12.5}, {"altitude_m": 12.5}), ({5: 1, 6: 12.5}, {"altitude_m": -12.5}),
+        ({5: b"\x01", 6: 2}, {"altitude_m": -2.0}), ({5: 0, 6: 2}, {"altitude_m": 2.0}),
+        ({17: 370}, {"heading_deg": 10.0}),
+        ({16: "m", 17: 360}, {"heading_deg": 0.0, "heading_sigma_deg": 25.0}), ({17: "north"}, {"heading_deg": None}),
+    ],
+)  # fmt: skip
+def test_what_exif_tells_beside_the_place(tags, told):
+    found = exif_place(PLACE | tags)
+    assert {name: getattr(found, name) for name in told} == told
+
+
+@pytest.mark.parametrize(
+    ("altitude", "error", "height", "sigma"),
+    [
+        (99_999.0, 3.0, 99_999.0, (10.0, 30.0)), (100_000.0, 3.0, None, (10.0, 30.0)),
+        (-100_000.0, 3.0, None, (10.0, 30.0)),
+        (408.5, 40.0, 408.5, (40.0, 30.0)),
+    ],
+)  # fmt: skip
+def test_a_height_by_exif_is_as_uncertain_as_the_receiver_and_the_geoid(altitude, error, height, sigma):
+    opened: Any = SimpleNamespace(gps=PLACE | {6: altitude, 31: error})
+    found = with_readings(query_of(np.zeros((240, 320, 3), np.uint8)), None, opened).readings
+    assert found.gps == GpsPosition(47.0, 8.0, error, height, float(np.hypot(*sigma)))
+    assert found.heading is None
 
 
 def test_a_photo_s_own_place_counts_only_where_it_is_asked_for():
