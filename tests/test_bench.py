@@ -219,6 +219,10 @@ class TestRun:
             "latency_ms_p50", "latency_ms_p95", "cpu_ms_p50", "per_query",
         }  # fmt: skip
         assert demanded <= outcome.keys()
+        # Next to nothing is done; sums in place of differences would count from the machine's start.
+        assert 0 <= outcome["cpu_ms_p50"] < 1000
+        assert 0 < outcome["latency_ms_p50"] <= outcome["latency_ms_p95"] < 60_000
+        assert 0 <= outcome["prepare_s"] < 60
         assert json.loads(json.dumps(outcome)) == outcome
         assert (outcome["queries"], outcome["localized"], outcome["false_localized"]) == (2, 2, 0)
         assert (outcome["success_5deg_0p05"], outcome["success_1deg_0p01"]) == (1.0, 0.5)

@@ -110,6 +110,7 @@ def plan_of(trials: list[Trial], cells: int = 3) -> CoverageMap:
 def test_a_photo_is_found_that_is_localized_where_it_was_taken(measured):
     _, found, seen = measured
     assert len(found.trials) == 20
+    assert 0 < found.seconds < 300
     for one in found.trials:
         x, y, _ = one.pose.axis_in_world
         assert one.found == (x > abs(y))

@@ -226,13 +226,14 @@ class TestBench:
             assert nearest[1] < bench.SEQUENCE.step_units
 
     def test_the_outcome_counts_what_happened(self, folder):
-        shown = []
+        shown, wall, cpu = [], time.perf_counter(), time.process_time()
         outcome = bench.run(folder, frames=8, seed=3, progress=lambda *now: shown.append(now))
         assert shown == [(k, 8) for k in range(1, 9)]
         assert (outcome["frames"], outcome["followed"], outcome["false_localized"]) == (8, 7, 0)
         assert outcome["success_1deg_0p01"] == 1.0
         assert 0 < outcome["rotation_deg_p50"] <= outcome["rotation_deg_p100"] < 0.2
-        assert outcome["latency_ms_p50"] > outcome["decode_ms_p50"] > 0
+        assert 1e3 * (time.perf_counter() - wall) > outcome["latency_ms_p50"] > outcome["decode_ms_p50"] > 0
+        assert 1e3 * (time.process_time() - cpu) > outcome["cpu_ms_p50"] > 0
         assert len(outcome["per_frame"]) == 8
 
     def test_times_are_those_of_frames_that_can_be_tracked(self):
