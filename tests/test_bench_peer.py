@@ -26,7 +26,7 @@ from service.bench.peer.photo_matching import (
     near_epipolar_lines,
     pairs_of_cameras,
 )
-from service.bench.peer.words import Words
+from service.bench.peer.words import Words, WordsConfig
 from service.bench.pose_metrics import Outcome, Units
 from service.errors import BackendMissing, SceneNotFound, UnknownName
 from service.geometry import pose_distance, so3_exp
@@ -117,6 +117,19 @@ def test_the_photo_with_the_same_words_comes_first() -> None:
     for number, kind in enumerate(kinds):
         assert words.ranked(unit(kind + 0.02 * rng.normal(size=kind.shape)))[0] == number
     assert sorted(words.ranked(kinds[0])) == [0, 1, 2]
+
+
+def test_words_count_by_how_few_photos_have_them() -> None:
+    everywhere, first, second = np.eye(8, dtype=np.float32)[:3]
+    photos = [np.repeat([everywhere, own], [16, 4], 0) for own in (first, second)]
+    words = Words.of(photos, WordsConfig(words=12))
+    weights = dict(zip(map(tuple, words.centres.tolist()), words.weights, strict=True))
+    # All have the first, whose logarithm is 0; a half has each other one.
+    assert max(weights.values()) == pytest.approx(np.log(2) + 0.05)
+    counted = {name: weight for name, weight in weights.items() if name != tuple(everywhere)}
+    assert set(np.round(list(counted.values()), 6)) == {np.round(np.log(2) + 0.05, 6)}
+    assert np.linalg.norm(words.photos, axis=1) == pytest.approx(1)
+    assert words.nbytes == 10 * 8 * 4 + 10 * 8 + 2 * 2 * 10  # a quarter of 40 features
 
 
 @dataclass(frozen=True)

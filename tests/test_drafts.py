@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -115,6 +116,12 @@ def test_a_scene_is_fetched_with_all_its_folders_or_not_at_all(tmp_path: Path, m
     fetched(tmp_path)
     assert (tmp_path / "copy" / "a" / "scene.ply").read_bytes() == DATA
     assert left(tmp_path / "copy") == ["a/scene.ply"]
+    os.utime(tmp_path / "copy", (0, 0))
+    fetched(tmp_path)  # nothing is missing
+    assert time.time() - 60 < (tmp_path / "copy").stat().st_mtime  # it is used, and not the next that goes
+    (tmp_path / "copy" / "a" / "scene.ply").write_bytes(DATA[:3])
+    fetched(tmp_path)
+    assert (tmp_path / "copy" / "a" / "scene.ply").read_bytes() == DATA
 
 
 def test_views_that_are_whole_are_read(tmp_path: Path) -> None:

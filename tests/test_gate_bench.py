@@ -15,7 +15,7 @@ from test_bench import FakeLoaded, FakeMatcher, FakeRasterizer, estimate, folder
 from service.bench import gate
 from service.bench import localize as bench
 from service.bench.gate import GARBAGE, unrelated_image
-from service.bench.gate_fit import Sample, fit_model, fitted, probabilities, summary
+from service.bench.gate_fit import Sample, fit_model, fitted, floors, probabilities, summary
 from service.bench.pose_metrics import Units
 from service.geometry import moved, pose_distance
 from service.pose.verification.gate import VERIFICATION
@@ -32,6 +32,20 @@ def test_the_fit_finds_planted_weights_and_no_negative_ones() -> None:
     found = fitted(features[:, :3], rng.uniform(size=len(features)) < probabilities(features[:, :3], planted[:3]))
     assert found[1:] == pytest.approx([3.0, 1.0], abs=0.25)
     assert fitted(features, right)[3] == 0
+
+
+def test_three_of_a_thousand_right_poses_are_below_a_floor() -> None:
+    features = np.column_stack([np.arange(10_000.0), -np.arange(10_000.0)])
+    assert (features < floors(features)).sum(0).tolist() == [30, 30]
+
+
+def test_a_sample_on_the_floor_or_at_the_bound_of_the_pixels_passes() -> None:
+    """The floor of each fold is that of the others, which are alike."""
+    samples = [replace(sample(s, "clean", True, 0.5), photo=s) for s in "abc" for _ in range(5)]
+    samples += [sample(s, "moved", False, 0.0) for s in "abc" for _ in range(5)]
+    assert summary(samples, SHIPPED_MODEL)["photometric"]["right_localized"] == 15
+    lower = [replace(s, signals={n: 0.98 * v for n, v in s.signals.items()}) if s.scene == "a" else s for s in samples]
+    assert summary(lower, SHIPPED_MODEL)["photometric"]["right_localized"] == 10
 
 
 def sample(scene: str, kind: str, right: bool, level: float, doubted: bool = False) -> Sample:

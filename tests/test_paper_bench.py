@@ -89,6 +89,20 @@ def test_every_query_is_one_line(scene, monkeypatch):
     assert next(line for line in lines if line["method"] == "icomma")["profile"].startswith("256 px, XFeat re-matched")
 
 
+def test_a_line_is_on_the_disk_before_the_next_query(scene, monkeypatch):
+    fake_answers(monkeypatch.setattr)
+    spec, synced = asked_for(scene, trials=2), []
+
+    def fsync(_: int) -> None:
+        (file,) = spec.out.glob("*.jsonl")
+        synced.append(len(file.read_text().splitlines()))
+
+    monkeypatch.setattr(runs.os, "fsync", fsync)
+    runs.run(spec)
+    assert len(synced) > 3
+    assert synced == list(range(1, len(synced) + 1))
+
+
 def test_facts_of_a_scene(scene, monkeypatch):
     """The six training cameras stand on a circle of radius 3 and height 1, from 57 to 286 degrees."""
     fake_answers(monkeypatch.setattr)

@@ -97,6 +97,19 @@ def test_a_copy_costs_two_seconds_and_reading_twice_and_a_job_a_tenth_of_one(meg
     assert [bool(choice.load) for choice in choices] == [False] * (jobs + 1) + [True]
 
 
+def test_an_only_copy_is_missed_as_long_as_its_load_would_be_a_tenth_of_the_jobs_since():
+    """Loading 100 MB takes two seconds, which are twenty jobs: as much as a tenth of 200 jobs."""
+    table = placement(x=100 * MB, y=0)
+    run_job(table, "x")
+    for _ in range(199):
+        run_job(table, "y")
+    assert table._is_missed("x")
+    run_job(table, "y")
+    assert not table._is_missed("x")
+    table.take(Choice("b" if "x" in table.scenes("a") else "a", ("x",), ()), ("x",))
+    assert not table._is_missed("x")  # there is another
+
+
 def test_a_scene_is_crowded_beyond_five_jobs_in_a_mean_of_some_ten():
     """Ten jobs before each from now on: the mean is 10 (1 - 0.9^n), which is beyond 5 at the seventh."""
     table = Placement(PlacementConfig())
