@@ -6,6 +6,9 @@ STUDIO_PYTHON ?= python3.11
 BIN := .venv/bin
 STUDIO_BIN := scenes/studio/.venv/bin
 
+# What is compiled is kept, whatever the caller's settings: many processes import it.
+export PYTHONDONTWRITEBYTECODE :=
+
 # Files are shared out among the cores; a file's tests share their servers.
 # Four on two cores, too: tests of servers mostly wait.
 PYTEST := $(BIN)/pytest -n 4 --dist loadfile
@@ -29,7 +32,9 @@ demo: setup
 check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	@# Meanwhile, on another core, the tests' modules are compiled: each of pytest's workers would compile all of them.
+	$(BIN)/pytest --collect-only -qq >/dev/null 2>&1 & \
+	$(BIN)/pyright --pythonpath $(BIN)/python; checked=$$?; wait; exit $$checked
 
 test: check
 	$(PYTEST) -m "not browser and not ci"

@@ -9,11 +9,17 @@ from __future__ import annotations
 
 import ast
 import functools
+import hashlib
 import importlib.machinery
+import importlib.util
 import inspect
+import marshal
+import os
 import sys
 import typing
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +27,7 @@ from beartype.door import is_bearable
 from jaxtyping import AbstractArray, jaxtyped
 
 _COMPILERS = ("service.jit", "numba", "llvmlite")
+_WRITTEN_BY = Path(__file__).read_bytes()
 
 
 class ShapeError(TypeError):
@@ -48,8 +55,22 @@ class Finder:
 
 class _Loader(importlib.machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> Any:
-        """Compile the source anew: __pycache__ has, and must keep, the code without checks."""
-        return self.source_to_code(self.get_data(self.path), self.path)
+        """Return the code with checks, kept in __pycache__ beside the code without them."""
+        source = self.get_data(self.path)
+        key = hashlib.sha256(b"\0".join((_WRITTEN_BY, self.path.encode(), source))).digest()
+        kept = Path(importlib.util.cache_from_source(self.path, optimization="shapes"))
+        with suppress(OSError):
+            data = kept.read_bytes()
+            if data.startswith(key):
+                return marshal.loads(data[len(key) :])
+        code = self.source_to_code(source, self.path)
+        if not sys.dont_write_bytecode:
+            with suppress(OSError):
+                kept.parent.mkdir(exist_ok=True)
+                written = kept.with_suffix(f".{os.getpid()}")
+                written.write_bytes(key + marshal.dumps(code))
+                written.replace(kept)  # whole or not at all: other workers write it, too
+        return code
 
     def source_to_code(self, data: Any, path: Any, *, _optimize: int = -1) -> Any:
         tree = ast.parse(data)

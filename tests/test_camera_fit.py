@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from rest_in_ci import rest_in_ci
 
 from service.geometry import look_at, so3_log
 from service.scene_formats import camera_fit, colmap
@@ -302,7 +303,7 @@ def rooms(count: int, rng: np.random.Generator) -> tuple[RawGaussians, list[Name
     return RawGaussians(means, quats, scales, np.full(n, 0.9, np.float32), sh), cameras
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", rest_in_ci(False, True))
 def test_cameras_of_a_large_scene_are_judged_part_by_part(turned: bool) -> None:
     raw, cameras = rooms(30, np.random.default_rng(0))
     turn = np.eye(4)
@@ -343,6 +344,7 @@ def test_many_cameras_around_an_object_are_no_large_scene(turned: bool) -> None:
     assert fit.is_doubtful
 
 
+@pytest.mark.ci
 def test_cameras_of_another_large_scene_are_left_out() -> None:
     raw, cameras = rooms(30, np.random.default_rng(0))
     beside = np.eye(4)

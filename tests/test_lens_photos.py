@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from api_server import ROOT
 from PIL import Image
+from rest_in_ci import rest_in_ci
 
 import service.localize
 from service.accuracy import Accuracy
@@ -95,8 +96,9 @@ def assert_right(found: PoseEstimate, name: str) -> None:
     assert twist @ np.linalg.solve(found.verdict.covariance, twist) < 40  # chi-square of six: 22 at 99.9 %
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("k1", [-0.08, 0.08])
+@pytest.mark.parametrize(
+    ("name", "k1"), rest_in_ci(*((name, k1) for k1 in (-0.08, 0.08) for name in (*NAMES[1:], NAMES[0])))
+)
 def test_an_untold_distortion_is_estimated_with_the_pose(studio: LoadedScene, name: str, k1: float) -> None:
     rgb, taken = through_lens(name, k1)
     for data, source in ((jpeg(rgb), "guessed"), (jpeg(rgb, equivalent_mm(taken)), "exif")):
@@ -129,7 +131,7 @@ def test_a_focal_length_in_exif_that_is_not_true_does_not_hide_the_place(studio:
     assert found.intrinsics.fx == pytest.approx(camera.fx, rel=0.01)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", rest_in_ci(*NAMES))
 def test_exact_intrinsics_without_the_distortion_are_contradicted(studio: LoadedScene, name: str) -> None:
     rgb, taken = through_lens(name, -0.08)
     found = localize(read_query(jpeg(rgb), intrinsics=taken), studio)
@@ -140,8 +142,9 @@ def test_exact_intrinsics_without_the_distortion_are_contradicted(studio: Loaded
     assert_right(localize(read_query(jpeg(rgb), intrinsics=told), studio), name)
 
 
-@pytest.mark.parametrize("factor", [0.95, 1.03])
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("name", "factor"), rest_in_ci(*((n, f) for f in (1.03, 0.95) for n in (*NAMES[1:], NAMES[0])))
+)
 def test_an_exact_focal_length_that_is_not_true_is_contradicted(studio: LoadedScene, name: str, factor: float) -> None:
     rgb, camera, _ = photo(name)
     wrong = replace(camera, fx=factor * camera.fx, fy=factor * camera.fy)
@@ -151,7 +154,7 @@ def test_an_exact_focal_length_that_is_not_true_is_contradicted(studio: LoadedSc
     assert found.verdict.fitting_correction.focal_factor == pytest.approx(1 / factor, abs=0.025)
 
 
-@pytest.mark.parametrize("name", [*NAMES[:2], pytest.param(NAMES[2], marks=pytest.mark.ci)])  # searches for 15 s
+@pytest.mark.parametrize("name", rest_in_ci(NAMES[1], NAMES[0], NAMES[2]))
 def test_no_lens_that_a_pinhole_is_said_to_be_gives_a_confident_wrong_pose(studio: LoadedScene, name: str) -> None:
     """A fisheye, which is recognised, and a crop off centre."""
     rgb, said = through_lens(name, fisheye=True)
@@ -169,7 +172,7 @@ def assert_right_if_localized(found: PoseEstimate, name: str) -> None:
     assert found.verdict.status is not Status.LOCALIZED or (degrees < 5 and units < RIGHT_UNITS)
 
 
-@pytest.mark.parametrize("seed", [0, 2])
+@pytest.mark.parametrize("seed", rest_in_ci(0, 2))
 def test_a_fisheye_is_recognised_from_wherever_its_refinement_began(
     studio: LoadedScene, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -209,8 +212,10 @@ def stored_sideways(upright: np.ndarray) -> bytes:
     return file.getvalue()
 
 
-@pytest.mark.parametrize("sideways", [False, True])
-@pytest.mark.parametrize("turn_deg", [(0.0, 0.8, 0.0), (-0.6, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    ("turn_deg", "sideways"),
+    rest_in_ci(*((turn, sideways) for turn in ((0.0, 0.8, 0.0), (-0.6, 0.0, 0.0)) for sideways in (True, False))),
+)
 def test_the_rows_of_a_rolling_shutter_are_turned_back(
     studio: LoadedScene, turn_deg: tuple[float, ...], sideways: bool
 ) -> None:
@@ -248,7 +253,7 @@ def test_a_strip_is_refined_until_it_settles_or_refused(studio: LoadedScene, goe
         assert found.verdict.reason is Reason.FOCAL_UNCERTAIN
 
 
-@pytest.mark.parametrize("name", ["same_light/same_light_18.jpg", "phone/phone_02.jpg"])
+@pytest.mark.parametrize("name", rest_in_ci("phone/phone_02.jpg", "same_light/same_light_18.jpg"))
 def test_a_plane_seen_with_another_principal_point_is_no_sure_answer(studio: LoadedScene, name: str) -> None:
     """The left two fifths of a photo of walls: 20 degrees turned, with the principal point in the middle, fits, too."""
     file = ROOT / "scenes" / "studio_another_day" / name

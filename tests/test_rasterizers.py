@@ -74,7 +74,7 @@ def render_reference(scene: GaussianScene, camera: Camera) -> reference.Picture:
     )  # fmt: skip
 
 
-@pytest.fixture(params=[*RASTERIZERS.names(), ON_CPU])
+@pytest.fixture(params=[*RASTERIZERS.names(), pytest.param(ON_CPU, marks=pytest.mark.ci)])
 def create(request: pytest.FixtureRequest):
     if request.param == ON_CPU:
         if request.node.originalname == "test_a_small_render_is_the_downsampled_large_one":
