@@ -9,12 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
+from stand_ins import TURNED
 
-from service.cli import scenes_register
-from service.errors import InvalidIntrinsics, InvalidPrior, InvalidRequest, NoGeoAnchor
+from service.cli import scenes_onto, scenes_register
+from service.errors import InvalidIntrinsics, InvalidPrior, InvalidRequest, NoGeoAnchor, RegistrationFailed
+from service.photos.images import encode_image
 from service.registration.known_places.known_place import KnownPlace, KnownPlaces
 from service.registration.registration import PARTS, Origin, Registration, Residual
-from service.types import GeoAnchor
+from service.results import Reason, Status
+from service.types import Camera, GeoAnchor, Intrinsics, NamedCamera, Pose, SceneInfo
 from service.web.metrics import Metrics
 from service.web.problems import Problem, problem_answer
 from service.web.routes import registrations
@@ -269,6 +272,82 @@ def test_a_registration_is_told_with_residuals_and_uncertainty(capsys):
     assert lines[0] == "determined: scale"
     assert lines[-1] == "not kept (--dry-run)"
     assert not any(line.startswith(("rotation", "position", "origin", "up in")) for line in lines)
+
+
+def estimates(monkeypatch, *statuses):
+    """Let photos be localized at (1, 2, 3), with these statuses; return the queries."""
+    asked: list[Any] = []
+
+    def localize(query, loaded):
+        asked.append(query)
+        status = statuses[len(asked) - 1]
+        verdict = SimpleNamespace(status=status, reason=Reason.NO_MATCHING_VIEW, covariance=SPREAD)
+        return SimpleNamespace(pose=Pose(TURNED), verdict=verdict)
+
+    for module in ("service.localize", "service.cli.scenes_onto"):
+        monkeypatch.setattr(f"{module}.localize", localize)
+    return asked
+
+
+PICTURE = encode_image(np.zeros((480, 640, 3), np.uint8), "png")
+SPREAD = np.diag([0.01, 0.02, 0.03, 1.0, 4.0, 9.0])
+
+
+def test_photos_that_are_not_localized_are_told_by_their_names(monkeypatch, tmp_path):
+    asked = estimates(monkeypatch, Status.LOCALIZED, Status.UNCERTAIN, Status.NOT_LOCALIZED)
+    for name in ("a.png", "b.png", "c.png"):
+        (tmp_path / name).write_bytes(encode_image(np.zeros((48, 64, 3), np.uint8), "png"))
+    lens, other = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), Intrinsics(128, 96, 120.0, 120.0, 64.0, 48.0)
+    # That of another size is of the photo before it was resized.
+    known = [KnownPlace("a.png", intrinsics=lens), KnownPlace("b.png", intrinsics=other), KnownPlace("c.png")]
+    loaded: Any = SimpleNamespace(scene=SimpleNamespace(info=SimpleNamespace(background_rgb=(0.0, 0.0, 0.0))))
+    found, missed = scenes_register._localized([(place, tmp_path / place.name) for place in known], loaded)
+    assert [(one.name, one.place, one.covariance is SPREAD) for one in found] == [("a.png", known[0], True)]
+    assert missed == [f"{name} was not localized: no_matching_view." for name in ("b.png", "c.png")]
+    assert [query.intrinsics_source for query in asked] == ["given", *[asked[2].intrinsics_source] * 2]
+    assert asked[0].intrinsics == lens
+
+
+def test_renders_of_a_scene_are_places_in_the_other_ones_world(monkeypatch):
+    asked = estimates(monkeypatch, *[Status.LOCALIZED, Status.UNCERTAIN] * 3)
+    monkeypatch.setattr(scenes_onto, "picture", lambda scene, spec: pictures.append(spec) or PICTURE)
+    pictures: list[Any] = []
+    camera = Camera(Intrinsics(1280, 960, 1000.0, 1000.0, 640.0, 480.0), Pose(np.eye(4)))
+    info = SimpleNamespace(origin_in_world=(100.0, 0.0, 0.0), background_rgb=(0.0,) * 3, up_in_world=(0.0, 1.0, 0.0))
+    scene: Any = SimpleNamespace(scene=SimpleNamespace(cameras=[NamedCamera("", camera)] * 5, info=info))
+    known, found, missed = scenes_onto.renders_in(scene, scene, 3)
+    assert len(asked) == len(pictures) == 3  # every other one
+    assert {(spec.intrinsics.width, spec.intrinsics.fx) for spec in pictures} == {(640, 500.0)}
+    assert pictures[0].pose.position_in_world.tolist() == [100.0, 0.0, 0.0]
+    assert (known.kind, known.up) == ("scene", (0.0, 1.0, 0.0))
+    assert missed == ["render 1 was not localized: no_matching_view."]
+    assert [one.name for one in found] == ["render 0", "render 2"]
+    assert [one.covariance for one in found] == [None, None]
+    place = known.places[0]
+    assert place.position.tolist() == [1.0, 2.0, 3.0]
+    # The camera's axes are turned by a right angle about z; the rotation's sigma is the mean of three variances.
+    assert place.covariance == pytest.approx(np.diag([4.0, 1.0, 9.0]))
+    assert place.rotation_sigma == pytest.approx(0.02**0.5)
+
+
+@pytest.mark.parametrize(
+    ("known", "unit", "scale"),
+    [(None, 0.5, 0.5), ("part", 0.5, 0.5), ("whole", None, 2.0), (None, None, None), ("part", None, None)],
+)
+def test_a_scene_is_registered_onto_one_that_is_or_whose_unit_is_known(monkeypatch, known, unit, scale):
+    info = SceneInfo("s", "s", "0" * 64, "ply", metres_per_unit=unit)
+    loaded = SimpleNamespace(scene=SimpleNamespace(info=info))
+    registered = {"part": registration(("up",)), "whole": registration()}.get(known)
+    monkeypatch.setattr(scenes_onto, "loaded_scene", lambda *_: loaded)
+    monkeypatch.setattr(scenes_onto, "scene_registrations", lambda *_: [registered])
+    if scale is None:
+        with pytest.raises(RegistrationFailed, match="nor is its unit known"):
+            scenes_onto.target_of(Path("s"), "xfeat")
+        return
+    found, target = scenes_onto.target_of(Path("s"), "xfeat")
+    assert found is loaded
+    assert (target is registered) == (known == "whole")
+    assert target.metres_per_unit == pytest.approx(scale)
 
 
 def test_each_photo_has_one_place(tmp_path):
