@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 from types import SimpleNamespace
@@ -21,7 +22,7 @@ from service.errors import (
     SceneTooLarge,
     StorageFailed,
 )
-from service.jobs import acceptance, photo_store, service, trajectory
+from service.jobs import acceptance, photo_store, service, shared_jobs, trajectory
 from service.jobs.acceptance import Acceptance
 from service.jobs.job_order import JobOrder
 from service.jobs.live_job import LiveJob
@@ -29,6 +30,7 @@ from service.jobs.model import Batch, Ending, JobSpec
 from service.jobs.photo_store import FolderPhotoStore
 from service.jobs.scene_wait import SceneWait
 from service.jobs.service import Jobs
+from service.jobs.shared_jobs import SharedJobs
 from service.jobs.trajectory import Trajectory
 from service.results import StageTiming, Status
 
@@ -270,6 +272,28 @@ def test_a_clients_share_is_counted_before_its_job_is_stored(taking):
         taking.accept(replace(limited, idempotency_key=None))
     assert taking.names()[3:] == ["released"]
     assert taking.accept(replace(limited, idempotency_key=None, most_queued=2)).id == "second"
+
+
+# ------------------------------------------------------------------ jobs of other fronts
+
+
+@pytest.mark.parametrize("due", [True, False])
+def test_jobs_that_changed_are_looked_at_and_all_once_in_a_while(due, monkeypatch):
+    done: list[Any] = []
+    other: Any = SharedJobs.__new__(SharedJobs)
+    other._lock, other._poll_at = threading.RLock(), 10.0
+    other._followed = {name: LiveJob(name, "s") for name in "ab"}
+    other._worker = SimpleNamespace(live={name: LiveJob(name, "s") for name in "cd"})
+    for name in ("_refresh", "_check_own"):
+        monkeypatch.setattr(SharedJobs, name, lambda _, live, name=name: done.append((name, live.id)))
+    for name in ("_forget_unheard", "_take_waiting"):
+        monkeypatch.setattr(SharedJobs, name, lambda _, name=name: done.append(name))
+    monkeypatch.setattr(shared_jobs.time, "monotonic", lambda: 10.0 if due else 9.99)
+    other._look({"a", "d"})
+    changed = [("_refresh", "a"), ("_check_own", "d")]
+    every = [*(("_refresh", name) for name in "ab"), *(("_check_own", name) for name in "cd")]
+    assert done == ([*every, "_forget_unheard", "_take_waiting"] if due else changed)
+    assert other._poll_at == (10.0 + shared_jobs._POLL_S if due else 10.0)
 
 
 # ------------------------------------------------------------------ photos

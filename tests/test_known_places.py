@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -282,6 +283,20 @@ def test_points_lengths_and_a_floor():
     )
     assert origin is None
     assert evidence.observations[0].position == pytest.approx([4, 5, 6])
+    lengths, floor = ({name: data[name]} for name in ("lengths", "floor"))
+    world = replace(INFO, up_in_world=(1.0, 0.0, 0.0))
+    for read, given, up, directions in (
+        (floor, None, (0, 0, 1), [[0, -1, 0], [1, 0, 0]]), (floor, (0.0, 1.0, 0.0), (0, 1, 0), [[0, -1, 0], [1, 0, 0]]),
+        (lengths, None, (0, 0, 1), [[1, 0, 0]]), (lengths, (0.0, 1.0, 0.0), (0, 1, 0), [[1, 0, 0]]),
+        ({"points": data["points"]}, None, None, []),
+    ):  # fmt: skip
+        picked, above = scene_points.read(read, "points"), np.array([0.0, -3.0, 0.0])
+        found, _ = gathered(KnownPlaces("points", ()), [], picked, world, above, GatherOptions(given))
+        assert found.up == (None if up is None else pytest.approx(up))
+        seen = [each.in_world for each in found.directions]
+        assert np.reshape(seen, (-1, 3)) == pytest.approx(np.reshape(directions, (-1, 3)))
+        assert all(each.in_target == pytest.approx(up) for each in found.directions)
+        assert len(found.heights) == (3 if read is floor else 0)
 
 
 @pytest.mark.parametrize(

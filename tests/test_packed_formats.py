@@ -13,7 +13,7 @@ import pytest
 import zstandard
 
 from service.errors import CorruptScene, SceneError, UnsupportedFormat
-from service.scene_formats import compressed_ply, gltf, ksplat, spz
+from service.scene_formats import compressed_ply, gltf, ksplat, sog, spz
 from service.types import SH_C0
 
 COEFFICIENTS = [(degree + 1) ** 2 - 1 for degree in range(5)]
@@ -242,6 +242,17 @@ def read_compressed(tmp_path: Path, *given: Any, **fields: Any) -> Any:
     path = tmp_path / "a.ply"
     path.write_bytes(compressed(*given, **fields))
     return compressed_ply.read(path)
+
+
+def test_bounds_of_logarithms_are_those_that_have_an_exponential():
+    for end in ("mins", "maxs"):
+        ends = {"mins": -1, "maxs": [1, 2, 3]}
+        for value in (700, -700, [0, -700, 700]):
+            low, high = sog._bounds({"scales": ends | {end: value}}, "scales", 3, "meta.json")
+            assert (low if end == "mins" else high).tolist() == (value if isinstance(value, list) else [value] * 3)
+        for value in (700.1, [0, -700.1, 0]):
+            with pytest.raises(CorruptScene, match=rf"'scales.{end}' must lie within -700..700"):
+                sog._bounds({"scales": ends | {end: value}}, "scales", 3, "meta.json")
 
 
 def test_packed_numbers_are_shares_of_their_chunks_bounds(tmp_path):

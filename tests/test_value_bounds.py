@@ -77,6 +77,20 @@ def test_a_pinholes_distortion_is_radial():
     assert lens.distorted(IntrinsicsCorrection(k1=0.1)).distortion == pytest.approx((0.3,))
 
 
+def test_distortions_are_added_as_far_as_the_farther_corner(monkeypatch):
+    """The principal point is left of and above the middle: the corner is 340 px to the right and 250 px down."""
+    seen = []
+    monkeypatch.setattr("service.types.composed", lambda *asked: seen.append(asked) or ("RADIAL", (0.5, 0.25)))
+    lens = replace(CAMERA, cx=300.0, model="RADIAL", distortion=(0.1, 0.2))
+    found = lens.distorted(IntrinsicsCorrection(2.0, k1=0.01))
+    assert (found.model, found.distortion, found.fx) == ("RADIAL", (0.5, 0.25), 1000.0)
+    assert seen == [("RADIAL", (0.1, 0.2), 2.0, 0.01, pytest.approx(((340 / 1000) ** 2 + (250 / 1020) ** 2) ** 0.5))]
+    # Nothing to add, and nothing to add it to.
+    assert lens.distorted(IntrinsicsCorrection(shift_x=0.1)).distortion == (0.1, 0.2)
+    assert replace(lens, cx=340.0, cy=250.0).distorted(IntrinsicsCorrection(k1=0.01)).model == "RADIAL"
+    assert seen[1][4] == pytest.approx(((340 / 500) ** 2 + (250 / 510) ** 2) ** 0.5)
+
+
 def test_images_are_made_smaller_never_larger():
     for pixels, size in ((320, (320, 240)), (640, (640, 480)), (2000, (640, 480)), (1, (1, 1)), (101, (101, 76))):
         found = CAMERA.with_long_side(pixels)

@@ -67,13 +67,15 @@ def gathered(
         rest = zip(everything.places[len(photos) :], points.in_world, strict=True)
         observations += [_of_point(place, at) for place, at in rest]
     up = options.up or everything.up
-    if up is None and (not observations or (points and len(points.floor))):
-        up = _Z  # the frame is made here: nothing else says what its axes are
     directions: list[Direction] = []
     heights: list[Height] = []
+    # The frame is made here where nothing else says what its axes are.
     if points and len(points.floor):
-        floor, heights = floor_evidence(points.floor, above_in_world, up or _Z)
+        up = up or _Z
+        floor, heights = floor_evidence(points.floor, above_in_world, up)
         directions.append(floor)
+    elif not observations:
+        up = up or _Z
     if up is not None and info.up_in_world is not None:
         directions.append(Direction(np.array(info.up_in_world), np.array(up), SCENE_UP_SIGMA))
     evidence = Evidence(
