@@ -1,7 +1,7 @@
 """The scene that photos are localized in, with its renderer; of a mapped scene both are kept beside it.
 
     CACHE/scenes/KEY/searched-KEY/       opacities.npy                            none, or without floaters
-    CACHE/scenes/KEY/packed-KEY/         order.npy geometry.npy sh.npy spheres.npy    of the CPU's renderer
+    CACHE/scenes/KEY/packed-KEY/         order.npy geometry.npy sh.npy ... (see `pack`)    of the CPU's renderer
 
 Both depend on nothing but the scene in KEY and on how they are made, which is in their own keys. So the next load
 looks at no Gaussian.

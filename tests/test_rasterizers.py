@@ -8,6 +8,7 @@ import sys
 import tracemalloc
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,11 @@ from test_documented_numbers import numbers, rows_of
 from service.geometry import look_at, moved, se3_exp
 from service.interfaces import Frame, Rasterizer
 from service.loaded_scene import LoadedScene
-from service.render import RASTERIZERS
+from service.render import RASTERIZERS, cpu
 from service.render.cpu import CpuRasterizer, dilation_for
 from service.render.gsplat_cuda import GsplatRasterizer
+from service.render.project import project
+from service.render.slabs import SlabConfig, slabs
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
 ON_CPU = "gsplat_on_cpu"
@@ -129,6 +132,49 @@ def test_nothing_is_drawn_beyond_a_uniform_occlusion_depth(depth):
     assert (truth.alpha > 0.1).sum() > 200
     close(frame.rgb, truth.rgb)
     close(frame.depth, truth.depth, scale=2.0)
+
+
+def test_what_a_wall_hides_is_not_projected(monkeypatch):
+    """Three walls, one behind the other: a view in slabs is that of the first one alone, and projects little more."""
+    each = 96 * 96
+    across = np.indices((96, 96)).reshape(2, -1).T / 48 - 1
+    wall = np.column_stack([across, np.ones(each)])
+    means = np.concatenate([z * wall for z in (2.0, 4.0, 6.0)])
+    # No two of equal depth: their order is not said.
+    means[:, 2] += np.random.default_rng(4).permutation(len(means)) * 5e-6
+    scene = make_scene(len(means), 1)
+    flat = np.tile(np.float32([0.025, 0.025, 0.001]), (len(means), 1)) * means[:, 2:].astype(np.float32)
+    upright = np.tile(np.float32([1, 0, 0, 0]), (len(means), 1))
+    opaque = np.full(len(means), 0.9, np.float32)
+    scene = replace(scene, means=means.astype(np.float32), quats=upright, scales=flat, opacities=opaque)
+    camera = Camera(Intrinsics(64, 48, 60, 60, 32, 24), Pose(np.eye(4)))
+    projected = []
+
+    def counting(*given):
+        found = project(*given)
+        projected.append(found[0])
+        return found
+
+    monkeypatch.setattr(cpu, "project", counting)
+    whole = CpuRasterizer(scene)
+    (at_once,) = whole.render([camera])
+    (visible,) = projected
+    projected.clear()
+    monkeypatch.setattr(cpu, "SLABS", SlabConfig(0, 16, 1.0))
+    monkeypatch.setattr(cpu, "slabs", partial(slabs, config=cpu.SLABS))
+    (in_slabs,) = whole.render([camera])
+    assert len(projected) > 1
+    assert visible > 2.5 * sum(projected)
+    # A thousandth of the light is missing at most.
+    assert np.abs(in_slabs.rgb - at_once.rgb).max() <= 0.001
+    first = {n: getattr(scene, n)[:each] for n in ("means", "quats", "scales", "opacities", "sh")}
+    truth = render_reference(replace(scene, **first), camera)
+    assert truth.alpha.min() > 0.999
+    assert np.abs(in_slabs.rgb - truth.rgb.numpy()).max() <= 0.001
+    # Gradients are of the image at once.
+    d_rgb = np.random.default_rng(5).normal(size=(48, 64, 3)).astype(np.float32)
+    monkeypatch.setattr(cpu, "SLABS", SlabConfig())
+    assert np.array_equal(whole.pose_gradient(camera, d_rgb), CpuRasterizer(scene).pose_gradient(camera, d_rgb))
 
 
 def test_an_open_tile_shows_everything():

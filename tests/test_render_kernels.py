@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,12 +18,15 @@ from test_rasterizers import lens, make_camera, make_scene, numeric_generator, r
 
 from service.render import cpu, pack
 from service.render.cpu import CpuRasterizer, dilation_for
+from service.render.slabs import SlabConfig, open_sums, slabs
+from service.types import Camera, Pose
 
 project = plain("service.render.project")
 blend = plain("service.render.blend")
 KERNELS = {
     "project": project.project,
-    "blend": blend.blend,
+    "blocks_in_view": project.blocks_in_view,
+    **{name: vars(blend)[name] for name in ("blend", "begin", "blend_further", "write")},
     "blend_backward": plain("service.render.backward").blend_backward,
     "sort_by_depth": plain("service.render.tiles").sort_by_depth,
     "fill_tiles": plain("service.render.tiles").fill_tiles,
@@ -30,6 +34,7 @@ KERNELS = {
 }
 
 
+NONE = np.empty(0, np.int32)
 PARAMETERS = ("means", "quats", "scales", "opacities", "sh")
 
 
@@ -38,7 +43,8 @@ def plainly(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Render without the compiler, and divide by zero and overflow as machine code does: in silence."""
     for name, kernel in KERNELS.items():
         monkeypatch.setattr(cpu, name, kernel)
-    monkeypatch.setattr(pack, "_fill", plain("service.render.pack")._fill)
+    for name in ("_fill", "_enclose"):
+        monkeypatch.setattr(pack, name, vars(plain("service.render.pack"))[name])
     with np.errstate(all="ignore"):
         yield
 
@@ -55,6 +61,48 @@ def test_every_pixel_equals_the_reference(degree: int, antialiased: bool) -> Non
     for ours, right in zip((frame.rgb, frame.alpha, frame.depth, frame.median_depth), truth, strict=True):
         assert worst(ours, right) < 1e-5
     assert truth.alpha.max() > 0.5
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_every_pixel_that_is_drawn_in_slabs_equals_the_reference(monkeypatch, antialiased: bool) -> None:
+    """In blocks of 16 Gaussians, of which each begins another slab."""
+    monkeypatch.setattr(pack, "CHUNKS_PER_BLOCK", 1)
+    monkeypatch.setitem(project.project.__globals__, "CHUNKS_PER_BLOCK", 1)
+    monkeypatch.setattr(cpu, "SLABS", SlabConfig(0, 1, 1.0, 0.0))
+    monkeypatch.setattr(cpu, "slabs", partial(slabs, config=cpu.SLABS))
+    scene, inside = make_scene(160, 1, 3, antialiased), make_camera(21, 18, seed=3)
+    back = np.eye(4)
+    back[2, 3] = -6.0
+    camera = Camera(inside.intrinsics, Pose(inside.pose.world_from_camera @ back))
+    drawn = []
+    monkeypatch.setattr(cpu, "blend_further", lambda *given: drawn.append(1) or blend.blend_further(*given))
+    frame = CpuRasterizer(scene).render([camera])[0]
+    truth = render_reference(scene, camera)
+    for ours, right in zip((frame.rgb, frame.alpha, frame.depth, frame.median_depth), truth, strict=True):
+        assert worst(ours, right) < 1e-5
+    assert truth.alpha.max() > 0.5
+    assert len(drawn) > 3
+
+
+def test_slabs_are_in_order_and_have_all_blocks() -> None:
+    """One block reaches through all of them, one is around the camera."""
+    extents = np.array([[3, 9], [1, 2], [-1, 0.5], [2, 3], [5, 6], [7, 8]], np.float32)
+    found = [
+        (sorted(b.tolist()), *map(float, ends))
+        for b, *ends in slabs(np.arange(6, dtype=np.int32), extents, 0.125, SlabConfig(0, 2))
+    ]
+    assert found == [([1, 2, 3], 0.125, 3.0), ([0, 3, 4], 3.0, 7.0), ([0, 5], 7.0, np.inf)]
+    (all_around,) = slabs(np.arange(2, dtype=np.int32), np.array([[-1, 1], [-2, 1]], np.float32), 0.1, SlabConfig(0, 1))
+    assert (sorted(all_around[0].tolist()), all_around[2]) == ([0, 1], np.inf)
+
+
+def test_open_tiles_are_counted_above_and_left_of_every_corner() -> None:
+    is_open = np.random.default_rng(1).random((5, 7)) < 0.5
+    sums = open_sums(is_open).reshape(6, 8)
+    assert all(sums[y, x] == is_open[:y, :x].sum() for y in range(6) for x in range(8))
+    for x0, y0, x1, y1 in ((0, 0, 7, 5), (2, 1, 4, 3), (6, 4, 7, 5), (3, 3, 3, 5)):
+        any_open = bool(is_open[y0:y1, x0:x1].any())
+        assert project.hidden(1.0, x0, y0, x1, y1, 7, np.empty(0), sums.reshape(-1)) == (not any_open)
 
 
 @pytest.mark.parametrize(("degree", "antialiased"), [(1, False), (2, True), (3, False)])
@@ -117,17 +165,24 @@ def test_a_block_is_hidden_behind_all_tiles_that_its_box_may_reach_and_one_more(
     for tile in range(10 * 6):
         depths = np.full(60, 3.9)
         depths[tile] = 4.0
-        if not project.block_hidden(sphere, view, pinhole, 0.01, 10, 6, depths):
+        if not project.block_hidden(sphere, view, pinhole, 0.01, np.inf, 10, 6, depths, NONE):
             open_tiles.add((tile % 10, tile // 10))
     assert open_tiles == {(x, y) for x in columns for y in rows}
-    assert project.block_hidden(sphere, view, pinhole, 3.99, 10, 6, np.full(60, 3.9))
-    assert not project.block_hidden(sphere, view, pinhole, 4.0, 10, 6, np.full(60, 3.9))  # it reaches the near plane
+    # Cut by the near plane, or the slab's, it is narrower: from depth 5 on it ends at 90 px, up to 5 it begins at 50.
+    for near, far, columns in ((5.0, np.inf, range(1, 7)), (0.01, 5.0, range(2, 8)), (6.0, 7.0, ()), (3.0, 4.0, ())):
+        shown = set()
+        for tile in range(10 * 6):
+            depths = np.full(60, -np.inf)
+            depths[tile] = np.inf
+            if not project.block_hidden(sphere, view, pinhole, near, far, 10, 6, depths, NONE):
+                shown.add(tile % 10)
+        assert shown == set(columns)
     turned = make_camera(seed=4).pose.camera_from_world
     centre = np.linalg.inv(turned) @ [2.5, -0.5, 5.0, 1.0]
     for tile, is_hidden in (((7, 3), False), ((8, 3), True), ((7, 4), True), ((1, 0), False), ((0, 0), True)):
         depths = np.full(60, 3.9)
         depths[tile[0] + 10 * tile[1]] = 4.1
-        found = project.block_hidden([*centre[:3], 1.0], turned[:3].ravel(), pinhole, 0.01, 10, 6, depths)
+        found = project.block_hidden([*centre[:3], 1.0], turned[:3].ravel(), pinhole, 0.01, np.inf, 10, 6, depths, NONE)
         assert found == is_hidden
 
 

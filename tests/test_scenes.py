@@ -390,7 +390,7 @@ def test_a_second_load_looks_at_no_gaussian(folder, tmp_path, monkeypatch):
     loaded = LoadedScene.load(path, cache_dir=cache)
     assert np.array_equal(loaded.searched.opacities > 0, ~odd)
     assert np.array_equal(loaded.scene.opacities, read.opacities)
-    for name in ("order", "geometry", "sh", "spheres"):
+    for name in ("order", "geometry", "sh", "spheres", "chunk_spheres"):
         mapped = getattr(loaded.rasterizer.packed, name)
         assert isinstance(mapped.base, np.memmap)
         assert np.array_equal(mapped, getattr(expected.packed, name))

@@ -56,6 +56,7 @@ X, Y, A, B, C, O, Z, R, G, BL = (i * BATCH for i in range(10))  # noqa: E741
 LOCAL = 16 * BATCH
 STATE = 7 * 16
 """Floats of a block's state: T, r, g, b, depth sum, median depth, alpha."""
+TILE_STATE = 16 * STATE
 
 
 @inline
@@ -132,42 +133,97 @@ def blend(records, starts, entries, width, height, background, end_t, local, lis
     """Write the image. Flat float32 outputs: rgb interleaved, the others one plane each. `end_t`: at least T_MIN."""
     tiles_x = (width + TILE - 1) // TILE
     tiles_y = (height + TILE - 1) // TILE
-    lane_x = to_float(iota() & isplat(3))
-    lane_y = to_float(iota() >> isplat(2))
     for tile in range(tiles_x * tiles_y):
         tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
-        alive = np.uint32(0)  # a bit for each block with pixels that still let light through
-        for block in range(16):
-            if tile_x + block % 4 * 4 < width and tile_y + block // 4 * 4 < height:
-                alive |= np.uint32(1) << np.uint32(block)
-        inside = alive
-        for block in range(16):
-            store(state, block * STATE, splat(1.0))  # transmittance
-            for k in range(1, 7):
-                store(state, block * STATE + k * 16, splat(0.0))
+        _clear(state, 0)
         first, last = np.intp(starts[tile]), np.intp(starts[tile + 1])
-        while first < last and alive != 0:
-            count = min(BATCH, last - first)
-            gather_batch(records, entries, first, count, local)
-            record_lists_by_block(local, count, tile_x, tile_y, alive, lists, lengths)
-            first += count
+        inside = _blocks_inside(tile_x, tile_y, width, height)
+        _blend_list(records, entries, first, last, tile_x, tile_y, inside, end_t, local, lists, lengths, state, 0)
+        _write_tile(state, 0, tile_x, tile_y, width, height, background, rgb, alpha, depth, median)
+
+
+@kernel
+def begin(width, height, states, alive):
+    """Begin an image that is blended in several steps: clear the states of all tiles, and mark their blocks."""
+    tiles_x = (width + TILE - 1) // TILE
+    for tile in range(len(alive)):
+        _clear(states, tile * TILE_STATE)
+        alive[tile] = _blocks_inside(tile % tiles_x * TILE, tile // tiles_x * TILE, width, height)
+
+
+@kernel
+def blend_further(records, starts, entries, width, end_t, close_t, local, lists, lengths, states, alive):
+    """Blend what is behind everything that was blended before; tiles without a block that is `alive` are passed by.
+
+    Afterwards blocks are no longer alive whose pixels all have a transmittance of `close_t` or less.
+    """
+    tiles_x = (width + TILE - 1) // TILE
+    for tile in range(len(alive)):
+        first, last = np.intp(starts[tile]), np.intp(starts[tile + 1])
+        if alive[tile] != 0 and first < last:
+            tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
+            alive[tile] = _blend_list(
+                records, entries, first, last, tile_x, tile_y, alive[tile], end_t, local, lists, lengths,
+                states, tile * TILE_STATE,
+            )  # fmt: skip
             for block in range(16):
-                if not (alive >> np.uint32(block)) & np.uint32(1) or lengths[block] == 0:
-                    continue
-                px = lane_x + np.float32(tile_x + block % 4 * 4 + 0.5)
-                py = lane_y + np.float32(tile_y + block // 4 * 4 + 0.5)
-                if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, end_t, state):
-                    alive &= ~(np.uint32(1) << np.uint32(block))
-        for block in range(16):
-            if (inside >> np.uint32(block)) & np.uint32(1):
-                x, y = tile_x + block % 4 * 4, tile_y + block // 4 * 4
-                _write_block(state, block, x, y, width, height, background, rgb, alpha, depth, median)
+                if bits(load(states, tile * TILE_STATE + block * STATE) > close_t) == 0:
+                    alive[tile] &= ~(np.uint32(1) << np.uint32(block))
+
+
+@kernel
+def write(width, height, background, states, rgb, alpha, depth, median):
+    """Write the image that was blended in several steps; the states are used up."""
+    tiles_x = (width + TILE - 1) // TILE
+    tiles_y = (height + TILE - 1) // TILE
+    for tile in range(tiles_x * tiles_y):
+        tile_x, tile_y = tile % tiles_x * TILE, tile // tiles_x * TILE
+        base = tile * TILE_STATE
+        _write_tile(states, base, tile_x, tile_y, width, height, background, rgb, alpha, depth, median)
 
 
 @inline
-def _run_block(local, lists, block, length, px, py, end_t, state):
+def _blocks_inside(tile_x, tile_y, width, height):
+    """Return a bit for each block of the tile that lies inside the image."""
+    inside = np.uint32(0)
+    for block in range(16):
+        if tile_x + block % 4 * 4 < width and tile_y + block // 4 * 4 < height:
+            inside |= np.uint32(1) << np.uint32(block)
+    return inside
+
+
+@inline
+def _clear(states, base):
+    for block in range(16):
+        store(states, base + block * STATE, splat(1.0))  # transmittance
+        for k in range(1, 7):
+            store(states, base + block * STATE + k * 16, splat(0.0))
+
+
+@inline
+def _blend_list(records, entries, first, last, tile_x, tile_y, alive, end_t, local, lists, lengths, states, base):
+    """Blend a part of a tile's list onto its state. Returns a bit for each block that still lets light through."""
+    lane_x = to_float(iota() & isplat(3))
+    lane_y = to_float(iota() >> isplat(2))
+    while first < last and alive != 0:
+        count = min(BATCH, last - first)
+        gather_batch(records, entries, first, count, local)
+        record_lists_by_block(local, count, tile_x, tile_y, alive, lists, lengths)
+        first += count
+        for block in range(16):
+            if not (alive >> np.uint32(block)) & np.uint32(1) or lengths[block] == 0:
+                continue
+            px = lane_x + np.float32(tile_x + block % 4 * 4 + 0.5)
+            py = lane_y + np.float32(tile_y + block // 4 * 4 + 0.5)
+            at = base + block * STATE
+            if not _run_block(local, lists, block, np.intp(lengths[block]), px, py, end_t, states, at):
+                alive &= ~(np.uint32(1) << np.uint32(block))
+    return alive
+
+
+@inline
+def _run_block(local, lists, block, length, px, py, end_t, state, base):
     """Blend the block's list onto its state. Returns False when every pixel's transmittance is `end_t` or less."""
-    base = block * STATE
     t, r, g = load(state, base), load(state, base + 16), load(state, base + 32)
     b, d, m = load(state, base + 48), load(state, base + 64), load(state, base + 80)
     total = load(state, base + 96)
@@ -207,9 +263,16 @@ def _run_block(local, lists, block, length, px, py, end_t, state):
 
 
 @inline
-def _write_block(state, block, x, y, width, height, background, rgb, alpha, depth, median):
+def _write_tile(states, base, tile_x, tile_y, width, height, background, rgb, alpha, depth, median):
+    for block in range(16):
+        x, y = tile_x + block % 4 * 4, tile_y + block // 4 * 4
+        if x < width and y < height:
+            _write_block(states, base + block * STATE, x, y, width, height, background, rgb, alpha, depth, median)
+
+
+@inline
+def _write_block(state, at, x, y, width, height, background, rgb, alpha, depth, median):
     """Add the background, normalize the depth, and write the part of the block that lies inside the image."""
-    at = block * STATE
     a = load(state, at + 96)
     rest = 1.0 - a
     r = fma(rest, background[0], load(state, at + 16))

@@ -1,11 +1,11 @@
 """The CPU renderer: one thread per image, several images over one shared pool.
 
-The steps are in `project` (ellipses and colours), `tiles` (depth order, tile lists), `blend` (the image), `backward`
-and `chain` (gradients); `pack` has the memory layout. Semantics are gsplat's (3DGS, Kerbl et al. 2023), with
-two additions: the 0.3 px^2 screen-space dilation, right at the resolution the scene was trained at, is scaled by
-(f_render / f_train)^2, which removes the bias of small renders; and whole blocks of 256 Gaussians outside 1.3 times the
-field of view are culled. On request an image ends early (`approximate`) and leaves out what lies beyond given depths
-(`occlusion_depths`).
+The steps are in `project` (ellipses and colours), `tiles` (depth order, tile lists), `blend` (the image), `slabs` (of
+large views), `backward` and `chain` (gradients); `pack` has the memory layout. Semantics are gsplat's (3DGS, Kerbl et
+al. 2023), with two additions: the 0.3 px^2 screen-space dilation, right at the resolution the scene was trained at, is
+scaled by (f_render / f_train)^2, which removes the bias of small renders; and whole blocks of 256 Gaussians outside 1.3
+times the field of view are culled. On request an image ends early (`approximate`) and leaves out what lies beyond
+given depths (`occlusion_depths`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int32
 
 from service.interfaces import Frame, Rasterizer, SceneGradients
 from service.render.backward import INPUT, WORK, blend_backward
-from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, blend
+from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, TILE_STATE, begin, blend, blend_further, write
 from service.render.pack import LANES, Packed, aligned, fill, mapped_pack, pack
-from service.render.project import RECORD, TILE, project
+from service.render.project import RECORD, TILE, blocks_in_view, project
 from service.render.projection_gradients import ROW, pose_twist, scene_rows, unpack_rows
+from service.render.slabs import SLABS, open_sums, slabs
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
 
@@ -47,7 +48,7 @@ class RenderConfig:
 
 DEFAULTS = RenderConfig()
 
-NO_OCCLUSION = np.empty(0, np.float32)
+NO_OCCLUSION, ALL_OPEN = np.empty(0, np.float32), np.empty(0, np.int32)
 
 # One for all scenes: kernels release the GIL, and more threads than cores would only take turns.
 _POOL = ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="render")
@@ -166,30 +167,66 @@ class CpuRasterizer(Rasterizer):
         return result
 
     def _render(
-        self, camera: Camera, end_t: np.float32 = T_MIN, occlusion_depth: Float32[np.ndarray, "_ _"] | None = None
+        self,
+        camera: Camera,
+        end_t: np.float32 = T_MIN,
+        occlusion_depth: Float32[np.ndarray, "_ _"] | None = None,
+        at_once: bool = False,
     ) -> Frame:
-        s = self._scratch()
+        s, k = self._scratch(), camera.intrinsics
         s.camera = None  # after an error the lists belong to no camera
-        self._bin(camera, s, occlusion_depth)
-        k = camera.intrinsics
         frame = Frame(np.empty((k.height, k.width, 3), np.float32), *np.empty((3, k.height, k.width), np.float32))
-        blend(
-            s.records, s.starts, s.entries, k.width, k.height, self._background, end_t, s.local, s.lists, s.lengths,
-            s.state,
-            frame.rgb.reshape(-1), frame.alpha.reshape(-1), frame.depth.reshape(-1), frame.median_depth.reshape(-1),
-        )  # fmt: skip
+        images = [image.reshape(-1) for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth)]
+        view = _view_and_intrinsics(camera)
+        near = np.float32(self.scene.info.near_plane)
+        found = blocks_in_view(self.packed.spheres, *view, k.width, k.height, near, s.blocks, s.extents)
+        blocks = s.blocks[:found]
+        tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
+        if found > SLABS.min_blocks and not at_once:
+            self._draw_slabs(camera, s, blocks, s.extents[:found], end_t, tile_depths, images)
+        else:
+            self._bin(camera, s, blocks, near, np.float32(np.inf), tile_depths, ALL_OPEN)
+            blend(
+                s.records, s.starts, s.entries, k.width, k.height, self._background, end_t, s.local, s.lists,
+                s.lengths, s.state, *images,
+            )  # fmt: skip
+            if end_t == T_MIN and occlusion_depth is None:  # an approximate image has no gradients
+                s.camera, s.info, s.frame = camera, self.scene.info, frame
         # The gradients and other jobs' caches share these arrays.
         for image in (frame.rgb, frame.alpha, frame.depth, frame.median_depth):
             image.flags.writeable = False
-        if end_t == T_MIN and occlusion_depth is None:  # an approximate image has no gradients
-            s.camera, s.info, s.frame = camera, self.scene.info, frame
         return frame
+
+    def _draw_slabs(
+        self,
+        camera: Camera,
+        s: _Scratch,
+        blocks: Int32[np.ndarray, "n"],
+        extents: Float32[np.ndarray, "n 2"],
+        end_t: np.float32,
+        tile_depths: Float32[np.ndarray, "_"],
+        images: Sequence[Float32[np.ndarray, "_"]],
+    ) -> None:
+        """Draw the image slab by slab, until no tile lets light through; see `slabs`."""
+        k = camera.intrinsics
+        tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
+        s.states, s.alive = _at_least(s.states, tiles_x * tiles_y * TILE_STATE), np.empty(tiles_x * tiles_y, np.uint32)
+        begin(k.width, k.height, s.states, s.alive)
+        close_t = max(end_t, np.float32(SLABS.close_t))
+        for some, near, far in slabs(blocks, extents, self.scene.info.near_plane):
+            self._bin(camera, s, some, near, far, tile_depths, open_sums(s.alive.reshape(tiles_y, tiles_x) != 0))
+            blend_further(
+                s.records, s.starts, s.entries, k.width, end_t, close_t, s.local, s.lists, s.lengths, s.states, s.alive
+            )  # fmt: skip
+            if not s.alive.any():
+                break
+        write(k.width, k.height, self._background, s.states, *images)
 
     def _backward(self, camera: Camera, d_rgb: Any, d_depth: Any, d_alpha: Any) -> _Scratch:
         """Fill `sums` for the image of this camera, rendered first unless it was this thread's last one."""
         s = self._scratch()
         is_last = s.camera is camera and s.info is self.scene.info  # `trained_at` another size gives another image
-        frame = s.frame if is_last and s.frame is not None else self._render(camera)
+        frame = s.frame if is_last and s.frame is not None else self._render(camera, at_once=True)
         width, height = camera.intrinsics.width, camera.intrinsics.height
         zero = np.zeros(width * height, np.float32)  # a gradient that is not given
         s.sums[: s.visible * RECORD] = 0
@@ -217,14 +254,22 @@ class CpuRasterizer(Rasterizer):
         info = self.scene.info
         return np.float32(dilation_for(camera, info)), info.render_mode == "antialiased"
 
-    def _bin(self, camera: Camera, s: _Scratch, occlusion_depth: Float32[np.ndarray, "_ _"] | None) -> None:
-        """Project the Gaussians, sort them by depth and fill the tile lists."""
+    def _bin(
+        self,
+        camera: Camera,
+        s: _Scratch,
+        blocks: Int32[np.ndarray, "_"],
+        near: np.float32,
+        far: np.float32,
+        tile_depths: Float32[np.ndarray, "_"],
+        open_tiles: Int32[np.ndarray, "_"],
+    ) -> None:
+        """Project the Gaussians of the blocks between two depths, sort them by depth and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
-        tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
         s.visible, count = project(
-            packed.geometry, packed.sh, packed.spheres, packed.sh_degree,
+            packed.geometry, packed.sh, packed.spheres, packed.chunk_spheres, blocks, packed.sh_degree,
             *_view_and_intrinsics(camera), k.width, k.height, *self._dilation(camera),
-            np.float32(self.scene.info.near_plane), tile_depths, s.records, s.depths, s.rects, s.local,
+            near, far, tile_depths, open_tiles, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:
@@ -252,6 +297,11 @@ def _tile_maxima(occlusion_depth: Float32[np.ndarray, "h w"], width: int, height
     return np.ascontiguousarray(occlusion_depth, np.float32).reshape(-1)
 
 
+def _at_least(array: np.ndarray, count: int) -> np.ndarray:
+    """Return the array, or a new one if it is too short."""
+    return array if len(array) >= count else aligned(count)
+
+
 def _flat(image: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(image, np.float32).reshape(-1)
 
@@ -273,6 +323,11 @@ class _Scratch:
         self.lists = aligned(16 * LIST, np.int32)
         self.lengths = np.empty(16, np.int32)
         self.state = aligned(16 * STATE)
+        self.blocks = np.empty(len(packed.spheres), np.int32)
+        self.extents = np.empty((len(packed.spheres), 2), np.float32)
+        self.states = aligned(0)
+        """Of all tiles, and which of their blocks still let light through: of images that are drawn in slabs."""
+        self.alive = np.empty(0, np.uint32)
         self.visible = 0
         self.camera: Camera | None = None
         """Camera of the image that the lists belong to..."""

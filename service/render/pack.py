@@ -5,6 +5,7 @@
     geometry  [chunk][ mx | my | mz | Sxx | Sxy | Sxz | Syy | Syz | Szz | log2 opacity ][16 lanes]
     sh        [chunk][ k0 r | k0 g | k0 b | k1 r | ... ][16 lanes]
     spheres   [block][ x, y, z, radius ]     encloses every Gaussian of the block out to its visible edge
+    chunk_spheres   [chunk][ x, y, z, radius ]     the same of the chunk
 
 One load brings a value of 16 Gaussians into a register. Morton order puts neighbours into one chunk, so that a block's
 sphere is small and is culled as a whole. S is the covariance in the world frame: it depends on no camera and is
@@ -34,9 +35,9 @@ VISIBLE_SIGMAS = 3.33
 """exp(-x^2 / 2) = 1/255 at x = 3.33: beyond it even an opaque Gaussian is skipped."""
 NEVER = -1e9
 """log2 of the opacity of a Gaussian that is never visible."""
-VERSION = 1
+VERSION = 2
 """Of the layout in files."""
-_ARRAYS = ("order", "geometry", "sh", "spheres")
+_ARRAYS = ("order", "geometry", "sh", "spheres", "chunk_spheres")
 _log = logging.getLogger(__name__)
 
 
@@ -51,11 +52,12 @@ class Packed:
     geometry: Float32[np.ndarray, "g"]
     sh: Float32[np.ndarray, "s"]
     spheres: Float32[np.ndarray, "blocks 4"]
+    chunk_spheres: Float32[np.ndarray, "chunks 4"]
 
     @property
     def nbytes(self) -> int:
         """Memory of all arrays."""
-        return self.order.nbytes + self.geometry.nbytes + self.sh.nbytes + self.spheres.nbytes
+        return sum(getattr(self, name).nbytes for name in _ARRAYS)
 
     @property
     def chunks(self) -> int:
@@ -78,7 +80,8 @@ def pack(scene: GaussianScene) -> Packed:
     (padded,) = layout["order"][0]
     order = np.concatenate([order, np.full(padded - scene.count, order[-1], np.int32)])
     geometry, sh = (aligned(layout[name][0][0]) for name in ("geometry", "sh"))
-    packed = Packed(scene.count, scene.sh_degree, order, geometry, sh, np.empty(*layout["spheres"]))
+    spheres, chunk_spheres = (np.empty(*layout[name]) for name in ("spheres", "chunk_spheres"))
+    packed = Packed(scene.count, scene.sh_degree, order, geometry, sh, spheres, chunk_spheres)
     fill(packed, scene)
     return packed
 
@@ -123,6 +126,7 @@ def _layout(scene: GaussianScene) -> dict[str, tuple[tuple[int, ...], type]]:
         "geometry": ((chunks * GEOMETRY * LANES,), np.float32),
         "sh": ((chunks * scene.sh.shape[1] * 3 * LANES,), np.float32),
         "spheres": ((-(-chunks // CHUNKS_PER_BLOCK), 4), np.float32),
+        "chunk_spheres": ((chunks, 4), np.float32),
     }
 
 
@@ -131,8 +135,10 @@ def fill(packed: Packed, scene: GaussianScene) -> None:
     sh = scene.sh.reshape(scene.count, -1)
     _fill(
         scene.means, scene.quats, scene.scales, scene.opacities, sh, packed.count, packed.order,
-        packed.geometry, packed.sh, packed.spheres,
+        packed.geometry, packed.sh,
     )  # fmt: skip
+    _enclose(scene.means, scene.scales, packed.order, LANES, packed.chunk_spheres)
+    _enclose(scene.means, scene.scales, packed.order, LANES * CHUNKS_PER_BLOCK, packed.spheres)
 
 
 def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
@@ -151,8 +157,8 @@ def morton_order(means: Float32[np.ndarray, "n 3"]) -> Int32[np.ndarray, "n"]:
 
 
 @kernel
-def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh, spheres):
-    """Write covariances, SH and bounding spheres; numba, as a Python loop over millions would take minutes."""
+def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh):
+    """Write covariances and SH; numba, as a Python loop over millions would take minutes."""
     coefficients = sh.shape[1]
     for place in range(order.shape[0]):
         i = order[place]
@@ -175,10 +181,15 @@ def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh
         at = (place // 16) * coefficients * 16 + (place & 15)
         for k in range(coefficients):
             packed_sh[at + k * 16] = sh[i, k]
-    for block in range(spheres.shape[0]):
-        first = block * CHUNKS_PER_BLOCK * LANES
-        last = min(first + CHUNKS_PER_BLOCK * LANES, order.shape[0])
-        # The sphere around the bounding box's centre: not the smallest one, but found in two passes.
+
+
+@kernel
+def _enclose(means, scales, order, size, spheres):
+    """Write the sphere of every `size` Gaussians in their packed order, around the middle of their box."""
+    for group in range(spheres.shape[0]):
+        first = group * size
+        last = min(first + size, order.shape[0])
+        # Not the smallest sphere, but found in two passes.
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for place in range(first, last):
             for axis in range(3):
@@ -193,5 +204,5 @@ def _fill(means, quats, scales, opacities, sh, count, order, geometry, packed_sh
             extent = VISIBLE_SIGMAS * max(scales[i, 0], scales[i, 1], scales[i, 2])
             radius = max(radius, np.sqrt(squared) + extent)
         for axis in range(3):
-            spheres[block, axis] = 0.5 * (low[axis] + high[axis])
-        spheres[block, 3] = radius
+            spheres[group, axis] = 0.5 * (low[axis] + high[axis])
+        spheres[group, 3] = radius

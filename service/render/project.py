@@ -122,19 +122,45 @@ def in_view(sphere, view, low_x, high_x, low_y, high_y, near):
     )
 
 
+@kernel
+def blocks_in_view(spheres, view, pinhole, width, height, near, blocks, extents):
+    """Write the numbers of the blocks that may be seen, and the least and largest depth of each; return how many."""
+    low_x, high_x, low_y, high_y = _clamp_region(pinhole, width, height)
+    count = 0
+    for block in range(spheres.shape[0]):
+        sphere = spheres[block]
+        if in_view(sphere, view, low_x, high_x, low_y, high_y, near):
+            blocks[count] = block
+            depth = view[8] * sphere[0] + view[9] * sphere[1] + view[10] * sphere[2] + view[11]
+            extents[count, 0], extents[count, 1] = depth - sphere[3], depth + sphere[3]
+            count += 1
+    return count
+
+
 @inline
-def block_hidden(sphere, view, pinhole, near, tiles_x, tiles_y, tile_depths):
-    """Whether a bounding sphere lies behind the occlusion depths of all tiles that it may reach into."""
+def _clamp_region(pinhole, width, height):
+    """Return low x, high x, low y, high y of the region that ellipses are clamped to, at depth 1; low is -x, -y."""
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
+    high_x = (width - cx) / fx + np.float32(0.15) * width / fx
+    low_x = cx / fx + np.float32(0.15) * width / fx
+    high_y = (height - cy) / fy + np.float32(0.15) * height / fy
+    low_y = cy / fy + np.float32(0.15) * height / fy
+    return low_x, high_x, low_y, high_y
+
+
+@inline
+def block_hidden(sphere, view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums):
+    """Whether what a bounding sphere has between two depths is hidden in all tiles that it may reach into."""
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
-    nearest, farthest = cz - radius, cz + radius
-    if nearest <= near:  # its projection is unbounded
-        return False
+    nearest, farthest = max(cz - radius, near), min(cz + radius, far)
+    if nearest >= farthest:
+        return True
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
     x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, pinhole[0], pinhole[2], tiles_x)
     y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, pinhole[1], pinhole[3], tiles_y)
-    return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths)
+    return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths, open_sums)
 
 
 @inline
@@ -146,8 +172,14 @@ def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
 
 
 @inline
-def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
-    """Whether a depth lies behind the occlusion depths of all these tiles."""
+def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths, open_sums):
+    """Whether none of these tiles is open, or the depth is behind the occlusion depths of all; see `project`."""
+    if len(open_sums):
+        top, bottom = np.intp(y0 * (tiles_x + 1)), np.intp(y1 * (tiles_x + 1))
+        if open_sums[bottom + x1] - open_sums[bottom + x0] == open_sums[top + x1] - open_sums[top + x0]:
+            return True
+    if len(tile_depths) == 0:
+        return False
     for ty in range(y0, y1):
         for tx in range(x0, x1):
             if depth <= tile_depths[np.intp(ty * tiles_x + tx)]:
@@ -155,20 +187,29 @@ def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
     return True
 
 
+@inline
+def _not_hidden(mask, rects, scratch, tiles_x, tile_depths, open_sums):
+    """Return the mask without the lanes that are hidden in all tiles of their rectangles."""
+    for lane in range(16):
+        if (mask >> np.uint32(lane)) & np.uint32(1):
+            x0, y0, x1, y1 = rects[512 + lane], rects[528 + lane], rects[544 + lane], rects[560 + lane]
+            if hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, tile_depths, open_sums):
+                mask &= ~(np.uint32(1) << np.uint32(lane))
+    return mask
+
+
 @kernel
-def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilation, antialiased, near, tile_depths,
-            records, depths, rects, scratch):  # fmt: skip
+def project(geometry, sh, spheres, chunk_spheres, blocks, degree, view, pinhole, width, height, dilation,
+            antialiased, near, far, tile_depths, open_sums, records, depths, rects, scratch):  # fmt: skip
     """Write a record, a depth and a tile rectangle for every visible Gaussian; return (visible, tile entries).
 
-    `view`: camera_from_world, 12 floats row by row. `pinhole`: fx, fy, cx, cy. `tile_depths`: for each tile the depth
-    beyond which nothing is seen; empty: unlimited. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1
-    (ends excluded).
+    Visible are those of `blocks` between the depths `near` and `far`. `view`: camera_from_world, 12 floats row by row.
+    `pinhole`: fx, fy, cx, cy. `tile_depths`: for each tile the depth beyond which nothing is seen; empty: unlimited.
+    `open_sums`: the number of open tiles above and left of each corner of tiles, row by row, where in the others
+    nothing is seen; empty: all are open. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1 (ends excluded).
     """
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
-    high_x = (width - cx) / fx + np.float32(0.15) * width / fx
-    low_x = cx / fx + np.float32(0.15) * width / fx
-    high_y = (height - cy) / fy + np.float32(0.15) * height / fy
-    low_y = cy / fy + np.float32(0.15) * height / fy
+    low_x, high_x, low_y, high_y = _clamp_region(pinhole, width, height)
     tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
     r00, r01, r02, t0 = view[0], view[1], view[2], view[3]
     r10, r11, r12, t1 = view[4], view[5], view[6], view[7]
@@ -182,16 +223,22 @@ def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilatio
     visible = 0
     entries = 0
     integers = scratch.view(np.int32)
-    for block in range(spheres.shape[0]):
-        if not in_view(spheres[block], view, low_x, high_x, low_y, high_y, near):
-            continue
-        if len(tile_depths) and block_hidden(spheres[block], view, pinhole, near, tiles_x, tiles_y, tile_depths):
+    may_hide = len(tile_depths) > 0 or len(open_sums) > 0
+    for place in range(blocks.shape[0]):
+        block = np.intp(blocks[place])
+        if may_hide and block_hidden(
+            spheres[block], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums
+        ):
             continue
         for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
+            if may_hide and block_hidden(
+                chunk_spheres[chunk], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums
+            ):
+                continue
             at = chunk * 160
             mx, my, mz = load(geometry, at), load(geometry, at + 16), load(geometry, at + 32)
             z = fma(mx, r20, fma(my, r21, fma(mz, r22, t2)))
-            seen = z > near
+            seen = (z > near) & (z <= far)
             if bits(seen) == 0:
                 continue
             x = fma(mx, r00, fma(my, r01, fma(mz, r02, t0)))
@@ -230,6 +277,16 @@ def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilatio
             mask = bits(seen)
             if mask == 0:
                 continue
+            to_tile = np.float32(1.0 / TILE)
+            store(integers, 512, to_int(vmax((px - wide) * to_tile, 0.0)))
+            store(integers, 528, to_int(vmax((py - high) * to_tile, 0.0)))
+            store(integers, 544, to_int(vmin(floor((px + wide) * to_tile) + 1.0, tiles_x)))
+            store(integers, 560, to_int(vmin(floor((py + high) * to_tile) + 1.0, tiles_y)))
+            store(scratch, 96, z)
+            if may_hide:
+                mask = _not_hidden(mask, integers, scratch, tiles_x, tile_depths, open_sums)
+                if mask == 0:
+                    continue
             # Colours for chunks with a visible Gaussian only: at degree 3, SH are five times the memory of the rest.
             inverse = HALF_LOG2E / determinant
             dx, dy, dz = mx - eye_x, my - eye_y, mz - eye_z
@@ -241,7 +298,6 @@ def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilatio
             store(scratch, 48, cxy * inverse * -2.0)
             store(scratch, 64, dxx * inverse)
             store(scratch, 80, log2_opacity)
-            store(scratch, 96, z)
             store(scratch, 112, vmax(red, 0.0))
             store(scratch, 128, vmax(green, 0.0))
             store(scratch, 144, vmax(blue, 0.0))
@@ -251,18 +307,11 @@ def project(geometry, sh, spheres, degree, view, pinhole, width, height, dilatio
             store(scratch, 208, blue)
             # From vectors of 16 Gaussians to their records.
             transpose16(scratch, 0, 16, scratch, 256, 16)
-            to_tile = np.float32(1.0 / TILE)
-            store(integers, 512, to_int(vmax((px - wide) * to_tile, 0.0)))
-            store(integers, 528, to_int(vmax((py - high) * to_tile, 0.0)))
-            store(integers, 544, to_int(vmin(floor((px + wide) * to_tile) + 1.0, tiles_x)))
-            store(integers, 560, to_int(vmin(floor((py + high) * to_tile) + 1.0, tiles_y)))
             # Visible Gaussians are written without gaps, in the packed order.
             for lane in range(16):
                 if (mask >> np.uint32(lane)) & np.uint32(1):
                     x0, y0 = integers[512 + lane], integers[528 + lane]
                     x1, y1 = integers[544 + lane], integers[560 + lane]
-                    if len(tile_depths) and hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, tile_depths):
-                        continue
                     store(records, visible * 16, load(scratch, 256 + lane * 16))
                     depths[visible] = scratch[96 + lane]
                     rects[visible] = (
