@@ -16,6 +16,7 @@ from service.estimators import inerf, mc_do
 from service.geometry import look_at, moved, transformed, unproject
 from service.interfaces import Features, Frame, ImagePairs
 from service.pose.descent.contribution_pruning import contributions
+from service.pose.features import rendered_views
 from service.pose.features.rendered_views import RenderedView, ViewRenderer, backprojected, to_uint8
 from service.pose.matching import render_and_match
 from service.pose.retrieval import viewpoints
@@ -275,3 +276,44 @@ def test_a_pose_that_readings_move_is_one_more_record(monkeypatch) -> None:
         )
     none = localizing._with_readings(QUERY, told, last, trace, loaded, localizing.Request())
     assert none == (QUERY, told)
+
+
+# ------------------------------------------------------------------ features of renders
+
+
+class OnDevice:
+    """Finds features by itself, or on the renderer's device for several pictures at once."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def extract(self, image, limit):
+        self.asked.append("one")
+        return "features"
+
+    def extract_rendered(self, frames, limit):
+        self.asked.append(f"{len(frames)} on the device")
+        return ["features"] * len(frames)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "on_device", "asked"),
+    [
+        ([(4, 5), (4, 5)], True, ["2 on the device"]), ([(4, 5)], True, ["1 on the device"]),
+        ([(4, 5), (4, 6)], True, ["one", "one"]), ([(4, 5), (4, 5)], False, ["one", "one"]),
+    ],
+)  # fmt: skip
+def test_renders_of_one_size_that_are_on_the_device_stay_there(sizes, on_device, asked, monkeypatch):
+    monkeypatch.setattr(rendered_views, "backprojected", lambda *each: each)
+    frames: list[Any] = [
+        SimpleNamespace(alpha=np.zeros(size), rgb=np.zeros((*size, 3), np.float32), device_rgb=on_device or None)
+        for size in sizes
+    ]
+    matcher: Any = OnDevice()
+    cameras: Any = list("ab"[: len(sizes)])
+    found = rendered_views.views_of(frames, cameras, matcher)
+    assert matcher.asked == asked
+    assert found == [("features", frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
+    plain: Any = SimpleNamespace(extract=matcher.extract)
+    assert len(rendered_views.views_of(frames, cameras, plain)) == len(sizes)
+    assert matcher.asked[-1] == "one"
