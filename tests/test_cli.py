@@ -175,14 +175,17 @@ def test_a_video_is_followed_and_told_four_ways(splatfix, room, tmp_path):
     assert second.startswith(f"7.000 s, {frames[2]}: localized")
 
 
-def test_scenes_are_listed_and_inspected(splatfix, room):
+def test_scenes_are_listed_and_inspected(splatfix, room, tmp_path):
     assert splatfix("scenes", "list", room.parent)[:2] == (0, f"{room}\n")
     code, told, _ = splatfix("scenes", "inspect", room)
     facts = {line[:18].strip(): line[18:].strip() for line in told.splitlines()}
     assert (code, facts["training cameras"], facts["format"]) == (0, "24", "ply")
     assert facts["name"] == "room (id room)"
     assert facts["training size"] == "320 px (from the training cameras)"
-    code, told, _ = splatfix("scenes", "inspect", room / "scene.ply", "--json")
+    drawn = tmp_path / "scene.png"
+    code, told, _ = splatfix("scenes", "inspect", room / "scene.ply", "--json", "--image", drawn)
+    with Image.open(drawn) as image:
+        assert image.size[0] == 600 + 440  # the plan, and renders beside it
     bare = json.loads(told)
     assert (code, bare["training_cameras"], bare["training_size"]["px"]) == (0, 0, None)
     assert bare["index"]["interior"]

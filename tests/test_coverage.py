@@ -341,9 +341,9 @@ def test_the_command_prints_writes_and_draws_and_inspect_tells_of_it(room, measu
     assert [t["found"] for t in written["trials"] if t["photo"]] == [True, True, True, False]
     with Image.open(tmp_path / "c.png") as image:
         assert image.width == 900
-    from service.cli.scene_facts import as_lines, scene_facts
+    from service.cli.scene_facts import as_lines, inspected_scene
 
-    facts = scene_facts(room)
+    facts = inspected_scene(room).facts
     assert facts["expected_accuracy"]["found"] == pytest.approx(written["found"])
     assert "of photos are found (Coverage, calibrated" in as_lines(facts)["expected accuracy"]
 

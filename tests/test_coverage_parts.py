@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from io import BytesIO
 from types import SimpleNamespace
@@ -21,6 +23,10 @@ from service.coverage.calibration import (
     left_out,
 )
 from service.coverage.plan_drawing import LEVELS, drawn_plan, level_colour, round_length
+from service.coverage.scene_drawing import drawn_scene
+from service.geometry import look_at
+from service.interfaces import Frame
+from service.types import Camera, GaussianScene, Intrinsics, NamedCamera, SceneInfo
 
 RED, GREY, WHITE, INK = [190, 40, 40], [205, 205, 205], [255, 255, 255], [30, 30, 30]
 TURNED = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
@@ -203,3 +209,61 @@ def test_a_line_is_fitted_to_an_outcome_and_stays_finite() -> None:
     assert np.allclose(np.log(line / (1 - line)), [-1.0, 0.5, 2.0], atol=0.35)
     always = fitted_line(x, np.ones(400, bool))(np.array([0.0]))
     assert 0.99 < always[0] < 1.0
+
+
+class Coloured:
+    """A rasterizer whose renders have one colour each, by the camera's direction."""
+
+    def render(self, cameras: Sequence[Camera]) -> list[Frame]:
+        frames = []
+        for camera in cameras:
+            shape = (camera.intrinsics.height, camera.intrinsics.width)
+            rgb = np.tile(np.float32((1 + camera.pose.axis_in_world) / 2), (*shape, 1))
+            frames.append(Frame(rgb, *(np.zeros(shape, np.float32) for _ in range(3))))
+        return frames
+
+
+COLOURED: Any = Coloured()
+
+
+def scene_at(means: np.ndarray, cameras: Sequence[NamedCamera] = ()) -> GaussianScene:
+    count = len(means)
+    return GaussianScene(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), 0.01, np.float32),
+        opacities=np.ones(count, np.float32),
+        sh=np.zeros((count, 1, 3), np.float32),
+        cameras=tuple(cameras),
+        info=replace(SceneInfo("a", "A", "", "ply"), up_in_world=(0.0, 0.0, 1.0)),
+    )
+
+
+def looking(at: tuple[float, float, float], towards: tuple[float, float, float]) -> Camera:
+    eye = np.array(at, float)
+    return Camera(Intrinsics(300, 200, 250, 250, 150, 100), look_at(eye, eye + towards, np.array([0.0, 0.0, 1.0])))
+
+
+def test_a_scene_is_drawn_with_its_cameras_to_scale_and_two_opposite_renders() -> None:
+    corners = np.array([[x, y, 0.0] for x in (0, 10) for y in (0, 4)])
+    cameras = [looking((2, 1, 1), (1, 0, 0)), looking((6, 1, 1), (0, 1, 0)), looking((2, 3, 1), (0, -1, 0))]
+    scene = scene_at(corners, [NamedCamera(f"{i}.jpg", camera) for i, camera in enumerate(cameras)])
+    image = np.asarray(Image.open(BytesIO(drawn_scene(scene, COLOURED, cameras[:1], scene.info)))).astype(int)
+    is_red = (image[:, :600] == RED).all(2)
+    rows, columns = np.nonzero(is_red)
+    # The plan is 540 pixels for 10 units, its lower left corner 30 from the left; the legend's dot is further down.
+    shown = [
+        np.hypot(columns - (30 + 54 * x), rows - (26 + 30 + 54 * (4 - y))).min() for x, y in ((2, 1), (6, 1), (2, 3))
+    ]
+    assert max(shown) < 3
+    assert not is_red[56 : 56 + 216, 30 + 54 * 8 :].any()
+    # The middle of the list looks along y; the other render is by the camera that looks along -y.
+    first, second = image[26 + 10, 600 + 290], image[26 + 200 + 6 + 10, 600 + 290]
+    assert first == pytest.approx([127.5, 255, 127.5], abs=1)
+    assert second == pytest.approx([127.5, 0, 127.5], abs=1)
+
+
+def test_a_scene_without_views_or_extent_is_drawn_without_renders() -> None:
+    scene = scene_at(np.zeros((1, 3)))
+    image = np.asarray(Image.open(BytesIO(drawn_scene(scene, COLOURED, (), scene.info))))
+    assert image.shape[1] == 600

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.cli.scene_facts import as_lines, scene_facts
+from service.cli.scene_facts import as_lines, inspected_scene
 from service.geometry import pose_distance
 from service.loaded_scene import LoadedScene
 from service.localize import localize
@@ -134,7 +134,7 @@ def test_a_veiled_scene_localizes_a_photo_and_is_shown_with_its_floaters(
 def test_inspection_tells_what_is_left_out(tmp_path, veiled: GaussianScene, monkeypatch) -> None:
     folder = write_room(tmp_path / "room")
     monkeypatch.setattr("service.cli.scene_facts.load_scene", lambda path: veiled)
-    facts = scene_facts(folder)
+    facts = inspected_scene(folder).facts
     assert facts["floaters"]["left_out"]
     assert facts["floaters"]["found"] == int(find_floaters(veiled).found.sum())
     assert "left out when photos are localized" in as_lines(facts)["floaters"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from service.cli.scenes_index import digest_facts, digest_line
 from service.cli.terminal import registrations_folder, settings_of
 from service.coverage.coverage_cache import coverage_file, read_coverage
 from service.coverage.held_out_photos import held_out_photos
+from service.coverage.scene_drawing import drawn_scene
+from service.interfaces import Rasterizer
 from service.loaded_scene import choose_rasterizer
 from service.localize import ASSUMED_TRAINING_PX
 from service.pose.retrieval.floaters import find_floaters, without_floaters
@@ -24,14 +26,30 @@ from service.render import RASTERIZERS
 from service.scene_formats import load_scene
 from service.scene_formats.manifest import read_manifest
 from service.scene_manager.scene_registrations import SceneRegistrations, registered_info
-from service.types import GaussianScene, SceneInfo
+from service.types import Camera, GaussianScene, SceneInfo
 
 
-def scene_facts(path: Path) -> dict[str, Any]:
-    """Load a scene and measure it; lengths in scene units. Renders some hundred small views, which takes seconds.
+@dataclass(frozen=True)
+class InspectedScene:
+    """A scene that was measured."""
 
-    Returns values that JSON can hold. Raises SceneError.
-    """
+    facts: dict[str, Any]
+    """Values that JSON can hold; lengths in scene units."""
+    searched: GaussianScene
+    """Without its floaters, if these are left out."""
+    rasterizer: Rasterizer
+    views: tuple[Camera, ...]
+    """Of the index; relative to the scene's origin."""
+    info: SceneInfo
+    """With what its registration tells."""
+
+    def drawn(self) -> bytes:
+        """Return a PNG: a plan view and two renders."""
+        return drawn_scene(self.searched, self.rasterizer, self.views, self.info)
+
+
+def inspected_scene(path: Path) -> InspectedScene:
+    """Load a scene and measure it. Renders some hundred small views, which takes seconds. Raises SceneError."""
     scene = load_scene(path)
     searched = without_floaters(scene)
     rasterizer = RASTERIZERS.load(choose_rasterizer()[0]).create(searched)
@@ -40,6 +58,7 @@ def scene_facts(path: Path) -> dict[str, Any]:
     known = registered_info(info, registration)
     # Quantiles: a few stray Gaussians would make the bounds meaningless.
     low, high = np.quantile(scene.means, [0.01, 0.99], axis=0) + info.origin_in_world
+    views, index = _index(searched, rasterizer)
     facts: dict[str, Any] = {
         "id": info.id,
         "name": info.name,
@@ -61,11 +80,12 @@ def scene_facts(path: Path) -> dict[str, Any]:
         "training_cameras": len(scene.cameras),
         "training_size": _training_size(path, scene),
         "frames": [asdict(frame) | {"frame_from_world": frame.frame_from_world.tolist()} for frame in info.frames],
-        "index": _index(searched, rasterizer),
+        "index": index,
         "training_photos": _training_photos(path, scene),
         "expected_accuracy": _expected_accuracy(path, searched, rasterizer.name),
     }
-    return facts | {"warnings": [*info.warnings, *_unknowns(info, facts["training_size"]["px"])]}
+    facts["warnings"] = [*info.warnings, *_unknowns(info, facts["training_size"]["px"])]
+    return InspectedScene(facts, searched, rasterizer, views, known)
 
 
 def _unknowns(info: SceneInfo, training_px: int | None) -> Iterator[str]:
@@ -89,19 +109,16 @@ def _training_size(path: Path, scene: GaussianScene) -> dict[str, Any]:
     return {"px": None, "source": f"unknown: each photo's own, within {low} to {high}"}
 
 
-def _index(scene: GaussianScene, rasterizer: Any) -> dict[str, Any]:
-    """Return from where the view index of the default estimator would be rendered, and how much its views cover."""
+def _index(scene: GaussianScene, rasterizer: Rasterizer) -> tuple[tuple[Camera, ...], dict[str, Any]]:
+    """Return the cameras of the default estimator's view index, how they are placed, and how much they cover."""
     rng = np.random.default_rng(0)  # the seed of `LoadedScene.prepare`
     if scene.cameras:
         cameras = index_cameras(scene, rasterizer, rng)
-        return {
-            "placed_by": "training cameras",
-            "views": len(cameras),
-            "coverage": coverage(scene, rasterizer, cameras),
-        }
+        seen = coverage(scene, rasterizer, cameras)
+        return tuple(cameras), {"placed_by": "training cameras", "views": len(cameras), "coverage": seen}
     # Without training cameras the index places its views itself, which depends on the seed.
     found = find_views(scene, rasterizer, rng)
-    return {
+    return tuple(found.cameras), {
         "placed_by": "the scene itself",
         "views": len(found.cameras),
         "coverage": found.coverage,

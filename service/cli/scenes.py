@@ -35,14 +35,18 @@ def list_scenes(
 def inspect_scene(
     scene: Annotated[Path, typer.Argument(help="Scene folder or scene file.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print it as JSON.")] = False,
+    image: Annotated[Path | None, typer.Option("--image", help="Draw a plan view and two renders: a PNG.")] = None,
 ) -> None:
     """Read a scene; print what is in it, what is unknown of it, and from where its views would be rendered."""
-    from service.cli.scene_facts import as_lines, scene_facts
+    from service.cli.scene_facts import as_lines, inspected_scene
 
     with err.status(f"looking at {scene}"):
-        facts = scene_facts(scene)
+        found = inspected_scene(scene)
+        drawn = found.drawn() if image else b""
+    if image:
+        image.write_bytes(drawn)
     if as_json:
-        print_json(facts)
+        print_json(found.facts)
         return
-    for name, value in as_lines(facts).items():
+    for name, value in as_lines(found.facts).items():
         say(f"{name:18} {value}")

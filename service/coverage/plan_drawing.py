@@ -1,4 +1,4 @@
-"""Draws a coverage map in plan view, with its legend in words."""
+"""Draws plan views: the parts of one, and a coverage map with its legend in words."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ LEVELS: tuple[tuple[float, tuple[int, int, int], str], ...] = (
 )
 """Least probability, colour (sRGB, from blue to orange: told apart also by those who don't see red or green), words."""
 _PX, _MARGIN, _LEGEND = 900, 40, 200
-_BLIND, _CAMERA, _INK, _PAPER = (205, 205, 205), (190, 40, 40), (30, 30, 30), (255, 255, 255)
+PAPER = (255, 255, 255)
+_BLIND, _CAMERA, _INK = (205, 205, 205), (190, 40, 40), (30, 30, 30)
 
 
 def drawn_plan(
@@ -39,15 +40,15 @@ def drawn_plan(
         x, y = ((points[:, :2] - low) * scale).T
         return np.stack([_MARGIN + x, height - _MARGIN - y], 1)
 
-    image = np.full((height + _LEGEND, _PX, 3), _PAPER, np.uint8)
-    _shade(image[:height], pixels(surfaces_in_world @ found.plan_from_world.T))
+    image = np.full((height + _LEGEND, _PX, 3), PAPER, np.uint8)
+    shade(image[:height], pixels(surfaces_in_world @ found.plan_from_world.T))
     radius = 0.46 * found.cell * scale
     for middle, row, sees in zip(pixels(cells), found.probabilities, found.sees_scene, strict=True):
         for heading, probability, seen in zip(found.headings_rad, row, sees, strict=True):
             half = np.pi / len(found.headings_rad)
-            _wedge(image, middle, radius, heading, half, level_colour(probability) if seen else _BLIND)
+            draw_wedge(image, middle, radius, heading, half, level_colour(probability) if seen else _BLIND)
     for at in pixels(cameras):
-        cv2.circle(image, tuple(np.rint(at).astype(int).tolist()), 3, _CAMERA, -1, cv2.LINE_AA)
+        draw_dot(image, at)
     _legend(image, height, found, scale / (metres_per_unit or 1.0), "m" if metres_per_unit else "units")
     return encode_image(image, "png")
 
@@ -57,7 +58,7 @@ def level_colour(probability: float) -> tuple[int, int, int]:
     return next(colour for least, colour, _ in LEVELS if probability >= least)
 
 
-def _shade(image: UInt8[np.ndarray, "h w 3"], at: np.ndarray) -> None:
+def shade(image: UInt8[np.ndarray, "h w 3"], at: np.ndarray) -> None:
     """Darken pixels by the number of the scene's surfaces there."""
     height, width = image.shape[:2]
     x, y = np.floor(at).astype(int).T
@@ -69,9 +70,10 @@ def _shade(image: UInt8[np.ndarray, "h w 3"], at: np.ndarray) -> None:
     image[:] = (image * (1 - 0.35 * dark)).astype(np.uint8)
 
 
-def _wedge(
+def draw_wedge(
     image: np.ndarray, middle: np.ndarray, radius: float, heading: float, half: float, colour: Sequence[int]
 ) -> None:
+    """Draw a sector around `middle`, `half` radians to either side of a heading from the plan's first axis."""
     angles = heading + np.linspace(-0.9 * half, 0.9 * half, 6)
     # Image rows go down, the plan's second axis up.
     rim = middle + radius * np.stack([np.cos(angles), -np.sin(angles)], 1)
@@ -81,19 +83,29 @@ def _wedge(
 
 
 def _legend(image: np.ndarray, top: int, found: CoverageMap, scale: float, unit: str) -> None:
-    _text(image, found.title, (_MARGIN, top + 22), 0.6)
+    write_words(image, found.title, (_MARGIN, top + 22), 0.6)
     rows = [*((colour, words) for _, colour, words in LEVELS), (_BLIND, "nothing of the scene in view")]
     for number, (colour, words) in enumerate(rows):
         x, y = _MARGIN + 430 * (number % 2), top + 52 + 26 * (number // 2)
         cv2.rectangle(image, (x, y - 13), (x + 18, y + 3), colour, -1)
-        _text(image, words, (x + 28, y), 0.5)
-    cv2.circle(image, (_MARGIN + 439, top + 99), 4, _CAMERA, -1, cv2.LINE_AA)
-    _text(image, "training camera", (_MARGIN + 458, top + 104), 0.5)
+        write_words(image, words, (x + 28, y), 0.5)
+    draw_dot(image, np.array([_MARGIN + 439.0, top + 99.0]), 4)
+    write_words(image, "training camera", (_MARGIN + 458, top + 104), 0.5)
+    write_scale(image, (_MARGIN, top + 140), scale, f"{unit}; each wedge points where the camera looks")
+    write_words(image, f"{len(found.trials)} renders made as photos are, seen from above", (_MARGIN, top + 175), 0.5)
+
+
+def draw_dot(image: UInt8[np.ndarray, "h w 3"], at: Float[np.ndarray, "2"], radius: int = 3) -> None:
+    """Draw the place of a training camera."""
+    cv2.circle(image, tuple(np.rint(at).astype(int).tolist()), radius, _CAMERA, -1, cv2.LINE_AA)
+
+
+def write_scale(image: UInt8[np.ndarray, "h w 3"], at: tuple[int, int], scale: float, unit: str) -> None:
+    """Draw a line of a round length, about 100 pixels, from a pixel to the right; `scale` is pixels per unit."""
     length = round_length(100 / scale)
-    end = _MARGIN + round(length * scale)
-    cv2.line(image, (_MARGIN, top + 140), (end, top + 140), _INK, 2)
-    _text(image, f"{length:g} {unit}; each wedge points where the camera looks", (end + 12, top + 145), 0.5)
-    _text(image, f"{len(found.trials)} renders made as photos are, seen from above", (_MARGIN, top + 175), 0.5)
+    end = at[0] + round(length * scale)
+    cv2.line(image, at, (end, at[1]), _INK, 2)
+    write_words(image, f"{length:g} {unit}", (end + 12, at[1] + 5), 0.5)
 
 
 def round_length(about: float) -> float:
@@ -102,5 +114,6 @@ def round_length(about: float) -> float:
     return float(max(step for step in (1, 2, 5) if step * power <= about * (1 + 1e-9)) * power)
 
 
-def _text(image: np.ndarray, words: str, at: tuple[int, int], size: float) -> None:
+def write_words(image: UInt8[np.ndarray, "h w 3"], words: str, at: tuple[int, int], size: float) -> None:
+    """Write a line from the pixel of its lower left corner."""
     cv2.putText(image, words, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
