@@ -5,6 +5,9 @@ from __future__ import annotations
 import asyncio
 import itertools
 import re
+import runpy
+import signal
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -596,3 +599,30 @@ def test_axes_have_a_few_round_ticks(
     low, high, found = charts._axis(np.array(values), log=log)
     assert (low, high) == pytest.approx(ends)
     assert found == pytest.approx(ticks)
+
+
+# ------------------------------------------------------------------ the process
+
+
+def test_the_process_serves_until_its_input_ends(monkeypatch):
+    made, signals, read = [], [], iter([b"still there", b""])
+
+    class Served:
+        def __init__(self, connect, host, port):
+            made.append((connect.args, connect.keywords, host, port))
+            self.server = SimpleNamespace(get_port=lambda: 8001)
+
+        def stop(self):
+            made.append("stopped")
+
+    monkeypatch.setattr("viewer.viewer_server.Viewer", Served)
+    monkeypatch.setattr("os.read", lambda descriptor, count: next(read) if descriptor == 0 else b"")
+    monkeypatch.setattr("signal.signal", lambda number, _: signals.append(number))
+    monkeypatch.setattr("logging.basicConfig", lambda **_: None)
+    monkeypatch.setattr(sys, "argv", ["viewer", "--service", "http://s", "--port", "7", "--end-with-stdin"])
+    monkeypatch.delitem(sys.modules, "viewer.__main__", raising=False)
+    runpy.run_module("viewer", run_name="__main__")
+    asked = {"timeout_s": 30.0, "use_proxy": False, "certificate": None}
+    assert made == [(("http://s",), asked, "127.0.0.1", 7), "stopped"]
+    assert signals == [signal.SIGTERM, signal.SIGINT]
+    assert next(read, None) is None
