@@ -473,6 +473,41 @@ def test_a_better_answer_replaces_the_best_and_a_doubt_that_is_conclusive_ends_t
     assert kept[2] == (0, Reason.POSITION_UNCERTAIN in search_state.CONCLUSIVE_DOUBTS)
 
 
+@pytest.mark.parametrize(
+    ("against", "kept"),
+    [({}, "ab"), ({"a": "b"}, "b"), ({"b": "a"}, "a"), ({"a": "b", "b": "a"}, "ab")],
+)
+def test_what_the_devices_readings_speak_against_is_no_alternative(against: dict, kept: str, monkeypatch) -> None:
+    """All answers stay where each is refused for another one."""
+
+    def one(name: str) -> Any:
+        return SimpleNamespace(name=name, verdict=SimpleNamespace(signals={}), variant=None, refined=REFINED)
+
+    def refine(*_: Any) -> Any:
+        yield "a record"
+        return SimpleNamespace(pose="elsewhere")
+
+    seen = SimpleNamespace(pose=HERE, differs_from=lambda *_: True)
+    for name, value in {
+        "explains_whole_photo": lambda *_: False, "seen_from": lambda *_: seen, "twins_of": lambda *_: [],
+        "hypotheses_of_photo": lambda *_: [], "rendered_ahead": lambda *_: ["hypothesis"], "refine_ambiguous": refine,
+        "replace": lambda value, **_: value, "VerifiedPose": lambda *_: one("b"),
+        "_ranked": lambda _, answers: "".join(each.name for each in answers),
+    }.items():  # fmt: skip
+        monkeypatch.setattr(ambiguity_check, name, value)
+    searching: Any = SimpleNamespace(
+        best=one("a"), config=SimpleNamespace(answers=None, ambiguity=None),
+        images=SimpleNamespace(corrected=lambda _: None),
+        verify=lambda _: SimpleNamespace(status=Status.LOCALIZED),
+        readings_prefer=lambda other, than: against.get(than.name) == other.name,
+    )  # fmt: skip
+    records, _ = drained(ambiguity_check.check_ambiguity(searching))
+    assert records == ["a record", kept]
+
+
+REFINED = SimpleNamespace(correction=None, pose=HERE)
+
+
 @pytest.mark.parametrize("loss", [0.02, 0.05])
 def test_an_ambiguous_hypothesis_may_leave_three_times_the_answers_residual(monkeypatch, loss: float) -> None:
     seen = []

@@ -199,12 +199,16 @@ def test_similar_scenes_are_searched_and_three_at_most(
 
     monkeypatch.setattr(multi_scene, "_inliers_by_scene", lambda *_: np.array(inliers))
     monkeypatch.setattr(multi_scene, "localize", localize)
-    monkeypatch.setattr(multi_scene, "replace", lambda value, **_: value)
+    told: dict[str, Any] = {}
+    monkeypatch.setattr(multi_scene, "replace", lambda value, **changes: told.update(changes) or value)
     monkeypatch.setattr(multi_scene, "SceneEstimate", lambda estimate, loaded: SimpleNamespace(**locals()))
     info = SimpleNamespace(info=SimpleNamespace(id="s"))
     scenes: Any = [SimpleNamespace(number=k, scene=info) for k in range(len(inliers))]
     found = multi_scene.localize_in_scenes(SimpleNamespace(), scenes)  # type: ignore[arg-type]
     assert done == searched
+    ranking = told["timings"][0]
+    assert 0 <= ranking.wall_s < 10  # nothing is done
+    assert 0 <= ranking.cpu_s < 1
     assert localized[found.loaded.number] is any(localized[k] for k in searched)
 
 
