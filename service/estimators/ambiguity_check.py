@@ -9,6 +9,7 @@ from itertools import chain
 import numpy as np
 
 from service.estimators.search_state import SearchState, VerifiedPose, changed
+from service.geometry import pose_distance
 from service.pose.absolute_pose.device_priors import prefers
 from service.pose.absolute_pose.pnp import AbsolutePose
 from service.pose.features.image_sizes import scaled_px
@@ -29,7 +30,8 @@ from service.types import Camera
 def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     """Where the scene is like its mirror image, find out whether the photo's mirror image fits better; return that.
 
-    Where the gate refused the answer, the mirror image counts only if the gate accepts it.
+    In another place it must fit much better: that the photo is mirrored is less probable than that a place has a
+    mirror image. Where the gate refused the answer, the mirror image counts only if the gate accepts it.
     """
     best, config = state.best, state.config
     if best is None or best.verdict.status is Status.NOT_LOCALIZED:
@@ -51,7 +53,14 @@ def check_mirror(state: SearchState) -> Generator[IterationRecord, None, bool]:
     # Both may be wrong: a poor answer is no evidence for the mirror image.
     if not state.finished and mirrored.verify(found).status is not Status.LOCALIZED:
         return False
-    is_mirrored = dissimilarity(mirrored.appearance_at(found)) < dissimilarity(best.verdict.signals)
+    limit = dissimilarity(best.verdict.signals)
+    alike = dissimilarity(mirrored.appearance_at(found))
+    if alike < limit:
+        seen = seen_from(state, best)
+        _, way = pose_distance(found.pose, seen.pose)
+        if way > config.mirror.same_place * seen.distance:
+            limit *= config.mirror.max_ratio_elsewhere
+    is_mirrored = alike < limit
     yield replace(best.record("check_mirror"), mirrored=is_mirrored)
     return is_mirrored
 

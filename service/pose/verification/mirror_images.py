@@ -23,6 +23,13 @@ class MirrorConfig:
     max_loss_ratio: float = 2.0
     """Times the answer's residual, after one refinement: of mirrored photos the mirror image has 0.6 to 1.6, of half of
     the others more than 3."""
+    same_place: float = 2.0
+    """Distance between the two positions, relative to that of what is seen, up to which both show the same place, which
+    is like its own mirror image: an object has 2 at most, from opposite sides."""
+    max_ratio_elsewhere: float = 0.25
+    """Dissimilarity of the mirror image relative to the answer's, below which it fits better though it shows another
+    place. Many buildings have rooms that are mirror images of others: in one of 12 million Gaussians photos have 0.29
+    and more, since their own room is not modelled best, and few photos are mirrored."""
 
 
 MIRROR = MirrorConfig()
