@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-_PATTERNS = ("view-index-*.npz", "free-views-*.npz", "coverage-*.json", "scenes/*", "fetched-scenes/*")
+_PATTERNS = ("view-index-*", "free-views-*", "coverage-*.json", "scenes/*", "fetched-scenes/*")
 _log = logging.getLogger(__name__)
 
 

@@ -16,6 +16,7 @@ from service.estimators import ESTIMATORS
 from service.interfaces import ImageMatcher, Matcher, Rasterizer, Tools
 from service.matchers import MATCHERS
 from service.pose.features.unknown_background import WHITE, has_white_border, shows_background
+from service.pose.retrieval.index import ViewIndex
 from service.pose.training_photos.digest import DIGEST, PhotoDigest, TrainingPhoto, digest_of, scene_key
 from service.pose.training_photos.digest_file import DIGEST_FILE, read_digest
 from service.render import RASTERIZERS
@@ -31,6 +32,10 @@ RASTERIZER_ORDER = ("gsplat_cuda", "cpu")
 """Where no rasterizer is named, the first one that can run here is used."""
 DEFAULT_ESTIMATOR = "view_index"
 DEFAULT_MATCHER = "xfeat"
+VIEWS_CUT = (
+    "the scene is larger than the {} views that its index may have: photos of some places may not be found; "
+    "divide it into several scenes."
+)
 WHITE_ASSUMED = (
     "the scene's background colour is unknown: white is assumed, since the photo's border is white; "
     + told_by_manifest('"background": [red, green, blue]')
@@ -143,7 +148,9 @@ class LoadedScene:
             if estimator not in self._prepared:
                 # A seed of its own: what a scene has prepared must not depend on the photo that came first.
                 tools = Tools(self.searched, self.rasterizer, self.matcher, np.random.default_rng(0), None)
-                self._prepared[estimator] = make(tools, self.cache_dir)
+                self._prepared[estimator] = prepared = make(tools, self.cache_dir)
+                if isinstance(prepared, ViewIndex) and prepared.is_cut:
+                    self.warnings += (VIEWS_CUT.format(len(prepared.views)),)
                 # It was read through for the index; from now on the renderer's copy is used.
                 release(self.scene)
             return self._prepared[estimator]

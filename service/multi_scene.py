@@ -23,7 +23,7 @@ from service.pose.features.image_sizes import scaled_px
 from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.retrieval.index import ViewIndex
-from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.scores import top_indices
 from service.results import IterationRecord, PoseEstimate, StageTiming, Status
 from service.types import Query
 
@@ -122,7 +122,7 @@ def _inliers(images: QueryImages, loaded: LoadedScene, roll_steps_45deg: int, co
     features, query = images.features(roll_steps_45deg=roll_steps_45deg), images.query
     max_error_px = config.approximate_max_error_px if query.lens_prior else config.max_error_px
     pixels = scaled_px(max_error_px, query.intrinsics)
-    scores = retrieval_scores(features.descriptors, [view.features.descriptors for view in index.views])
+    scores = index.scores(features.descriptors)
     most = 0
     for i in top_indices(scores, config.views):
         matches = correspondences(features, index.views[i], loaded.matcher)

@@ -15,6 +15,7 @@ from test_scenes import TRANSFORMS, ply
 
 from service import disk_cache
 from service.disk_cache import cache_bytes, evict
+from service.mapped_arrays import write_arrays
 from service.pose.retrieval.view_files import read_views
 from service.scene_formats import load_scene
 from service.scene_formats.cache import mapped_scene
@@ -73,8 +74,9 @@ def test_who_reads_an_entry_uses_it(tmp_path: Path) -> None:
     scene.mkdir()
     (scene / "scene.ply").write_bytes(ply())
     mapped_scene(scene, cache)
-    views = cache / "view-index-x.npz"
-    np.savez(views, counts=np.zeros(0, int), sizes=np.zeros((0, 2), int))
+    views = cache / "view-index-x"
+    none = {"counts": np.zeros(0, int), "sizes": np.zeros((0, 2), int)}
+    write_arrays(views, none | dict.fromkeys(("points_px", "scores", "descriptors", "points_in_world"), np.zeros(0)))
     entries = [next((cache / "scenes").iterdir()), views]
     for entry in entries:
         os.utime(entry, (0, 1.0))

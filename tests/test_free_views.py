@@ -97,15 +97,16 @@ def test_damaged_or_unwritable_files_cost_no_photo(tmp_path: Path, caplog: pytes
         Features(*(np.ones(s, np.float32) for s in ((1, 2), 1, (1, 4)))),
         np.ones((1, 3), np.float32),
     )
-    path = tmp_path / "views.npz"
-    for damaged in (b"", b"not a zip"):
-        path.write_bytes(damaged)
+    path = tmp_path / "views"
+    write_views(path, [view], {})
+    for damaged in (b"", b"no array"):
+        (path / "counts.npy").write_bytes(damaged)
         assert read_views(path) is None
     write_views(path, [view], {"more": np.array(3)})
     views, stored = read_views(path) or ((), {})
     assert (len(views), views[0].camera.intrinsics, stored["more"]) == (1, LENS, 3)
     # A folder that is a file: nothing can be written there.
-    FreeViews()._store(path / "below.npz", [view])
+    FreeViews()._store(path / "more.npy" / "below", [view])
     assert "not stored" in caplog.text
 
 

@@ -12,7 +12,6 @@ import pytest
 from service.geometry import moved
 from service.interfaces import Features
 from service.pose.features.image_sizes import PHOTO_PX
-from service.pose.retrieval import image_variant
 from service.pose.retrieval.image_variant import ImageVariant, Retrieval
 from service.pose.retrieval.scores import retrieval_scores
 from service.types import BoxPrior, Camera, Intrinsics, Pose
@@ -21,7 +20,6 @@ VIEW_LENS = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
 
 
 def retrieval(
-    monkeypatch: pytest.MonkeyPatch,
     scores: Mapping[int, list[float]],
     suggested: list[int] = [],  # noqa: B006
     *,
@@ -38,7 +36,9 @@ def retrieval(
         # What stands for descriptors says which rotation it is of.
         return Features(np.zeros((1, 2), np.float32), np.ones(1, np.float32), np.full((1, 2), roll, np.float32))
 
-    monkeypatch.setattr(image_variant, "retrieval_scores", lambda own, *_: np.array(scores[int(own[0, 0])]))
+    def of_rotation(own: np.ndarray, _: Any) -> np.ndarray:
+        return np.array(scores[int(own[0, 0])])
+
     places = positions or [0.0] * len(next(iter(scores.values())))
     poses = [moved(Pose(np.eye(4)), np.array([0, 0, 0, x, 0, 0])) for x in places]
     none = np.zeros((1, 2), np.float32)
@@ -49,15 +49,15 @@ def retrieval(
     lens = Intrinsics(640, 480, focal, focal, 320.0, 240.0)
     query = SimpleNamespace(intrinsics=lens, intrinsics_source=source, region=region, scene_priors=None)
     images: Any = SimpleNamespace(query=query, features=features, corners=lambda: None)
-    found = Retrieval(images, SimpleNamespace(views=views, corners=None))  # type: ignore[arg-type]
+    found = Retrieval(images, SimpleNamespace(views=views, corners=None, scores=of_rotation))  # type: ignore[arg-type]
     found._suggested.extend(suggested)
     return found, extracted
 
 
-def test_of_the_suggested_rotations_two_are_extracted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_the_suggested_rotations_two_are_extracted() -> None:
     """Each costs as much as the photo itself; the upright one is known anyway."""
     scores = {0: [1.0], **{roll: [0.1 * roll] for roll in range(1, 8)}}
-    found, extracted = retrieval(monkeypatch, scores, [3, 0, 5, 7, 1])
+    found, extracted = retrieval(scores, [3, 0, 5, 7, 1])
     upright = ImageVariant(320)
     assert found.rotated_variant(upright) == upright
     assert {roll for _, roll in extracted} == {0, 3, 5}
@@ -66,31 +66,29 @@ def test_of_the_suggested_rotations_two_are_extracted(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("ratio", "rotated"), [(1.29, False), (1.31, True)])
-def test_a_rotation_has_to_be_better_by_three_tenths(
-    ratio: float, rotated: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rotation_has_to_be_better_by_three_tenths(ratio: float, rotated: bool) -> None:
     """Rotated photos have 1.3 times the score and more with the right rotation."""
-    found, _ = retrieval(monkeypatch, {0: [1.0, 0.2], 2: [0.1, ratio], 4: [0.1, 0.5]}, [4, 2])
+    found, _ = retrieval({0: [1.0, 0.2], 2: [0.1, ratio], 4: [0.1, 0.5]}, [4, 2])
     assert found.rotated_variant(ImageVariant(320)).roll_steps_45deg == (2 if rotated else 0)
     # The likeliest by corners is another one, which is worse.
     assert found.rotated_variant(ImageVariant(320), likeliest_only=True).roll_steps_45deg == 0
 
 
-def test_the_best_of_two_rotations_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    found, _ = retrieval(monkeypatch, {0: [1.0], 2: [3.0], 6: [2.0]}, [6, 2])
+def test_the_best_of_two_rotations_is_taken() -> None:
+    found, _ = retrieval({0: [1.0], 2: [3.0], 6: [2.0]}, [6, 2])
     assert found.rotated_variant(ImageVariant(320)) == ImageVariant(320, 2)
 
 
 @pytest.mark.parametrize(("score", "upright"), [(1.49, False), (1.51, True)])
-def test_a_photo_like_some_view_needs_no_rotation(score: float, upright: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_photo_like_some_view_needs_no_rotation(score: float, upright: bool) -> None:
     """Of clean upright photos the best view has 1.8 and more, of rotated ones 1.3 at most."""
-    found, _ = retrieval(monkeypatch, {0: [0.3, score, 0.2]})
+    found, _ = retrieval({0: [0.3, score, 0.2]})
     assert found.is_upright(ImageVariant(320)) is upright
 
 
-def test_an_oblique_rotation_fits_the_same_canvas(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_oblique_rotation_fits_the_same_canvas() -> None:
     """By 45 degrees a 4:3 image needs a canvas of 0.99 times its long side squared, instead of 0.75: pixels cost."""
-    found, extracted = retrieval(monkeypatch, {roll: [1.0] for roll in range(8)})
+    found, extracted = retrieval({roll: [1.0] for roll in range(8)})
     for roll in range(8):
         found.features(ImageVariant(400, roll))
     assert [roll for long_side, roll in extracted if long_side == 400] == [0, 2, 4, 6]
@@ -117,29 +115,25 @@ def test_an_oblique_rotation_fits_the_same_canvas(monkeypatch: pytest.MonkeyPatc
         (0.2, "given", 160),  # at least
     ],
 )
-def test_a_photo_is_resized_to_the_views_angle_per_pixel(
-    ratio: float, source: str, side: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photo_is_resized_to_the_views_angle_per_pixel(ratio: float, source: str, side: float) -> None:
     focal = 300.0 * 640 / 320 / ratio
-    found, _ = retrieval(monkeypatch, {0: [1.0]}, focal=focal, source=source)
+    found, _ = retrieval({0: [1.0]}, focal=focal, source=source)
     assert found.upright_variant().long_side == pytest.approx(side, abs=1)
 
 
 @pytest.mark.parametrize("inside", [0, 3, 20])
-def test_the_sixteen_views_nearest_to_a_prior_are_searched_at_least(
-    inside: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_sixteen_views_nearest_to_a_prior_are_searched_at_least(inside: int) -> None:
     """They may see what the photo shows from outside of its region."""
     count = 40
     region = BoxPrior(np.full(3, -1.0), np.full(3, 1.0))
     positions = [0.0] * inside + [2.0 + k for k in range(count - inside)]
     planted = list(np.linspace(5.0, 1.0, count)[::-1])
-    found, _ = retrieval(monkeypatch, {0: planted}, region=region, positions=positions)
+    found, _ = retrieval({0: planted}, region=region, positions=positions)
     scores = found.scores(ImageVariant(320))
     kept = max(inside, 16)
     assert np.array_equal(scores[:kept], planted[:kept])
     assert scores[kept:].max() <= 0 < scores[:kept].min()
-    unrestricted, _ = retrieval(monkeypatch, {0: planted})
+    unrestricted, _ = retrieval({0: planted})
     assert np.array_equal(unrestricted.scores(ImageVariant(320)), planted)
 
 

@@ -39,7 +39,7 @@ from service.pose.features.rendered_views import VIEWS, to_uint8
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.refinement.refine_stage import RefinedPose, rematch_and_refine
 from service.pose.retrieval.ambiguous_hypotheses import PoseAtDistance, ambiguous_hypotheses, shifted_hypotheses
-from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.scores import top_indices
 from service.pose.verification.mirror_images import dissimilarity
 from service.results import IterationRecord, Reason
 
@@ -98,7 +98,7 @@ def _refined_mirror_image(
     # Mirroring the image changes its features.
     features = images.matcher.extract(np.ascontiguousarray(to_uint8(rendered.frame.rgb)[:, ::-1]), VIEWS.max_features)
     views = state.tools.prepared.views
-    scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
+    scores = state.tools.prepared.scores(features.descriptors)
     error_px = scaled_px(MATCH_ERROR_PX, camera)
     best: AbsolutePose | None = None
     for i in top_indices(scores, config.rival_views):
@@ -123,7 +123,7 @@ def _rivals(state: SearchState, answer: VerifiedPose, seen: PoseAtDistance) -> I
     # The render in the place of the photo: whatever the light, the scene is like itself.
     view = state.renderer.at(images.query, seen.pose).view(images.matcher)
     camera, views = view.camera.intrinsics, tools.prepared.views
-    scores = retrieval_scores(view.features.descriptors, [other.features.descriptors for other in views])
+    scores = tools.prepared.scores(view.features.descriptors)
     error_px = scaled_px(MATCH_ERROR_PX, camera)
     config = state.config.ambiguity
     alike = ambiguous_hypotheses(

@@ -37,7 +37,9 @@ class SearchConfig:
     large_photo_factor: float = 1.25
     """Size of the photo in the stage `retrieve_more_views`, relative to `retrieve_full_size`."""
     further_views_divisor: int = 16
-    """One view in so many is matched before the search is given up: in a building the likeliest five may be wrong."""
+    max_further_views: int = 64
+    """One view in so many, but not more than this, is matched before the search is given up: in a building the
+    likeliest five may be wrong."""
     free_views: int = 8
     """Views beside the index that a photo is matched with which no view of the index led to; 0: none."""
     rematch_below_inliers: int = 30

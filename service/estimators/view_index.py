@@ -63,7 +63,7 @@ from service.types import Camera, Query
 class Options:
     candidates: int = 5
     """Index views that the photo in its full size is matched with, 1 to 64; then, larger, with as many others or a
-    sixteenth of all, whichever is more. The small copy before is matched with two, at most."""
+    sixteenth of all (64 at most), whichever is more. The small copy before is matched with two, at most."""
     effort: Literal["fast", "normal", "exhaustive"] = "normal"
     """How hard to search for a photo that the verification gate doesn't accept. `fast`: in the index, and
     with the photo turned. `normal`: then among views beside the index, and among sampled poses if something in the
@@ -169,8 +169,10 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     name = "retrieve_rotated" if variant.roll_steps_45deg else "retrieve_full_size"
     yield Stage(_search_views(name, variant, deque(views), state), variant)
     variant = variant.scaled(config.large_photo_factor)
-    ranked = top_indices(retrieval.scores(variant), len(retrieval.scores(variant)))[options.candidates :]
-    untried = deque(ranked[: max(options.candidates, len(retrieval.scores(variant)) // config.further_views_divisor)])
+    scores = retrieval.scores(variant)
+    ranked = top_indices(scores, len(scores))[options.candidates :]
+    further = min(len(scores) // config.further_views_divisor, config.max_further_views)
+    untried = deque(ranked[: max(options.candidates, further)])
     # A stage ends early where matches or refinement fail; the next goes on with the other views.
     while untried:
         yield Stage(_search_views("retrieve_more_views", variant, untried, state), variant)
@@ -225,7 +227,7 @@ def _free_view_stages(upright: ImageVariant, state: SearchState) -> Iterator[Sta
     views = index.free_views.of(tools.scene, tools.rasterizer, tools.matcher, index.views)
     if not views:
         return
-    retrieval = Retrieval(state.images, replace(index, views=views), state.config.retrieval)
+    retrieval = Retrieval(state.images, replace(index, views=views, words=None), state.config.retrieval)
     variant = retrieval.rotated_variant(upright)
     scores = retrieval.scores(variant)
     untried = deque(top_indices(scores, state.config.free_views))

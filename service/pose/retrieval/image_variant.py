@@ -15,7 +15,7 @@ from service.pose.features.in_plane_rotation import rolls_to_upright
 from service.pose.features.query_images import QueryImages
 from service.pose.matching.correspondences import MATCH_ERROR_PX
 from service.pose.retrieval.index import ViewIndex
-from service.pose.retrieval.scores import SCORES, ScoreConfig, retrieval_scores, top_indices
+from service.pose.retrieval.scores import SCORES, ScoreConfig, top_indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +88,7 @@ class Retrieval:
     def scores(self, variant: ImageVariant) -> Float64[np.ndarray, "views"]:
         """Return how much each view is like the photo; views far from its prior's region are below all others."""
         if variant not in self._scores:
-            descriptors = [view.features.descriptors for view in self.index.views]
-            scores = retrieval_scores(self.features(variant).descriptors, descriptors, self.config.scores)
+            scores = self.index.scores(self.features(variant).descriptors, self.config.scores)
             self._scores[variant] = self._demoted_outside_prior(scores)
         return self._scores[variant]
 

@@ -16,7 +16,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, Float64, UInt8
 
 from service.interfaces import Tools
 from service.pose.features.in_plane_rotation import CORNERS, Corners, detect_corners
@@ -26,6 +26,7 @@ from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY
 from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_space import SPACE
 from service.pose.retrieval.free_views import FREE_VIEWS, FreeViews
+from service.pose.retrieval.inverted_views import INVERTED, InvertedViews, view_scores
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer
 from service.pose.retrieval.scene_symmetries import (
     NO_REPETITIONS,
@@ -35,12 +36,12 @@ from service.pose.retrieval.scene_symmetries import (
     is_examined,
     like_its_mirror_image,
 )
-from service.pose.retrieval.scores import SCORES
+from service.pose.retrieval.scores import SCORES, ScoreConfig
 from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 from service.types import Camera, Query
 
-VERSION = 11
+VERSION = 12
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
@@ -60,19 +61,38 @@ class ViewIndex:
     """Motions that lead from the one to the other."""
     free_views: FreeViews = field(default_factory=FreeViews, compare=False)
     """Views beside these, for photos that are like none of them."""
+    words: InvertedViews | None = field(default=None, compare=False)
+    """The views' features by words; None: there are few views."""
+    is_cut: bool = False
+    """Whether the scene needs more views than the index may have."""
+
+    def scores(
+        self, descriptors: Float32[np.ndarray, "n d"], config: ScoreConfig = SCORES
+    ) -> Float64[np.ndarray, "views"]:
+        """Return the views' retrieval scores for an image's features, strongest first."""
+        return view_scores(descriptors, self.views, self.words, config)
 
 
 def prepared_index(tools: Tools[None], cache_dir: Path | None, viewpoints: ViewpointConfig = VIEWPOINTS) -> ViewIndex:
     """Read the scene's index from the cache, or build it and store it there."""
     # The names are hashes of all that their content depends on, so one of other values is never read.
-    path = cache_dir / f"view-index-{_key(tools, viewpoints)}.npz" if cache_dir else None
-    free_views = FreeViews(cache_dir / f"free-views-{_key(tools, viewpoints, FREE_VIEWS)}.npz" if cache_dir else None)
+    path = cache_dir / f"view-index-{_key(tools, viewpoints)}" if cache_dir else None
+    free_views = FreeViews(cache_dir / f"free-views-{_key(tools, viewpoints, FREE_VIEWS)}" if cache_dir else None)
+
+    def is_cut(index: ViewIndex) -> bool:
+        return viewpoints.cuts(len(index.views), len(tools.scene.cameras))
+
     if found := _read(path, free_views):
-        return found
+        return replace(found, is_cut=is_cut(found))
     index = built_index(index_cameras(tools.scene, tools.rasterizer, tools.rng, viewpoints), tools)
     if path:
-        _write(index, path)
-    return replace(index, free_views=free_views)
+        try:
+            _write(index, path)
+        except OSError as error:  # a full disk
+            log.warning("the view index stays in memory: %s", error)
+        # What is mapped takes no memory of this process's own.
+        index = _read(path, free_views) or index
+    return replace(index, free_views=free_views, is_cut=is_cut(index))
 
 
 def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = LOD) -> ViewIndex:
@@ -103,12 +123,13 @@ def built_index(cameras: Sequence[Camera], tools: Tools[None], lod: LodConfig = 
         batches = in_batches(range(len(cameras)), tools.rasterizer.cameras_at_once)
         found = list(chain.from_iterable(pool.map(seen, batches)))
         views = tuple(view for view, _, _ in found)
-        mirrored = like_its_mirror_image(views, tools.rasterizer, tools.matcher, pool)
+        words = InvertedViews.of_many(views)
+        mirrored = like_its_mirror_image(views, words, tools.rasterizer, tools.matcher, pool)
         pictures = [picture for *_, picture in found]
-        repetitions, repeated = find_repetitions(views, pictures, tools.rasterizer, tools.matcher, pool)
+        repetitions, repeated = find_repetitions(views, words, pictures, tools.rasterizer, tools.matcher, pool)
     log.info("view index of %s: %d views", tools.scene.info.name, len(views))
     corners = Corners.pooled([own for _, own, _ in found if own])
-    return ViewIndex(views, corners, mirrored, repeated, repetitions)
+    return ViewIndex(views, corners, mirrored, repeated, repetitions, words=words)
 
 
 def _picture(rgb: UInt8[np.ndarray, "h w 3"], camera: Camera, tools: Tools[None]) -> QueryImages:
@@ -121,7 +142,7 @@ def _key(tools: Tools[None], *more: object) -> str:
     visible = int(np.count_nonzero(tools.scene.opacities))  # floaters are left out
     scene = (tools.scene.info.sha256, visible, len(tools.scene.cameras), tools.scene.info.background_rgb)
     # Dataclasses of numbers: their repr names each value.
-    configs = (*more, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES)
+    configs = (*more, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES, INVERTED)
     parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 
@@ -135,6 +156,8 @@ def _write(index: ViewIndex, path: Path) -> None:
         "corner_directions_deg": index.corners.directions_deg,
         "corner_descriptors": index.corners.descriptors,
     }
+    if index.words:
+        others |= index.words.arrays()
     write_views(path, index.views, others)
 
 
@@ -148,4 +171,4 @@ def _read(path: Path | None, free_views: FreeViews) -> ViewIndex | None:
         repetitions = Repetitions(stored["repetition_motions"], stored["repetition_points"])
     except KeyError:  # a whole file with other arrays
         return None
-    return ViewIndex(views, pooled, mirrored, repeated, repetitions, free_views)
+    return ViewIndex(views, pooled, mirrored, repeated, repetitions, free_views, InvertedViews.from_arrays(stored))

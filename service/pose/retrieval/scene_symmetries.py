@@ -28,7 +28,8 @@ from service.pose.features.rendered_views import VIEWS, View, camera_of, to_uint
 from service.pose.matching.correspondences import MATCH_ERROR_PX, correspondences
 from service.pose.refinement.photometric import refine_photometric
 from service.pose.retrieval.ambiguous_hypotheses import AMBIGUITY, AmbiguityConfig, PoseAtDistance, ambiguous_hypotheses
-from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.inverted_views import InvertedViews, view_scores
+from service.pose.retrieval.scores import top_indices
 from service.types import Camera, Pose
 
 
@@ -141,6 +142,7 @@ def _is_turned(number: int, count: int, config: SymmetryConfig) -> bool:
 
 def find_repetitions(
     views: Sequence[View],
+    words: InvertedViews | None,
     pictures: Sequence[QueryImages | None],
     rasterizer: Rasterizer,
     matcher: Matcher,
@@ -158,11 +160,13 @@ def find_repetitions(
         if images is None or len(view.points_in_world) == 0:
             return [], False
         # In a large scene a photo's own matches tell where it is seen as it is.
-        upright = [] if are_many else _seen_from_elsewhere(view, view.features, views, matcher, AMBIGUITY, config)
+        upright = (
+            [] if are_many else _seen_from_elsewhere(view, view.features, views, words, matcher, AMBIGUITY, config)
+        )
         turned = [
             pose
             for features in (_turned(images, config) if _is_turned(number, len(views), config) else ())
-            for pose in _seen_from_elsewhere(view, features, views, matcher, ANYWHERE, config)
+            for pose in _seen_from_elsewhere(view, features, views, words, matcher, ANYWHERE, config)
         ]
         alike = [_if_alike(images, pose, rasterizer, config) for pose in (*upright, *turned)]
         own = view.camera.pose.camera_from_world
@@ -184,6 +188,7 @@ def _seen_from_elsewhere(
     view: View,
     features: Features,
     views: Sequence[View],
+    words: InvertedViews | None,
     matcher: Matcher,
     ambiguity: AmbiguityConfig,
     config: SymmetryConfig,
@@ -191,7 +196,7 @@ def _seen_from_elsewhere(
     """Return the other poses that many of a view's matches agree on, with these features of it."""
     # The view's own pose is the answer that others are compared with.
     own, intrinsics = PoseAtDistance(view.camera.pose, view.distance), view.camera.intrinsics
-    scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
+    scores = view_scores(features.descriptors, views, words)
     error_px, least = scaled_px(MATCH_ERROR_PX, intrinsics), config.min_repeated_inliers
     found = ambiguous_hypotheses(features, intrinsics, own, views, scores, matcher, error_px, least, ambiguity)
     return [other.pose for other in found]
@@ -212,6 +217,7 @@ def _sample(view: View, config: SymmetryConfig) -> Float32[np.ndarray, "n 3"]:
 
 def like_its_mirror_image(
     views: Sequence[View],
+    words: InvertedViews | None,
     rasterizer: Rasterizer,
     matcher: Matcher,
     pool: Executor,
@@ -223,16 +229,25 @@ def like_its_mirror_image(
     # Spread over the index, whose views are spread over the scene.
     probes = np.unique(np.linspace(0, len(views) - 1, config.mirror_probes).astype(int))
     frames = rasterizer.render([views[i].camera for i in probes])
-    inliers = pool.map(lambda i, frame: _mirrored_inliers(views[i], frame, views, matcher, config), probes, frames)
+    inliers = pool.map(
+        lambda i, frame: _mirrored_inliers(views[i], frame, views, words, matcher, config), probes, frames
+    )
     return float(np.median(list(inliers))) >= config.min_mirror_inliers
 
 
-def _mirrored_inliers(view: View, frame: Frame, views: Sequence[View], matcher: Matcher, config: SymmetryConfig) -> int:
+def _mirrored_inliers(
+    view: View,
+    frame: Frame,
+    views: Sequence[View],
+    words: InvertedViews | None,
+    matcher: Matcher,
+    config: SymmetryConfig,
+) -> int:
     """Return how many matches of a mirrored view with one of the others agree on a pose, at most."""
     intrinsics = mirrored_intrinsics(view.camera.intrinsics)
     # Mirroring the image changes its features, so they can't be taken from the index.
     features = matcher.extract(np.ascontiguousarray(to_uint8(frame.rgb)[:, ::-1]), VIEWS.max_features)
-    scores = retrieval_scores(features.descriptors, [other.features.descriptors for other in views])
+    scores = view_scores(features.descriptors, views, words)
     error_px = scaled_px(MATCH_ERROR_PX, intrinsics)
     most = 0
     for i in top_indices(scores, config.mirror_tries):

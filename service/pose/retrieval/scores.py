@@ -34,14 +34,24 @@ def retrieval_scores(
     Gaussians, 13 similar rooms, 374 views: a right view is among the first five for 10 photos of 16; relative to the
     average for 8, by VLAD with 32 words for 3. In the six test scenes and studio each of them finds one for all 58.)
     """
-    # Extractors return features by strength, the strongest first.
-    photo = np.ascontiguousarray(descriptors[: config.photo_features].T)
-    # Unit length: the dot product is the cosine similarity.
-    best = np.stack([(view[: config.view_features] @ photo).max(0, initial=0.0) for view in views], 1)
-    # Of few views a fixed rank, of many a share of them; never beyond the last.
-    rank = min(max(config.usual_rank, round(config.usual_share * len(views))), len(views) - 1)
+    best = best_similarities(descriptors[: config.photo_features], views, config)
+    rank = usual_rank(len(views), config)
     usual = -np.partition(-best, rank, axis=1)[:, rank, None]
     return np.maximum(best - usual, 0.0).sum(0, dtype=np.float64)
+
+
+def best_similarities(
+    photo: Float32[np.ndarray, "n d"], views: Sequence[Float32[np.ndarray, "_ d"]], config: ScoreConfig = SCORES
+) -> Float32[np.ndarray, "n views"]:
+    """Return each feature's best similarity in each view, at least 0: the cosine to one of its strongest features."""
+    # Unit length: the dot product is the cosine similarity. Extractors return the strongest first.
+    columns = np.ascontiguousarray(photo.T)
+    return np.stack([(view[: config.view_features] @ columns).max(0, initial=0.0) for view in views], 1)
+
+
+def usual_rank(views: int, config: ScoreConfig = SCORES) -> int:
+    """Return the rank of the view in which a feature has its usual similarity: of few views a fixed one."""
+    return min(max(config.usual_rank, round(config.usual_share * views)), views - 1)
 
 
 def top_indices(scores: Float64[np.ndarray, "n"], count: int) -> Int64[np.ndarray, "k"]:

@@ -81,7 +81,7 @@ class PlacementConfig:
     """...the median of those above a half is at least this: within a room it is 0.95, within hollow objects 0.6 to 0.8.
     A room that is taken for an open scene wastes some views; of a bowl that is taken for a room all are in it."""
     min_views: int = 64
-    max_views: int = 1000
+    max_views: int = 20_000
     covered_share: float = 0.93
     """The choice ends with `max_views`, or once it has `min_views` and shows this share of what all good views show."""
     tolerated_roll_deg: float = 30.0

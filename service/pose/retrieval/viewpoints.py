@@ -22,7 +22,8 @@ class ViewpointConfig:
     render_px: int = 384
     """Long side."""
     min_views: int = 64
-    max_views: int = 512
+    max_views: int = 20_000
+    """A building of 12 million Gaussians and 6000 cameras needs 4439, which take 1 GB while the index is made."""
     spacing: float = 0.35
     """A wide scene gets more than `min_views`, until each training camera has one within this distance
     (`choose_spread_poses`)."""
@@ -30,6 +31,10 @@ class ViewpointConfig:
     """Training cameras, about, from whose renders the typical depth is taken."""
     placement: PlacementConfig = PLACEMENT
     """How views are found in a scene without cameras."""
+
+    def cuts(self, views: int, cameras: int) -> bool:
+        """Return whether so many views of a scene with so many training cameras are fewer than it needs."""
+        return views >= (self.max_views if cameras else self.placement.max_views) and views != cameras
 
 
 VIEWPOINTS = ViewpointConfig()
