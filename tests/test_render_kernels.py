@@ -96,13 +96,15 @@ def test_slabs_are_in_order_and_have_all_blocks() -> None:
     assert (sorted(all_around[0].tolist()), all_around[2]) == ([0, 1], np.inf)
 
 
-def test_open_tiles_are_counted_above_and_left_of_every_corner() -> None:
-    is_open = np.random.default_rng(1).random((5, 7)) < 0.5
-    sums = open_sums(is_open).reshape(6, 8)
-    assert all(sums[y, x] == is_open[:y, :x].sum() for y in range(6) for x in range(8))
-    for x0, y0, x1, y1 in ((0, 0, 7, 5), (2, 1, 4, 3), (6, 4, 7, 5), (3, 3, 3, 5)):
-        any_open = bool(is_open[y0:y1, x0:x1].any())
-        assert project.hidden(1.0, x0, y0, x1, y1, 7, np.empty(0), sums.reshape(-1)) == (not any_open)
+def test_open_squares_are_counted_above_and_left_of_every_corner() -> None:
+    is_open = np.random.default_rng(1).random((8, 12)) < 0.2
+    alive = np.zeros((2, 3), np.uint32)
+    for y, x in np.argwhere(is_open):
+        alive[y // 4, x // 4] |= np.uint32(1 << (y % 4 * 4 + x % 4))
+    sums = open_sums(alive).reshape(9, 13)
+    assert all(sums[y, x] == is_open[:y, :x].sum() for y in range(9) for x in range(13))
+    for x0, y0, x1, y1 in ((0, 0, 12, 8), (2, 1, 4, 3), (6, 4, 7, 5), (3, 3, 3, 5), (10, 6, 12, 8)):
+        assert project.closed(x0, y0, x1, y1, 12, sums.reshape(-1)) == (not is_open[y0:y1, x0:x1].any())
 
 
 @pytest.mark.parametrize(("degree", "antialiased"), [(1, False), (2, True), (3, False)])
@@ -165,7 +167,7 @@ def test_a_block_is_hidden_behind_all_tiles_that_its_box_may_reach_and_one_more(
     for tile in range(10 * 6):
         depths = np.full(60, 3.9)
         depths[tile] = 4.0
-        if not project.block_hidden(sphere, view, pinhole, 0.01, np.inf, 10, 6, depths, NONE):
+        if not project.block_hidden(sphere, view, pinhole, 0.01, np.inf, 10, 6, depths, NONE, 1):
             open_tiles.add((tile % 10, tile // 10))
     assert open_tiles == {(x, y) for x in columns for y in rows}
     # Cut by the near plane, or the slab's, it is narrower: from depth 5 on it ends at 90 px, up to 5 it begins at 50.
@@ -174,7 +176,7 @@ def test_a_block_is_hidden_behind_all_tiles_that_its_box_may_reach_and_one_more(
         for tile in range(10 * 6):
             depths = np.full(60, -np.inf)
             depths[tile] = np.inf
-            if not project.block_hidden(sphere, view, pinhole, near, far, 10, 6, depths, NONE):
+            if not project.block_hidden(sphere, view, pinhole, near, far, 10, 6, depths, NONE, 1):
                 shown.add(tile % 10)
         assert shown == set(columns)
     turned = make_camera(seed=4).pose.camera_from_world
@@ -182,7 +184,9 @@ def test_a_block_is_hidden_behind_all_tiles_that_its_box_may_reach_and_one_more(
     for tile, is_hidden in (((7, 3), False), ((8, 3), True), ((7, 4), True), ((1, 0), False), ((0, 0), True)):
         depths = np.full(60, 3.9)
         depths[tile[0] + 10 * tile[1]] = 4.1
-        found = project.block_hidden([*centre[:3], 1.0], turned[:3].ravel(), pinhole, 0.01, np.inf, 10, 6, depths, NONE)
+        found = project.block_hidden(
+            [*centre[:3], 1.0], turned[:3].ravel(), pinhole, 0.01, np.inf, 10, 6, depths, NONE, 1
+        )
         assert found == is_hidden
 
 

@@ -214,7 +214,7 @@ class CpuRasterizer(Rasterizer):
         begin(k.width, k.height, s.states, s.alive)
         close_t = max(end_t, np.float32(SLABS.close_t))
         for some, near, far in slabs(blocks, extents, self.scene.info.near_plane):
-            self._bin(camera, s, some, near, far, tile_depths, open_sums(s.alive.reshape(tiles_y, tiles_x) != 0))
+            self._bin(camera, s, some, near, far, tile_depths, open_sums(s.alive.reshape(tiles_y, tiles_x)))
             blend_further(
                 s.records, s.starts, s.entries, k.width, end_t, close_t, s.local, s.lists, s.lengths, s.states, s.alive
             )  # fmt: skip
@@ -262,14 +262,14 @@ class CpuRasterizer(Rasterizer):
         near: np.float32,
         far: np.float32,
         tile_depths: Float32[np.ndarray, "_"],
-        open_tiles: Int32[np.ndarray, "_"],
+        is_open: Int32[np.ndarray, "_"],
     ) -> None:
         """Project the Gaussians of the blocks between two depths, sort them by depth and fill the tile lists."""
         packed, k = self.packed, camera.intrinsics
         s.visible, count = project(
             packed.geometry, packed.sh, packed.spheres, packed.chunk_spheres, blocks, packed.sh_degree,
             *_view_and_intrinsics(camera), k.width, k.height, *self._dilation(camera),
-            near, far, tile_depths, open_tiles, s.records, s.depths, s.rects, s.local,
+            near, far, tile_depths, is_open, s.records, s.depths, s.rects, s.local,
         )  # fmt: skip
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         if len(s.entries) < count:

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.jit import inline, kernel
-from service.render.pack import CHUNKS_PER_BLOCK
+from service.render.pack import CHUNKS_PER_BLOCK, VISIBLE_SIGMAS
 from service.render.simd import (
     as_float,
     as_int,
@@ -41,6 +41,9 @@ RECORD = 16
 """Floats of a record."""
 TILE = 16
 """Pixels of a tile's side."""
+SQUARE = 4
+"""Pixels of the side of a square, of which `blend` knows whether it still lets light through."""
+SQUARES = TILE // SQUARE
 HALF_LOG2E = np.float32(0.5 * np.log2(np.e))
 TWO_LN2 = np.float32(2 * np.log(2.0))
 LOG2_ALPHA_MIN = np.float32(-np.log2(255.0))
@@ -149,8 +152,11 @@ def _clamp_region(pinhole, width, height):
 
 
 @inline
-def block_hidden(sphere, view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums):
-    """Whether what a bounding sphere has between two depths is hidden in all tiles that it may reach into."""
+def block_hidden(sphere, view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums, margin):
+    """Whether what a bounding sphere has between two depths is hidden wherever it may reach in the image.
+
+    `margin`: by how many squares of 4 x 4 pixels the dilation may enlarge what it has.
+    """
     x, y, z, radius = sphere[0], sphere[1], sphere[2], sphere[3]
     cz = view[8] * x + view[9] * y + view[10] * z + view[11]
     nearest, farthest = max(cz - radius, near), min(cz + radius, far)
@@ -158,28 +164,38 @@ def block_hidden(sphere, view, pinhole, near, far, tiles_x, tiles_y, tile_depths
         return True
     cx = view[0] * x + view[1] * y + view[2] * z + view[3]
     cy = view[4] * x + view[5] * y + view[6] * z + view[7]
-    x0, x1 = _tiles_between(cx - radius, cx + radius, nearest, farthest, pinhole[0], pinhole[2], tiles_x)
-    y0, y1 = _tiles_between(cy - radius, cy + radius, nearest, farthest, pinhole[1], pinhole[3], tiles_y)
-    return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths, open_sums)
-
-
-@inline
-def _tiles_between(low, high, nearest, farthest, focal, centre, tiles):
-    """Return the range of tiles along one axis that a box in the camera frame projects to, a tile more at each end."""
-    first = (min(low / nearest, low / farthest) * focal + centre) / TILE - 1
-    last = (max(high / nearest, high / farthest) * focal + centre) / TILE + 2
-    return int(max(0, min(first, tiles))), int(max(0, min(last, tiles)))
-
-
-@inline
-def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths, open_sums):
-    """Whether none of these tiles is open, or the depth is behind the occlusion depths of all; see `project`."""
+    low_x, high_x = _between(cx - radius, cx + radius, nearest, farthest, pinhole[0], pinhole[2])
+    low_y, high_y = _between(cy - radius, cy + radius, nearest, farthest, pinhole[1], pinhole[3])
     if len(open_sums):
-        top, bottom = np.intp(y0 * (tiles_x + 1)), np.intp(y1 * (tiles_x + 1))
-        if open_sums[bottom + x1] - open_sums[bottom + x0] == open_sums[top + x1] - open_sums[top + x0]:
+        wide, high = tiles_x * SQUARES, tiles_y * SQUARES
+        x0, x1 = _cells(low_x, high_x, SQUARE, wide, margin)
+        y0, y1 = _cells(low_y, high_y, SQUARE, high, margin)
+        if closed(x0, y0, x1, y1, wide, open_sums):
             return True
     if len(tile_depths) == 0:
         return False
+    x0, x1 = _cells(low_x, high_x, TILE, tiles_x, 1)
+    y0, y1 = _cells(low_y, high_y, TILE, tiles_y, 1)
+    return hidden(nearest, x0, y0, x1, y1, tiles_x, tile_depths)
+
+
+@inline
+def _between(low, high, nearest, farthest, focal, centre):
+    """Return the range of pixels along one axis that a box in the camera frame projects to."""
+    first = min(low / nearest, low / farthest) * focal + centre
+    return first, max(high / nearest, high / farthest) * focal + centre
+
+
+@inline
+def _cells(first, last, side, count, margin):
+    """Return the range of cells of so many pixels that a range of pixels is in, some more at each end."""
+    low, high = first / side - margin, last / side + (1 + margin)
+    return int(max(0, min(low, count))), int(max(0, min(high, count)))
+
+
+@inline
+def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths):
+    """Whether a depth lies behind the occlusion depths of all these tiles."""
     for ty in range(y0, y1):
         for tx in range(x0, x1):
             if depth <= tile_depths[np.intp(ty * tiles_x + tx)]:
@@ -188,13 +204,25 @@ def hidden(depth, x0, y0, x1, y1, tiles_x, tile_depths, open_sums):
 
 
 @inline
+def closed(x0, y0, x1, y1, wide, open_sums):
+    """Whether none of these squares is open; `open_sums` as in `project`, of `wide` squares a row."""
+    top, bottom = np.intp(y0 * (wide + 1)), np.intp(y1 * (wide + 1))
+    return open_sums[bottom + x1] - open_sums[bottom + x0] == open_sums[top + x1] - open_sums[top + x0]
+
+
+@inline
 def _not_hidden(mask, rects, scratch, tiles_x, tile_depths, open_sums):
-    """Return the mask without the lanes that are hidden in all tiles of their rectangles."""
+    """Return the mask without the lanes that are hidden in all tiles, or closed in all squares, that they reach."""
     for lane in range(16):
-        if (mask >> np.uint32(lane)) & np.uint32(1):
-            x0, y0, x1, y1 = rects[512 + lane], rects[528 + lane], rects[544 + lane], rects[560 + lane]
-            if hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, tile_depths, open_sums):
-                mask &= ~(np.uint32(1) << np.uint32(lane))
+        if not (mask >> np.uint32(lane)) & np.uint32(1):
+            continue
+        x0, y0, x1, y1 = rects[512 + lane], rects[528 + lane], rects[544 + lane], rects[560 + lane]
+        is_hidden = len(tile_depths) > 0 and hidden(scratch[96 + lane], x0, y0, x1, y1, tiles_x, tile_depths)
+        if not is_hidden and len(open_sums):
+            x0, y0, x1, y1 = rects[576 + lane], rects[592 + lane], rects[608 + lane], rects[624 + lane]
+            is_hidden = closed(x0, y0, x1, y1, tiles_x * SQUARES, open_sums)
+        if is_hidden:
+            mask &= ~(np.uint32(1) << np.uint32(lane))
     return mask
 
 
@@ -205,8 +233,9 @@ def project(geometry, sh, spheres, chunk_spheres, blocks, degree, view, pinhole,
 
     Visible are those of `blocks` between the depths `near` and `far`. `view`: camera_from_world, 12 floats row by row.
     `pinhole`: fx, fy, cx, cy. `tile_depths`: for each tile the depth beyond which nothing is seen; empty: unlimited.
-    `open_sums`: the number of open tiles above and left of each corner of tiles, row by row, where in the others
-    nothing is seen; empty: all are open. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1 (ends excluded).
+    `open_sums`: the number of open squares of 4 x 4 pixels above and left of each corner of squares, row by row, where
+    in the others nothing is seen; empty: all are open. A rectangle is four 16-bit tile numbers: x0, y0, x1, y1 (ends
+    excluded).
     """
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     low_x, high_x, low_y, high_y = _clamp_region(pinhole, width, height)
@@ -224,15 +253,16 @@ def project(geometry, sh, spheres, chunk_spheres, blocks, degree, view, pinhole,
     entries = 0
     integers = scratch.view(np.int32)
     may_hide = len(tile_depths) > 0 or len(open_sums) > 0
+    margin = 1 + int(np.float32(VISIBLE_SIGMAS) * np.sqrt(dilation) / SQUARE)
     for place in range(blocks.shape[0]):
         block = np.intp(blocks[place])
         if may_hide and block_hidden(
-            spheres[block], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums
+            spheres[block], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums, margin
         ):
             continue
         for chunk in range(block * CHUNKS_PER_BLOCK, min((block + 1) * CHUNKS_PER_BLOCK, chunks)):
             if may_hide and block_hidden(
-                chunk_spheres[chunk], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums
+                chunk_spheres[chunk], view, pinhole, near, far, tiles_x, tiles_y, tile_depths, open_sums, margin
             ):
                 continue
             at = chunk * 160
@@ -283,6 +313,12 @@ def project(geometry, sh, spheres, chunk_spheres, blocks, degree, view, pinhole,
             store(integers, 544, to_int(vmin(floor((px + wide) * to_tile) + 1.0, tiles_x)))
             store(integers, 560, to_int(vmin(floor((py + high) * to_tile) + 1.0, tiles_y)))
             store(scratch, 96, z)
+            if len(open_sums):
+                to_square = np.float32(1.0 / SQUARE)
+                store(integers, 576, to_int(vmax((px - wide) * to_square, 0.0)))
+                store(integers, 592, to_int(vmax((py - high) * to_square, 0.0)))
+                store(integers, 608, to_int(vmin(floor((px + wide) * to_square) + 1.0, tiles_x * SQUARES)))
+                store(integers, 624, to_int(vmin(floor((py + high) * to_square) + 1.0, tiles_y * SQUARES)))
             if may_hide:
                 mask = _not_hidden(mask, integers, scratch, tiles_x, tile_depths, open_sums)
                 if mask == 0:

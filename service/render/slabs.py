@@ -2,12 +2,12 @@
 
 A large scene has many times more Gaussians in the field of view than before the first surface. So the blocks in view
 are put in order of their nearest points and cut into slabs; a slab is projected, sorted and blended before the next one
-is looked at, and of that only blocks, chunks and Gaussians that reach into tiles which still let light through. What an
-image costs follows what it shows, and so does the memory for it.
+is looked at, and of that only blocks, chunks and Gaussians that reach into squares of 4 x 4 pixels which still let
+light through. What an image costs follows what it shows, and so does the memory for it.
 
 A Gaussian is drawn in the slab that its own depth is in, whichever its block is in; so the order is that of an image
 drawn at once, but for Gaussians whose depths are equal to 1 part in 2 million: their keys are exact to that (see
-`tiles`). Where a tile is closed, at most `close_t` of a pixel's light is missing.
+`tiles`). Where a square is closed, at most `close_t` of a pixel's light is missing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32
+from jaxtyping import Float32, Int32, UInt32
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class SlabConfig:
     growth: float = 1.25
     """Of each slab over the one before: farther ones are hidden more and more, and looking at them costs the same."""
     close_t: float = 0.001
-    """Transmittance of all pixels at which a tile takes nothing from the slabs behind: a quarter of a grey level."""
+    """Transmittance of all pixels at which a square takes nothing from the slabs behind: a quarter of a grey level."""
 
 
 SLABS = SlabConfig()
@@ -58,8 +58,14 @@ def slabs(
             start = end
 
 
-def open_sums(is_open: Bool[np.ndarray, "h w"]) -> Int32[np.ndarray, "_"]:
-    """Return for each corner of tiles how many open ones are above and left of it, row by row (a summed-area table)."""
-    sums = np.zeros((is_open.shape[0] + 1, is_open.shape[1] + 1), np.int32)
+def open_sums(alive: UInt32[np.ndarray, "h w"]) -> Int32[np.ndarray, "_"]:
+    """Return for each corner of squares how many open ones are above and left of it (a summed-area table), row by row.
+
+    `alive` has a bit for each of the 4 x 4 squares of a tile, row by row.
+    """
+    high, wide = alive.shape
+    bits = (alive[..., None] >> np.arange(16, dtype=np.uint32)) & np.uint32(1)
+    is_open = bits.reshape(high, wide, 4, 4).swapaxes(1, 2).reshape(4 * high, 4 * wide)
+    sums = np.zeros((4 * high + 1, 4 * wide + 1), np.int32)
     np.cumsum(np.cumsum(is_open, 0, np.int32), 1, out=sums[1:, 1:])
     return sums.reshape(-1)
