@@ -365,6 +365,13 @@ def test_attributes_are_floats_or_shares_of_integers(tmp_path):
     assert found.up == (0.0, 1.0, 0.0)
 
 
+@pytest.mark.parametrize("kind", ["u1", "<u2", "i1", "<i2"])
+def test_the_largest_integer_of_each_kind_is_one(kind, tmp_path):
+    largest = np.iinfo(kind).max
+    tree, data = scene_tree([{"mesh": 0}], columns(OPACITY=np.array([[largest], [largest // 3]], kind)))
+    assert read_glb(tmp_path, glb_file(tree, data)).opacities == pytest.approx([1.0, (largest // 3) / largest])
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_harmonics_come_by_degree_and_number(tmp_path, degree):
     more = {

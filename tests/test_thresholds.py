@@ -73,6 +73,13 @@ def test_settings_have_a_least_value(name: str, least: float, below: float) -> N
         Settings(scenes=[], **{name: below})
 
 
+def test_as_many_jobs_run_as_there_are_replicas_unless_workers_are_named() -> None:
+    for given, jobs in (({}, 3), ({"workers": 7}, 7), ({"engine": "embedded", "workers": 7}, 7)):
+        assert Settings(scenes=[], **{"engine": "ray", "ray_replicas": 3} | given).jobs_at_once == jobs
+    here = Settings(scenes=[], ray_replicas=1234)
+    assert here.jobs_at_once == here.jobs.workers == here.workers < 1234
+
+
 @pytest.mark.parametrize(("name", "most"), [("port", 65535), ("max_wait_s", 3600)])
 def test_settings_have_a_largest_value(name: str, most: int) -> None:
     Settings(scenes=[], **{name: most})
