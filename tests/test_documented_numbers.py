@@ -19,7 +19,7 @@ from service.bench.bench_photos import BenchPhoto
 from service.bench.datasets import LAYOUTS
 from service.bench.field_queries import FieldQuery, decoded, send
 from service.bench.field_random import random_row
-from service.bench.field_rows import TOLD, Row
+from service.bench.field_rows import FOCAL_FACTORS, K1, TOLD, Row
 from service.bench.fleet_simulation import FLEETS
 from service.bench.gpu import LIMIT_S, PARTS
 from service.bench.gpu_shared import FULL
@@ -55,6 +55,7 @@ def numbers(text: str) -> list[float]:
 # ------------------------------------------------------------------ modifications of the benches
 
 DRAWN = {row[0].strip("` "): (numbers(row[1]), numbers(row[2])) for row in rows_of("benchmarks.md", "`--modify` |")}
+RANDOM_K1 = DRAWN["k1"][1]
 SCENE_RANGES = {row[0].strip("` "): numbers(row[1]) for row in rows_of("benchmarks.md", "`--modify-scene` |")}
 
 
@@ -122,6 +123,13 @@ def test_random_combinations_are_as_frequent_as_documented(random_rows: list[Row
     for count, share in pairs:
         # Five standard deviations of a binomial distribution.
         assert abs(count / len(names) - share) < 5 * np.sqrt(share * (1 - share) / len(names)), (count, share)
+
+
+def test_rows_of_a_lens_go_to_both_ends_of_the_documented_range_in_pairs() -> None:
+    assert [min(K1), max(K1)] == RANDOM_K1
+    assert sorted(K1) == list(K1) == sorted(-k for k in K1)
+    assert sorted(set(FOCAL_FACTORS)) == list(FOCAL_FACTORS)
+    assert 0.85 < min(FOCAL_FACTORS) < 1 < max(FOCAL_FACTORS) < 1.15
 
 
 def test_starts_fill_their_documented_ranges() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from service.geometry import moved, pose_distance, se3_exp, se3_log, so3_exp
-from service.live.fusion import Fusion
+from service.live.fusion import FUSION, Fusion
 from service.live.live_values import FusedOdometry, OdometryFacts
 from service.types import Pose, SceneInfo
 
@@ -229,3 +231,25 @@ def test_a_scene_in_metres_needs_no_baseline():
 def test_a_scale_that_the_walk_contradicts_is_not_believed():
     told = fused(walk(4.0), info=replace(INFO, metres_per_unit=1.4 / SCALE))
     assert scale_error(told[-1]) < 0.02
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "shift", "known"),
+    [(3.9, 0.19, True), (4.1, 0.0, False), (0.0, 0.21, False)],
+)
+def test_a_camera_is_carried_until_its_angle_or_its_place_is_unsure(turn_deg, shift, known):
+    """By four degrees, or a twenty-fifth of the depth, which is 5."""
+    fusion: Any = Fusion.__new__(Fusion)
+    fusion._config, fusion._fitted = FUSION, SimpleNamespace(depth=5.0)
+    spread = np.diag([np.radians(turn_deg) ** 2] * 3 + [shift**2] * 3 + [9.0])
+    pose = Pose(np.eye(4))
+    fusion._carried = lambda late: (pose, spread)
+    found = fusion.carried()
+    assert (found is not None) == known
+    if found is not None:
+        assert found[0] is pose
+        assert np.array_equal(found[1], spread[:6, :6])
+    fusion._carried = lambda late: None
+    assert fusion.carried() is None
+    fusion._carried, fusion._fitted = lambda late: (pose, spread), None
+    assert fusion.carried() is None
