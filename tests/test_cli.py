@@ -195,6 +195,31 @@ def test_scenes_are_listed_and_inspected(splatfix, room, tmp_path):
     assert "training size is unknown" in " ".join(bare["warnings"])
 
 
+def test_a_photo_that_cannot_be_read_keeps_no_other_from_its_result(splatfix, room, photo, tmp_path):
+    broken, table = tmp_path / "broken.jpg", tmp_path / "out.csv"
+    broken.write_bytes(encoded_noise()[:2000])
+    given = ("localize", photo, broken, photo, "--scene", room)
+    code, told, complaint = splatfix(*given, "--csv", table)
+    assert (code, [line.split(",")[0].split(": ")[1] for line in told.splitlines()]) == (2, ["localized"] * 2)
+    assert complaint.startswith(f"error: {broken}: the JPEG can't be decoded")
+    with table.open(newline="") as file:
+        rows = [(row["photo"], row["status"], row["reason"]) for row in csv.DictReader(file)]
+    assert [row[1] for row in rows] == ["localized", "error", "localized"]
+    assert rows[1] == (str(broken), "error", "invalid_image")
+    code, told, _ = splatfix(*given, "--json")
+    first, second, third = json.loads(told)
+    assert (code, first["status"], third["status"]) == (2, "localized", "localized")
+    assert second["error"]["code"] == "invalid_image"
+    assert str(broken) in second["error"]["message"]
+
+
+def encoded_noise() -> bytes:
+    stream = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 255, (100, 120, 3), np.uint8)
+    Image.fromarray(noise).save(stream, "JPEG")
+    return stream.getvalue()
+
+
 def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo, tmp_path):
     torn = tmp_path / "torn.ply"
     torn.write_bytes(b"ply\n")

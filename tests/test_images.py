@@ -417,7 +417,7 @@ class TestBrokenPhotos:
         [
             (b"", "empty"),
             (b"hello, this is text", "not a JPEG"),
-            (b"GIF89a" + bytes(100), "not a JPEG"),
+            (b"GIF89a" + bytes(100), "a GIF file is not read"),
             (b"\xff\xd8\xff", "header"),
             (b"\x89PNG\r\n\x1a\n", "header"),
             (b"RIFF\x10\0\0\0WEBPVP8 " + bytes(20), "header"),
@@ -463,6 +463,25 @@ class TestBrokenPhotos:
         data = encoded(Image.fromarray(noise), kind)
         with pytest.raises(InvalidImage, match=r"truncated|broken"):
             read_query(data[: len(data) // 2])
+
+    @pytest.mark.parametrize("progressive", [False, True])
+    def test_a_jpeg_that_lacks_only_its_end_marker_is_read(self, progressive):
+        noise = np.random.default_rng(0).integers(0, 255, (100, 120, 3), np.uint8)
+        whole = encoded(Image.fromarray(noise), "JPEG", progressive=progressive)
+        assert np.array_equal(read_query(whole[:-2]).rgb, read_query(whole).rgb)
+        with pytest.raises(InvalidImage, match="truncated"):
+            read_query(whole[:-40])
+
+    @pytest.mark.parametrize(
+        ("kind", "data"),
+        [
+            *((kind, encoded(Image.fromarray(gradient()), kind)) for kind in ("AVIF", "GIF", "BMP", "TIFF")),
+            ("JPEG XL", b"\x00\x00\x00\x0cJXL \r\n\x87\n" + bytes(40)),
+        ],
+    )
+    def test_a_format_that_is_not_read_is_named(self, kind, data):
+        with pytest.raises(InvalidImage, match=rf"^photo: an? {kind}\b.* is not read here. Convert it to JPEG.$"):
+            read_query(data)
 
     @settings(max_examples=150)
     @given(st.data())

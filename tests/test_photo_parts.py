@@ -35,7 +35,7 @@ from service.photos.intrinsics import (
     undistorted_points,
     undistorted_query,
 )
-from service.photos.jpeg_scans import count_scans
+from service.photos.jpeg_segments import scans_and_end
 from service.photos.sequence import SequenceOptions, check_sequence, is_packed, packed, read_sequence, unpacked
 from service.types import Intrinsics, IntrinsicsCorrection, Pose, Query
 
@@ -273,7 +273,7 @@ def test_a_photo_is_converted_band_by_band(monkeypatch):
 
 @pytest.mark.parametrize(("scans", "read"), [(24, True), (25, False)])
 def test_a_progressive_jpeg_has_24_scans_at_most(monkeypatch, scans, read):
-    monkeypatch.setattr(images, "count_scans", lambda data: scans)
+    monkeypatch.setattr(images, "scans_and_end", lambda data: (scans, True))
     if read:
         open_photo(file(64, 48, "JPEG"))
     else:
@@ -283,8 +283,8 @@ def test_a_progressive_jpeg_has_24_scans_at_most(monkeypatch, scans, read):
 
 
 def test_scans_are_counted_by_their_markers():
-    assert count_scans(file(64, 48, "JPEG")) == 1
-    assert count_scans(file(64, 48, "JPEG", progressive=True)) > 3
+    assert scans_and_end(file(64, 48, "JPEG")) == (1, True)
+    assert scans_and_end(file(64, 48, "JPEG", progressive=True))[0] > 3
 
 
 def test_images_are_encoded_with_their_colours_and_opacity():

@@ -20,7 +20,7 @@ from service.cli.render import render
 from service.cli.report import report
 from service.cli.scenes import scenes_app
 from service.cli.serve import serve
-from service.cli.terminal import err
+from service.cli.terminal import err, tell_error
 from service.errors import SplatfixError
 
 app = typer.Typer(
@@ -52,5 +52,5 @@ def main() -> None:
     try:
         app()
     except SplatfixError as error:
-        err.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
+        tell_error(error)
         raise SystemExit(2) from None

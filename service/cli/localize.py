@@ -22,8 +22,9 @@ from service.cli.terminal import (
     say,
     scene_anchors,
     scene_registrations,
+    tell_error,
 )
-from service.errors import InvalidRequest
+from service.errors import BadInput, InvalidImage, InvalidIntrinsics, InvalidRequest
 
 if TYPE_CHECKING:
     from service.jobs.model import JobRecord
@@ -100,7 +101,8 @@ def localize(
 ) -> None:
     """Find where photos, or a video's frames, were taken in a scene; of several scenes, also in which.
 
-    The exit code is 0 also for photos that are not localized, unless --fail is given; 2 for an error.
+    The exit code is 0 also for photos that are not localized, unless --fail is given; 2 for an error. A photo that
+    can't be read doesn't keep the others from being localized.
     """
     from service.photos.sequence import is_sequence
     from service.results import Status
@@ -179,7 +181,10 @@ def _localize_each(
     *,
     learn_lenses: bool,
 ) -> list[Status]:
-    """Localize every photo by itself, in the one scene or in each of several; return their statuses."""
+    """Localize every photo by itself, in the one scene or in each of several; return their statuses.
+
+    Of several photos those that can't be read are told in the end, by exit code 2. Of one it raises BadInput.
+    """
     from service.cli import result_tables
     from service.jobs.embedded_engine import run_task
     from service.jobs.read_photo import read_photo
@@ -190,26 +195,49 @@ def _localize_each(
 
     loaded, registrations = [scene.loaded for scene in known], [scene.registration for scene in known]
     lenses = LensMemory(MemoryLensStore(len(bodies))) if learn_lenses else None
-    results: list[tuple[str, Result]] = []
+    results: list[tuple[str, Result | BadInput]] = []
     for body in track(bodies, "photos", console=err, transient=True, disable=len(bodies) == 1):
         spec = job_spec(fields)
         recall = partial(lenses.recall, "", None) if lenses else None
-        photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb, recall=recall)
-        result, shown = run_task(photo.task(spec), loaded, registrations=registrations)
+        try:
+            photo = read_photo(body.photo, spec, loaded[0].scene.info.background_rgb, recall=recall)
+        except (InvalidImage, InvalidIntrinsics) as error:
+            results.append((body.name, _of_file(error, body.name)))
+            if len(bodies) == 1:
+                raise
+            tell_error(error)
+            continue
+        answer, shown = run_task(photo.task(spec), loaded, registrations=registrations)
         if lenses:
-            lenses.learn("", None, photo.camera, photo.recalled, result.estimate)
+            lenses.learn("", None, photo.camera, photo.recalled, answer.estimate)
         # By identity: comparing scenes would compare their arrays.
         anchors = next((scene.anchors for scene in known if scene.loaded is shown), ())
-        results.append((body.name, result_out(result, anchors)))
+        shown_result = result_out(answer, anchors)
+        results.append((body.name, shown_result))
         if not output.as_json:
             # At once, not in the end: a photo may take seconds.
-            say(result_tables.photo_line(*results[-1]))
+            say(result_tables.photo_line(body.name, shown_result))
     if output.as_json:
         # One document, so that it can be parsed as a whole.
-        print_json([{"photo": name, **result.model_dump(mode="json")} for name, result in results])
+        print_json([{"photo": name, **_json_of(result)} for name, result in results])
     if output.csv_file:
         result_tables.write_photo_table(output.csv_file, results)
-    return [result.status for _, result in results]
+    found = [result for _, result in results if not isinstance(result, BadInput)]
+    if len(found) < len(results):
+        raise typer.Exit(2)
+    return [result.status for result in found]
+
+
+def _json_of(result: Result | BadInput) -> dict[str, Any]:
+    if isinstance(result, BadInput):
+        return {"error": {"code": result.code, "message": str(result)}}
+    return result.model_dump(mode="json")
+
+
+def _of_file(error: BadInput, name: str) -> BadInput:
+    """Name the file where an error names the request's field."""
+    error.where = name if error.where == "photo" else f"{name}: {error.where}"
+    return error
 
 
 def _localize_sequence(

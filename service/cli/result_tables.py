@@ -6,6 +6,7 @@ import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from service.errors import BadInput
 from service.web.schemas.exports import smoothed_frames
 from service.web.schemas.job_results import FrameOut, Result
 from service.web.schemas.poses import Transform
@@ -34,17 +35,21 @@ def _line(name: str, status: str, score: float, world_from_camera: Transform) ->
     return f"{name}: {status}, score {score:.2f}, position {position}, quaternion_wxyz {quaternion}"
 
 
-def write_photo_table(path: Path, results: Sequence[tuple[str, Result]]) -> None:
-    """Write a CSV table with one row a photo; the pose is world_from_camera in OpenCV axes, in scene units."""
-    rows = [
-        (
-            *(name, result.scene.id, result.status, result.reason, result.score),
-            *_pose(result.pose.world_from_camera),
-            *(result.inliers, round(1000 * sum(timing.wall_s for timing in result.timings), 1)),
-        )
-        for name, result in results
-    ]
-    _write(path, ("photo", "scene", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms"), rows)
+def write_photo_table(path: Path, results: Sequence[tuple[str, Result | BadInput]]) -> None:
+    """Write a CSV table with one row a photo; the pose is world_from_camera in OpenCV axes, in scene units.
+
+    A photo that could not be read has status `error` and the error's code as reason.
+    """
+    head = ("photo", "scene", "status", "reason", "score", *_POSE_COLUMNS, "inliers", "latency_ms")
+    rows: list[Sequence[object]] = []
+    for name, result in results:
+        if isinstance(result, BadInput):
+            rows.append((name, "", "error", result.code, *[""] * (len(head) - 4)))
+            continue
+        latency_ms = round(1000 * sum(timing.wall_s for timing in result.timings), 1)
+        verdict = (result.scene.id, result.status, result.reason, result.score)
+        rows.append((name, *verdict, *_pose(result.pose.world_from_camera), result.inliers, latency_ms))
+    _write(path, head, rows)
 
 
 def write_frame_table(path: Path, frames: Sequence[FrameOut], *, smooth: bool = False) -> None:

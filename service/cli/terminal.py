@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from service.errors import InvalidRequest
+from service.errors import InvalidRequest, SplatfixError
 
 if TYPE_CHECKING:
     from service.loaded_scene import LoadedScene
@@ -48,6 +48,11 @@ def settings_of(given: dict[str, Any]) -> Settings:
 def say(text: str) -> None:
     """Print text without rich's markup and line breaks."""
     out.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def tell_error(error: SplatfixError) -> None:
+    """Print an error as one line on the terminal's error stream."""
+    err.print(f"error: {error}", style="red", markup=False, highlight=False, soft_wrap=True)
 
 
 def short(value: Any) -> str:

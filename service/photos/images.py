@@ -9,6 +9,7 @@ Focal lengths without calibration are EXIF's 35 mm equivalent (`exif_focal_prior
 
 from __future__ import annotations
 
+import hashlib
 import logging
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -28,7 +29,8 @@ from service.photos.decode_config import DEFAULTS
 from service.photos.decoded_pixels import DecodedPixels
 from service.photos.heic import decode_heic
 from service.photos.intrinsics import ORIENTATIONS, require_size, undistorted
-from service.photos.jpeg_scans import count_scans
+from service.photos.jpeg_segments import END, lacks_only_its_end, scans_and_end
+from service.photos.unread_photos import unread_format
 from service.types import LENS_PRIORS, Intrinsics, IntrinsicsSource, LensPrior, Pose, Query
 
 # The classes are called directly: Image.open would try every format that Pillow knows, and warn before the size
@@ -234,6 +236,8 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
     if not data:
         raise InvalidImage("the photo is empty (0 bytes).", where="photo")
     # By its first bytes: what a client says of a file's type or name need not be true.
+    if unread := unread_format(data):
+        raise InvalidImage(f"{unread} file is not read here.", where="photo", hint="Convert it to JPEG.")
     matching = [(name, decoder, limit) for name, decoder, limit, begins_like in _DECODERS if begins_like(data)]
     if not matching:
         raise InvalidImage("not a JPEG, PNG, WebP or HEIC photo.", where="photo")
@@ -251,11 +255,24 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
             where="photo",
             hint="Send it smaller: more than about 2 megapixels don't help.",
         )
-    if isinstance(photo, JpegImageFile) and (scans := count_scans(data)) > DEFAULTS.max_scans:
+    return name, _checked_jpeg(photo, data) if isinstance(photo, JpegImageFile) else photo
+
+
+def _checked_jpeg(photo: JpegImageFile, data: bytes) -> JpegImageFile:
+    """Return the JPEG, with an end if nothing but that is missing. Raises InvalidImage if it has too many scans."""
+    scans, has_end = scans_and_end(data)
+    if scans > DEFAULTS.max_scans:
         raise InvalidImage(
             f"a JPEG of {scans} scans; the limit is {DEFAULTS.max_scans}.", where="photo", hint="Save it again."
         )
-    return name, photo
+    if has_end:
+        return photo
+    return JpegImageFile(BytesIO(data + END)) if lacks_only_its_end(data, _pixels_hash) else photo
+
+
+def _pixels_hash(jpeg: bytes) -> bytes:
+    """Return a hash of a JPEG's pixels. Raises OSError."""
+    return hashlib.sha256(JpegImageFile(BytesIO(jpeg)).tobytes()).digest()
 
 
 def _heic(data: bytes, max_pixels: int) -> Image.Image:
