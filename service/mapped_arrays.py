@@ -1,7 +1,7 @@
 """Named arrays as a folder of memory-mapped `.npy` files, written whole or not at all.
 
-They are written by `numpy.save` and opened without pickle. The folder belongs to a cache: what can't be opened is made
-again by who asked for it.
+They are written by `numpy.save` and opened as plain numbers, no objects. The folder belongs to a cache: what can't be
+opened is made again by who asked for it.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ import pytest
 
 import service.loaded_scene
 import service.localize
+import service.searched_scene
 from service.errors import BackendMissing, EstimatorFault
 from service.geometry import moved
 from service.interfaces import Features, Frame, Rasterizer, SceneGradients
@@ -258,6 +259,11 @@ class Gpu:
         return made
 
 
+def choose_from(monkeypatch: pytest.MonkeyPatch, rasterizers: Gpu) -> None:
+    for module in (service.loaded_scene, service.searched_scene):
+        monkeypatch.setattr(module, "RASTERIZERS", rasterizers)
+
+
 @pytest.mark.parametrize(
     ("gpu", "named", "expected", "skipped_rasterizers", "warned"),
     [
@@ -268,7 +274,7 @@ class Gpu:
     ],
 )
 def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expected, skipped_rasterizers, warned):
-    monkeypatch.setattr(service.loaded_scene, "RASTERIZERS", gpu)
+    choose_from(monkeypatch, gpu)
     use(monkeypatch, Script(1))
     bound = LoadedScene.of(loaded.scene, rasterizer=named)
     assert (bound.rasterizer.name, bound.skipped_rasterizers) == (expected, skipped_rasterizers)
@@ -278,6 +284,6 @@ def test_the_gpu_is_used_where_it_can_be(monkeypatch, loaded, gpu, named, expect
 
 
 def test_a_gpu_that_was_asked_for_is_no_other(monkeypatch, loaded):
-    monkeypatch.setattr(service.loaded_scene, "RASTERIZERS", Gpu(full=True))
+    choose_from(monkeypatch, Gpu(full=True))
     with pytest.raises(BackendMissing, match="no memory"):
         LoadedScene.of(loaded.scene, rasterizer="gsplat_cuda")

@@ -8,7 +8,6 @@ import sys
 import tracemalloc
 import warnings
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +23,7 @@ from service.render import RASTERIZERS, cpu
 from service.render.cpu import CpuRasterizer, dilation_for
 from service.render.gsplat_cuda import GsplatRasterizer
 from service.render.project import project
-from service.render.slabs import SlabConfig, slabs
+from service.render.slabs import SlabConfig
 from service.types import Camera, GaussianScene, Intrinsics, Pose, SceneInfo
 
 ON_CPU = "gsplat_on_cpu"
@@ -160,8 +159,7 @@ def test_what_a_wall_hides_is_not_projected(monkeypatch):
     (at_once,) = whole.render([camera])
     (visible,) = projected
     projected.clear()
-    monkeypatch.setattr(cpu, "SLABS", SlabConfig(0, 16, 1.0))
-    monkeypatch.setattr(cpu, "slabs", partial(slabs, config=cpu.SLABS))
+    whole.slab_config = SlabConfig(0, 16, 1.0)
     (in_slabs,) = whole.render([camera])
     assert len(projected) > 1
     assert visible > 2.5 * sum(projected)
@@ -173,7 +171,6 @@ def test_what_a_wall_hides_is_not_projected(monkeypatch):
     assert np.abs(in_slabs.rgb - truth.rgb.numpy()).max() <= 0.001
     # Gradients are of the image at once.
     d_rgb = np.random.default_rng(5).normal(size=(48, 64, 3)).astype(np.float32)
-    monkeypatch.setattr(cpu, "SLABS", SlabConfig())
     assert np.array_equal(whole.pose_gradient(camera, d_rgb), CpuRasterizer(scene).pose_gradient(camera, d_rgb))
 
 

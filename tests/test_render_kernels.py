@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -68,15 +67,13 @@ def test_every_pixel_that_is_drawn_in_slabs_equals_the_reference(monkeypatch, an
     """In blocks of 16 Gaussians, of which each begins another slab."""
     monkeypatch.setattr(pack, "CHUNKS_PER_BLOCK", 1)
     monkeypatch.setitem(project.project.__globals__, "CHUNKS_PER_BLOCK", 1)
-    monkeypatch.setattr(cpu, "SLABS", SlabConfig(0, 1, 1.0, 0.0))
-    monkeypatch.setattr(cpu, "slabs", partial(slabs, config=cpu.SLABS))
     scene, inside = make_scene(160, 1, 3, antialiased), make_camera(21, 18, seed=3)
     back = np.eye(4)
     back[2, 3] = -6.0
     camera = Camera(inside.intrinsics, Pose(inside.pose.world_from_camera @ back))
     drawn = []
     monkeypatch.setattr(cpu, "blend_further", lambda *given: drawn.append(1) or blend.blend_further(*given))
-    frame = CpuRasterizer(scene).render([camera])[0]
+    frame = CpuRasterizer(scene, slab_config=SlabConfig(0, 1, 1.0, 0.0)).render([camera])[0]
     truth = render_reference(scene, camera)
     for ours, right in zip((frame.rgb, frame.alpha, frame.depth, frame.median_depth), truth, strict=True):
         assert worst(ours, right) < 1e-5

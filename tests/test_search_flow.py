@@ -23,6 +23,7 @@ from service.localize import Request
 from service.pose.matching.correspondences import Correspondences
 from service.pose.matching.match_stages import Rematch
 from service.pose.refinement.refine_stage import RefinedPose, RefineOutcome, RematchedPose
+from service.pose.retrieval.ambiguous_hypotheses import PoseAtDistance
 from service.pose.retrieval.image_variant import ImageVariant
 from service.results import Candidates, IterationRecord, Reason, Status
 from service.types import Intrinsics, IntrinsicsCorrection, Query
@@ -368,6 +369,7 @@ def test_a_mirror_image_that_is_less_unlike_the_photo_is_told(
     monkeypatch.setattr(ambiguity_check, "mirror_image_of", lambda *_: pair)
     monkeypatch.setattr(ambiguity_check, "prefers", lambda *_: False)
     monkeypatch.setattr(ambiguity_check, "_search_mirrored", returns(refined() if found else None, asked))
+    monkeypatch.setattr(ambiguity_check, "seen_from", lambda *_: PoseAtDistance(HERE, 4.0))
 
     def checked(signal: float) -> tuple[list, bool]:
         searching = state()
@@ -386,6 +388,27 @@ def test_a_mirror_image_that_is_less_unlike_the_photo_is_told(
         assert asked[0][0][1:] == (ImageVariant(400, 5), pytest.approx(0.06))
         records, is_mirrored = checked(0.82)
         assert [record.mirrored for record in records] == [is_mirrored] == [False]
+
+
+@pytest.mark.parametrize(
+    ("shift", "signal", "mirrored"),
+    # Beyond twice the distance that is seen, 4 units, it must be four times less unlike the photo.
+    [(7.9, 0.81, True), (8.1, 0.81, False), (8.1, 0.949, False), (8.1, 0.951, True)],
+)
+def test_a_mirror_image_in_another_place_must_fit_much_better(monkeypatch, shift, signal, mirrored) -> None:
+    names = ("gradients", "gradients_half", "colours", "colours_half", "local_colour_correlation")
+    pair = SimpleNamespace(appearance_at=lambda pose: dict.fromkeys(names, signal))
+    there = replace(refined(), pose=moved(HERE, np.array([0, 0, 0, shift, 0, 0])))
+    monkeypatch.setattr(ambiguity_check, "mirror_image_of", lambda *_: pair)
+    monkeypatch.setattr(ambiguity_check, "prefers", lambda *_: False)
+    monkeypatch.setattr(ambiguity_check, "_search_mirrored", returns(there))
+    monkeypatch.setattr(ambiguity_check, "seen_from", lambda *_: PoseAtDistance(HERE, 4.0))
+    searching = state()
+    searching.tools.prepared.like_its_mirror_image = True  # type: ignore[misc]
+    searching.images = SimpleNamespace(query=SimpleNamespace(scene_priors=None))  # type: ignore[assignment]
+    given = replace(verdict("localized"), signals=dict.fromkeys(names, 0.8))
+    searching.best, searching.finished = VerifiedPose(refined(0.03), given, ImageVariant(400, 3)), True
+    assert drained(ambiguity_check.check_mirror(searching))[1] is mirrored
 
 
 # ------------------------------------------------------------------ the record of an answer through another lens

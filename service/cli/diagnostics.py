@@ -33,9 +33,12 @@ from service.pose.refinement.photometric import refine_photometric
 from service.pose.refinement.uncertainty import pose_uncertainty
 from service.pose.retrieval.floaters import find_floaters
 from service.pose.retrieval.free_space import free_space_of
+from service.pose.retrieval.inverted_views import InvertedConfig, InvertedViews
 from service.pose.training_photos.patch_kernels import linearize_places
 from service.pose.training_photos.patch_matching import PATCHES, grey, matched, pinhole_vector, predicted
 from service.render import RASTERIZERS
+from service.render.cpu import CpuRasterizer
+from service.render.slabs import SlabConfig
 from service.scene_formats import SCENE_FORMATS
 from service.types import NO_CORRECTION, Camera, GaussianScene, Intrinsics, NamedCamera, Pose, SceneInfo
 
@@ -92,7 +95,11 @@ def compile_kernels() -> None:
     one = RigMatches(seen, points, camera.intrinsics, Pose(np.eye(4)), 4.0)
     estimate_rig_pose([one, replace(one, photo_px=seen + 8.0)], 8, [camera.pose])
     linearize_reprojection(np.zeros((8, 2)), points, camera.intrinsics, camera.pose, NO_CORRECTION)
+    CpuRasterizer(room, slab_config=SlabConfig(min_blocks=0)).render([camera])
     free_space_of(room).enclosures(points)
+    views = [np.eye(64, dtype=np.float32)] * 2
+    words = InvertedConfig(min_words=2, exact_views=1)
+    InvertedViews.of(views, config=words).scores(views[0], views, config=words)
     _match_patches(grey(photo), points, camera)
     find_floaters(replace(room, cameras=(NamedCamera("warm", camera),)))
 

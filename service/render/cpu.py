@@ -29,7 +29,7 @@ from service.render.blend import BATCH, LIST, LOCAL, STATE, T_MIN, TILE_STATE, b
 from service.render.pack import LANES, Packed, aligned, fill, mapped_pack, pack
 from service.render.project import RECORD, TILE, blocks_in_view, project
 from service.render.projection_gradients import ROW, pose_twist, scene_rows, unpack_rows
-from service.render.slabs import SLABS, open_sums, slabs
+from service.render.slabs import SLABS, SlabConfig, open_sums, slabs
 from service.render.tiles import fill_tiles, sort_by_depth
 from service.types import Camera, GaussianScene, SceneInfo
 
@@ -82,8 +82,9 @@ class CpuRasterizer(Rasterizer):
 
     name = "cpu"
 
-    def __init__(self, scene: GaussianScene, packed: Packed | None = None) -> None:
+    def __init__(self, scene: GaussianScene, packed: Packed | None = None, slab_config: SlabConfig = SLABS) -> None:
         self.scene = scene
+        self.slab_config = slab_config
         self.packed = packed or pack(scene)
         self._background = np.asarray(scene.info.background_rgb, np.float32)
         self._local = threading.local()
@@ -182,7 +183,7 @@ class CpuRasterizer(Rasterizer):
         found = blocks_in_view(self.packed.spheres, *view, k.width, k.height, near, s.blocks, s.extents)
         blocks = s.blocks[:found]
         tile_depths = NO_OCCLUSION if occlusion_depth is None else _tile_maxima(occlusion_depth, k.width, k.height)
-        if found > SLABS.min_blocks and not at_once:
+        if found > self.slab_config.min_blocks and not at_once:
             self._draw_slabs(camera, s, blocks, s.extents[:found], end_t, tile_depths, images)
         else:
             self._bin(camera, s, blocks, near, np.float32(np.inf), tile_depths, ALL_OPEN)
@@ -212,8 +213,8 @@ class CpuRasterizer(Rasterizer):
         tiles_x, tiles_y = -(-k.width // TILE), -(-k.height // TILE)
         s.states, s.alive = _at_least(s.states, tiles_x * tiles_y * TILE_STATE), np.empty(tiles_x * tiles_y, np.uint32)
         begin(k.width, k.height, s.states, s.alive)
-        close_t = max(end_t, np.float32(SLABS.close_t))
-        for some, near, far in slabs(blocks, extents, self.scene.info.near_plane):
+        close_t = max(end_t, np.float32(self.slab_config.close_t))
+        for some, near, far in slabs(blocks, extents, self.scene.info.near_plane, self.slab_config):
             self._bin(camera, s, some, near, far, tile_depths, open_sums(s.alive.reshape(tiles_y, tiles_x)))
             blend_further(
                 s.records, s.starts, s.entries, k.width, end_t, close_t, s.local, s.lists, s.lengths, s.states, s.alive

@@ -37,7 +37,7 @@ SLABS = SlabConfig()
 
 
 def slabs(
-    blocks: Int32[np.ndarray, "n"], extents: Float32[np.ndarray, "n 2"], near: float, config: SlabConfig = SLABS
+    blocks: Int32[np.ndarray, "n"], extents: Float32[np.ndarray, "n 2"], near: float, config: SlabConfig
 ) -> Iterator[tuple[Int32[np.ndarray, "_"], np.float32, np.float32]]:
     """Yield for each slab the blocks that may reach into it, and the depths between which it is, near to far.
 
