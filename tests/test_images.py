@@ -472,6 +472,18 @@ class TestBrokenPhotos:
         with pytest.raises(InvalidImage, match="truncated"):
             read_query(whole[:-40])
 
+    def test_looking_for_the_end_of_a_jpeg_decodes_no_more_than_the_largest_photo(self, monkeypatch):
+        whole = encoded(Image.fromarray(gradient()), "JPEG")
+        asked = []
+        monkeypatch.setattr(images, "lacks_only_its_end", lambda *_: asked.append(1) or False)
+        monkeypatch.setattr(images.JpegImageFile, "width", 8000)
+        for height, looks in ((2796, 1), (2797, 0)):  # a third of 64 * 1024^2 pixels
+            monkeypatch.setattr(images.JpegImageFile, "height", height)
+            images._open(whole[:-2])
+            images._open(whole[:-2], header_only=True)
+            images._open(whole)
+            assert (len(asked), asked.clear()) == (looks, None)
+
     @pytest.mark.parametrize(
         ("kind", "data"),
         [

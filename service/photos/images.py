@@ -105,7 +105,7 @@ class OpenedPhoto:
 
 
 def open_photo(data: bytes) -> OpenedPhoto:
-    """Read a photo's header; a HEIC is decoded already. Raises InvalidImage."""
+    """Read a photo's header; a HEIC, or a JPEG without an end, is decoded already. Raises InvalidImage."""
     name, image = _open(data)
     return OpenedPhoto(name, image, _identity(image))
 
@@ -255,19 +255,25 @@ def _open(data: bytes, *, header_only: bool = False) -> tuple[str, Image.Image]:
             where="photo",
             hint="Send it smaller: more than about 2 megapixels don't help.",
         )
-    return name, _checked_jpeg(photo, data) if isinstance(photo, JpegImageFile) else photo
+    if not isinstance(photo, JpegImageFile):
+        return name, photo
+    # Three times the pixels: looking for the end of a photo must take no longer than to decode the largest.
+    mends = not header_only and 3 * photo.width * photo.height <= limit
+    return name, _checked_jpeg(photo, data, mends_end=mends)
 
 
-def _checked_jpeg(photo: JpegImageFile, data: bytes) -> JpegImageFile:
-    """Return the JPEG, with an end if nothing but that is missing. Raises InvalidImage if it has too many scans."""
+def _checked_jpeg(photo: JpegImageFile, data: bytes, *, mends_end: bool) -> JpegImageFile:
+    """Return the JPEG, on request with an end if nothing but that is missing, for which it is decoded twice.
+
+    Raises InvalidImage if it has too many scans.
+    """
     scans, has_end = scans_and_end(data)
     if scans > DEFAULTS.max_scans:
         raise InvalidImage(
             f"a JPEG of {scans} scans; the limit is {DEFAULTS.max_scans}.", where="photo", hint="Save it again."
         )
-    if has_end:
-        return photo
-    return JpegImageFile(BytesIO(data + END)) if lacks_only_its_end(data, _pixels_hash) else photo
+    mends_end = mends_end and not has_end and lacks_only_its_end(data, _pixels_hash)
+    return JpegImageFile(BytesIO(data + END)) if mends_end else photo
 
 
 def _pixels_hash(jpeg: bytes) -> bytes:
