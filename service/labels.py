@@ -24,6 +24,7 @@ STAGES = {
     "retrieve_rotated": "Search with the photo turned",
     "retrieve_full_size": "Search with the photo in full size",
     "retrieve_more_views": "Search among further views",
+    "await_index": "Wait for the whole view index",
     "retrieve_free_views": "Search among views from new places",
     "retrieve_by_readings": "Search where the device's readings say",
     "match": "Match with a view",

@@ -141,23 +141,45 @@ class LoadedScene:
 
     def prepare(self, estimator: str) -> Any:
         """Return what the estimator prepares for this scene (e.g. its view index), made once."""
-        make = getattr(ESTIMATORS.load(estimator), "prepare", None)
-        if make is None:
-            return None
+        prepared = self.usable(estimator)
+        if not isinstance(prepared, ViewIndex):
+            return prepared
+        whole = prepared.whole.result() if prepared.whole else prepared
+        with self._lock:
+            if self._prepared[estimator] is not whole:
+                self._keep(estimator, whole)
+        return whole
+
+    def usable(self, estimator: str) -> Any:
+        """Return what the estimator has prepared for this scene by now: of a large index at least its first part, which
+        is made if need be."""
         with self._lock:
             if estimator not in self._prepared:
-                # A seed of its own: what a scene has prepared must not depend on the photo that came first.
-                tools = Tools(self.searched, self.rasterizer, self.matcher, np.random.default_rng(0), None)
-                self._prepared[estimator] = prepared = make(tools, self.cache_dir)
-                if isinstance(prepared, ViewIndex) and prepared.is_cut:
-                    self.warnings += (VIEWS_CUT.format(len(prepared.views)),)
-                # It was read through for the index; from now on the renderer's copy is used.
-                release(self.scene)
-            return self._prepared[estimator]
+                self._make(estimator)
+        return self.prepared(estimator)
+
+    def _make(self, estimator: str) -> None:
+        make = getattr(ESTIMATORS.load(estimator), "prepare", None)
+        if make is None:
+            self._prepared[estimator] = None
+            return
+        # A seed of its own: what a scene has prepared must not depend on the photo that came first.
+        tools = Tools(self.searched, self.rasterizer, self.matcher, np.random.default_rng(0), None)
+        self._keep(estimator, make(tools, self.cache_dir))
+
+    def _keep(self, estimator: str, prepared: Any) -> None:
+        self._prepared[estimator] = prepared
+        if isinstance(prepared, ViewIndex) and prepared.whole:
+            return
+        if isinstance(prepared, ViewIndex) and prepared.is_cut:
+            self.warnings += (VIEWS_CUT.format(len(prepared.views)),)
+        # It was read through for the index; from now on the renderer's copy is used.
+        release(self.scene)
 
     def prepared(self, estimator: str) -> Any:
-        """Return what the estimator has prepared; None as long as it hasn't: nothing is made or waited for."""
-        return self._prepared.get(estimator)
+        """Return what the estimator has prepared by now; None as long as it hasn't: nothing is made or waited for."""
+        prepared = self._prepared.get(estimator)
+        return prepared.latest() if isinstance(prepared, ViewIndex) else prepared
 
     def digest_photos(self, folder: Path, progress: Callable[[int, int], None] | None = None) -> PhotoDigest:
         """Return the digest of the training photos that lie in the scene's folder. Raises SceneNotFound."""
@@ -198,7 +220,7 @@ class LoadedScene:
             return self
         if not has_white_border(query.rgb, query.valid_mask):
             return self
-        index = self.prepare(DEFAULT_ESTIMATOR)
+        index = self.usable(DEFAULT_ESTIMATOR)
         with self._lock:
             # Whether the background shows at all is asked of the views once: a room hides it everywhere.
             if self._over_white is None:

@@ -133,7 +133,18 @@ def localize_in_scene(
     found = estimate_of(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
     )
-    return replace(found, advice=advice)
+    return replace(found, advice=advice, warnings=found.warnings + _of_unfinished_index(tools, trace.records))
+
+
+def _of_unfinished_index(tools: Tools[Any], records: Sequence[IterationRecord]) -> tuple[str, ...]:
+    """Return a warning where only a part of the scene's views was searched."""
+    index = tools.prepared
+    if not isinstance(index, ViewIndex) or index.whole is None or any(r.stage == "await_index" for r in records):
+        return ()
+    return (
+        f"the scene's view index was still being built: {len(index.views)} of {index.whole.planned_views} views were "
+        "searched; places that look like this one may not have been compared. Localize again when it is whole.",
+    )
 
 
 def _tools(query: Query, loaded: LoadedScene, request: Request, tally: RenderTally) -> Tools[Any]:
@@ -144,7 +155,7 @@ def _tools(query: Query, loaded: LoadedScene, request: Request, tally: RenderTal
         loaded.matcher,
         # Of this job alone: jobs that run beside it must not change its numbers.
         np.random.default_rng(request.seed),
-        loaded.prepare(request.estimator),
+        loaded.usable(request.estimator),
         image_matcher=loaded.image_matcher,
         tally=tally,
         surface_points=loaded.photo_digest and loaded.photo_digest.points,
@@ -178,7 +189,7 @@ def _if_captured(verdict: Verdict, query: Query, pose: Pose, tools: Tools[Any]) 
     """Return a verdict for a pose outside of what the index's views saw as `uncertain` for that reason; others as
     they are, also where another reason than that the evidence is poor decided."""
     by_evidence = verdict.status is Status.LOCALIZED or verdict.reason in _REASONS_OF_EVIDENCE
-    views = tools.prepared.views if isinstance(tools.prepared, ViewIndex) else ()
+    views = tools.prepared.latest().views if isinstance(tools.prepared, ViewIndex) else ()
     if verdict.status is Status.NOT_LOCALIZED or not by_evidence:
         return verdict
     if not is_outside(query.intrinsics, pose, tools.rasterizer, views):

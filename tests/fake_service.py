@@ -360,6 +360,7 @@ class FakeService:
             sh_degree=0,
             cameras=len(self.scene.cameras),
             memory_bytes=self.scene.nbytes,
+            index=None,
             jobs=0,
             uploaded=False,
             error=None,

@@ -19,7 +19,8 @@ from service.pose.features.image_sizes import sized
 from service.pose.features.rendered_views import ViewRenderer, camera_of, to_uint8
 from service.pose.features.scene_focus import focus_of_scene
 from service.pose.retrieval.free_views import free_view_cameras
-from service.pose.retrieval.index import ViewIndex, built_index
+from service.pose.retrieval.index import ViewIndex
+from service.pose.retrieval.index_builder import IndexBuilder
 from service.render.cpu import CpuRasterizer
 from service.render.render_counter import Counted
 from service.scene_formats import load_scene
@@ -57,7 +58,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> GaussianScene:
 @pytest.fixture(scope="module")
 def index(scene: GaussianScene) -> ViewIndex:
     cameras = [Camera(LENS, named.camera.pose) for named in scene.cameras[:8]]
-    return built_index(cameras, tools_of(CpuRasterizer(scene)))
+    return IndexBuilder(cameras, tools_of(CpuRasterizer(scene))).whole()
 
 
 def tools_of(rasterizer: Rasterizer, prepared: object = None) -> Tools:
@@ -72,7 +73,7 @@ def query_of(scene: GaussianScene, **options) -> Query:
 
 def test_an_index_is_rendered_in_batches(scene, index):
     batched = InBatches(scene)
-    again = built_index([view.camera for view in index.views], tools_of(batched))
+    again = IndexBuilder([view.camera for view in index.views], tools_of(batched)).whole()
     assert batched.calls[:2] == [6, 2]
     for a, b in zip(index.views, again.views, strict=True):
         assert np.array_equal(a.features.descriptors, b.features.descriptors)

@@ -23,7 +23,7 @@ from service.multi_scene import localize_in_scenes
 from service.pose.descent.gradient_descent import loss_and_gradient
 from service.pose.descent.losses import LOSSES, loss_against
 from service.pose.features.rendered_views import to_uint8
-from service.pose.retrieval.index import prepared_index
+from service.pose.retrieval.stored_index import prepared_index
 from service.pose.retrieval.view_placement import PlacementConfig
 from service.pose.retrieval.viewpoints import ViewpointConfig
 from service.render.render_counter import Counted

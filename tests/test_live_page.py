@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from api_server import until
 from axe_playwright_python.sync_playwright import Axe
-from browsing import HTTP, NEEDS_CHROMIUM, launched, opened, served
+from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
 from gateway import free_port
 from playwright.sync_api import Browser, Page, expect
 from small_room import FOCAL, pose_at, write_room
@@ -78,9 +79,12 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
     page.get_by_role("button", name="Start camera").click()
     expect(page.locator(".verdict .badge")).to_have_text("Localized")
     expect(page.locator(".stack .above")).to_be_visible()
-    page.wait_for_timeout(3000)
-    localized = [answer for answer in answers if answer.get("status") == "localized"]
-    assert len(localized) > 10
+    localized: list[dict] = []
+    deadline = time.monotonic() + PATIENCE_MS / 1000
+    while len(localized) <= 10:
+        assert time.monotonic() < deadline, f"{len(localized)} of {len(answers)} answers are localized"
+        page.wait_for_timeout(200)  # events come meanwhile
+        localized = [answer for answer in answers if answer.get("status") == "localized"]
     truth = walk()
     for answer in localized:
         pose = Pose(np.array(answer["world_from_camera"]))

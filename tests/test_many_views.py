@@ -86,7 +86,7 @@ def test_a_scene_says_that_its_index_was_cut(monkeypatch: pytest.MonkeyPatch) ->
     assert [few.cuts(7, 8), few.cuts(7, 7), few.cuts(6, 8), few.cuts(7, 0)] == [True, False, False, False]
     monkeypatch.setattr(loaded_scene, "ViewIndex", SimpleNamespace)
     monkeypatch.setattr(loaded_scene, "release", lambda _: None)
-    indexes = [SimpleNamespace(views=[0] * 7, is_cut=is_cut) for is_cut in (True, False)]
+    indexes = [SimpleNamespace(views=[0] * 7, is_cut=is_cut, whole=None) for is_cut in (True, False)]
     estimator = SimpleNamespace(prepare=lambda *_: indexes.pop(0))
     monkeypatch.setattr(loaded_scene.ESTIMATORS, "load", lambda _: estimator)
     scenes = [LoadedScene(*[SimpleNamespace()] * 3) for _ in indexes]  # type: ignore[arg-type]

@@ -723,6 +723,24 @@ def test_the_rest_of_a_batch_is_cancelled_while_its_scene_is_prepared(page: Page
     assert sorted(cancelled) == ["a", "b"]
 
 
+def test_a_scene_card_shows_how_far_the_view_index_is(page: Page, url: str) -> None:
+    """The service's answers are altered: its scenes are small, and their indexes whole at once."""
+    listed = HTTP.get(f"{url}/scenes").json()
+    studio = next(scene for scene in listed["scenes"] if scene["id"] == "studio")
+    studio["index"] = {"views": 256, "planned_views": 1503}
+    page.route(f"{url}/scenes", lambda route: route.fulfill(json=listed))
+    page.goto(f"{url}/#/")
+    page.reload()
+    card = page.locator(".card").filter(has_text="Studio")
+    expect(card).to_contain_text("View index: 256 of 1,503 views")
+    expect(card.get_by_role("progressbar", name="View index of Studio")).to_have_attribute("value", "256")
+    assert not serious(page)
+    # It is asked for again until it is whole.
+    studio["index"]["views"] = 1503
+    expect(card).not_to_contain_text("View index")
+    expect(card.get_by_role("progressbar")).to_have_count(0)
+
+
 def _saved(page: Page, name: str) -> bytes:
     with page.expect_download() as waited:
         page.get_by_role("button", name=name).click()
@@ -855,11 +873,13 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
         asked: dict = {"files": {"photo": PHOTO.read_bytes()}}
         asked |= {"headers": {"Authorization": f"Bearer {key}"}} if key else {}
         job = HTTP.post(f"{url}/localize", data=slow, timeout=90, **asked).json()
+        began = time.monotonic()
         page.goto(f"{url}/#/jobs/{job['id']}")
         expect(page.locator(".line")).to_contain_text("step ")
         viewer.bring_to_front()
         viewer.goto(f"{url}/viewer/jobs/{job['id']}/")
         viewer.get_by_text("running", exact=True).wait_for(timeout=PATIENCE_MS)
+        opened_s = time.monotonic() - began
         viewer.evaluate("window.old = true")
     lost = page.get_by_role("alert")
     expect(lost).to_contain_text("Reconnecting")
@@ -874,7 +894,8 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
         page.bring_to_front()
         expect(lost).to_be_hidden()
         expect(page.locator(".line")).to_contain_text("step ")
-        assert time.monotonic() - ready < 5
+        # Machines that draw slowly need longer to open both at all.
+        assert time.monotonic() - ready < max(5, opened_s)
         stages = page.locator(".stages li").all_inner_texts()
         assert len(stages) == len(set(stages))
         page.get_by_role("button", name="Cancel").click()

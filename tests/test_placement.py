@@ -13,7 +13,7 @@ from service.geometry import look_at
 from service.interfaces import Frame, Tools
 from service.matchers import MATCHERS
 from service.pose.retrieval.free_space import _steps_in_the_clear, fibonacci_directions, free_space_of
-from service.pose.retrieval.index import built_index
+from service.pose.retrieval.index_builder import IndexBuilder
 from service.pose.retrieval.lod_proxy import LOD, LodConfig, OccludedRenderer, lod_proxy, occlusion_depths
 from service.pose.retrieval.view_placement import (
     PlacementConfig,
@@ -296,7 +296,7 @@ def test_views_of_a_large_scene_show_all_that_is_seen_but_not_what_walls_hide() 
     camera = Camera(search_camera(160), look_at(eye, eye + np.array([1.0, 0.1, -0.1]), up))
     watched, alone = Watched(scene), CpuRasterizer(room)
     tools = Tools(scene, watched, MATCHERS.load("sift").create(), np.random.default_rng(0), None)
-    built_index([camera], tools, LodConfig(proxy_gaussians=20_000, min_gaussians=30_000))
+    IndexBuilder([camera], tools, LodConfig(proxy_gaussians=20_000, min_gaussians=30_000)).whole()
     ((rgb, drawn),) = watched.drawn
     truth = alone.render([camera])[0].rgb
     visible = alone._scratch().visible

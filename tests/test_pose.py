@@ -20,9 +20,10 @@ from service.pose.features.query_images import QueryImages
 from service.pose.features.rendered_views import ViewRenderer, backprojected, to_uint8
 from service.pose.matching.correspondences import correspondences
 from service.pose.refinement.photometric import refine_photometric
-from service.pose.retrieval import index as index_module
-from service.pose.retrieval.index import built_index, prepared_index
+from service.pose.retrieval import stored_index
+from service.pose.retrieval.index_builder import IndexBuilder
 from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.stored_index import prepared_index
 from service.pose.retrieval.viewpoints import ViewpointConfig, choose_spread_poses, farthest_points
 from service.pose.verification.appearance import (
     BlockStatistics,
@@ -633,7 +634,7 @@ def test_an_index_of_other_values_or_another_rasterizer_has_another_cache(
     others += [replace(SMALL, placement=replace(SMALL.placement, max_views=9))]
     assert [prepare(config) for config in (SMALL, *others, SMALL)] == [1, 2, 3, 4, 4]
     assert prepare(SMALL, OtherWalls()) == 5
-    monkeypatch.setattr(index_module, "LOD", replace(index_module.LOD, opaque_alpha=0.8))
+    monkeypatch.setattr(stored_index, "LOD", replace(stored_index.LOD, opaque_alpha=0.8))
     assert prepare(SMALL) == 6
 
 
@@ -642,7 +643,7 @@ def test_an_index_of_a_scene_without_features_is_empty_but_there() -> None:
         def render(self, cameras: Sequence[Camera], **options: object) -> list[Frame]:
             return [Frame(np.full_like(f.rgb, 0.5), f.alpha, f.depth, f.depth) for f in super().render(cameras)]
 
-    index = built_index([Camera(LENS, true_pose())], tools_for(Fog()))
+    index = IndexBuilder([Camera(LENS, true_pose())], tools_for(Fog())).whole()
     assert len(index.views) == 1
     assert len(index.views[0].points_in_world) == 0
     none = np.zeros((0, 27), np.float32)

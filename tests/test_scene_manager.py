@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,15 +42,23 @@ class Loaded:
     """A scene in memory; what is torn can't be loaded."""
 
     def __init__(self, path: Path) -> None:
-        self.name, self.nbytes, self.prepared = path.name, SIZE, []
+        self.name, self.nbytes, self.made = path.name, SIZE, []
+        self.warnings, self.grows = (), lambda: None
         self.rasterizer, self.skipped_rasterizers = SimpleNamespace(name="cpu"), ""
         info = SimpleNamespace(origin_in_world=(10.0, 0.0, 0.0))
         self.scene = SimpleNamespace(
             info=info, count=3, sh_degree=2, cameras=(), means=np.arange(303.0).reshape(101, 3)
         )
 
+    def usable(self, estimator: str) -> None:
+        self.made.append(("a part", estimator))
+
     def prepare(self, estimator: str) -> None:
-        self.prepared.append(estimator)
+        self.grows()
+        self.made.append(("all", estimator))
+
+    def prepared(self, estimator: str) -> None:
+        return None
 
 
 class Manager:
@@ -58,6 +67,7 @@ class Manager:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, names: str, memory: int | None, **options: Any) -> None:
         self.clock, self.loads, self.warmed, self.evicted = Clock(), [], [], []
         self.sizes: dict[str, int] = {}
+        self.grows: Callable[[], None] = lambda: None
         monkeypatch.setattr(module, "time", self.clock)
         monkeypatch.setattr(entry_module, "time", self.clock)
         monkeypatch.setattr(entry_module, "estimated_bytes", lambda path: SIZE)
@@ -75,6 +85,7 @@ class Manager:
         if path.name == "bug":
             raise ValueError("a bug")
         loaded = Loaded(path)
+        loaded.grows = self.grows
         loaded.nbytes = self.sizes.get(path.name, SIZE)
         return loaded
 
@@ -125,7 +136,7 @@ def test_a_scene_is_loaded_when_it_is_asked_for_and_prepared_once(make):
     assert of.work() == ["a"]
     assert of.states() == {"a": "ready", "b": "unloaded", "c": "unloaded"}
     loaded = of.scenes.get("a")
-    assert loaded.prepared == ["view_index"]
+    assert loaded.made == [("a part", "view_index"), ("all", "view_index")]
     assert of.warmed == [("a", "view_index")]
     assert of.evicted == [(Path("/cache"), 7)]
     assert of.entry("a").measured_bytes == SIZE
@@ -380,6 +391,62 @@ def test_a_scene_that_was_unloaded_while_it_was_loaded_goes(make, monkeypatch):
     monkeypatch.setattr(module, "warm_up", lambda loaded, estimator: setattr(of.entry("a"), "wanted", False))
     of.work()
     assert (of.states()["a"], of.entry("a").loaded) == ("unloaded", None)
+
+
+def test_a_scene_is_ready_and_stays_while_its_index_grows(make):
+    """Jobs use it, none of them, nor memory that another scene needs, drops it before it is whole."""
+    of = make("ab", memory=SIZE)
+    a, seen = of.entry("a"), []
+
+    def while_it_grows() -> None:
+        of.grows = lambda: None
+        assert of.scenes.readiness().ready
+        held = of.scenes.acquire("a")
+        of.scenes.release(held.scenes)
+        with pytest.raises(SceneNotReady):
+            of.scenes.get("b")
+        assert not of.scenes._makes_room(of.entry("b"))
+        seen.append((a.state, a.is_idle, a.loaded is not None))
+
+    of.grows = while_it_grows
+    a.required = True
+    with pytest.raises(SceneNotReady):
+        of.scenes.get("a")
+    assert of.work() == ["a", "b"]
+    assert seen[0] == ("ready", False, True)
+    assert of.states() == {"a": "unloaded", "b": "ready"}  # it went once it was whole
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_scene_that_is_unloaded_while_its_index_grows_goes_when_that_is_whole(make, again):
+    of = make("a")
+    entry, states = of.entry("a"), []
+
+    def unload() -> None:
+        of.scenes.unload(entry)
+        states.append((entry.state, entry.loaded is not None))
+        if again:
+            of.scenes.load(entry)
+
+    of.grows = unload
+    with pytest.raises(SceneNotReady):
+        of.scenes.get("a")
+    of.work()
+    assert states == [("unloading", True)]
+    assert (entry.state, entry.loaded is not None) == (("ready", True) if again else ("unloaded", False))
+
+
+def test_a_scene_whose_index_can_not_be_built_has_failed(make):
+    of = make("a")
+
+    def fail() -> None:
+        raise MemoryError("full")
+
+    of.grows = fail
+    with pytest.raises(SceneNotReady):
+        of.scenes.get("a")
+    of.work()
+    assert (of.states()["a"], of.entry("a").is_growing) == ("failed", False)
 
 
 def test_entries_tell_what_they_are(make):

@@ -155,6 +155,7 @@ class FakeRetrieval:
 
     def __init__(self, rotations: dict[int, int] | None = None, upright: bool = True) -> None:
         self.rotations, self.upright = rotations or {}, upright
+        self.index = SimpleNamespace(whole=None)
 
     def upright_variant(self) -> ImageVariant:
         return ImageVariant(400)

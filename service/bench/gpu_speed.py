@@ -14,7 +14,7 @@ from service.bench.gpu_runner import Row
 from service.bench.gpu_shared import Shared
 from service.interfaces import Tools
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
-from service.pose.retrieval.index import prepared_index
+from service.pose.retrieval.stored_index import prepared_index
 
 
 def latency(shared: Shared) -> Iterator[Row]:

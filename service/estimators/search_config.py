@@ -76,6 +76,8 @@ class SearchConfig:
     """Matches with a render at the answer with which lens models are fitted."""
     fisheye_doubts: tuple[Reason, ...] = (Reason.FOCAL_UNCERTAIN, Reason.POSITION_UNCERTAIN, Reason.OUTSIDE_PRIOR)
     """Doubts that don't speak against a fisheye's answer."""
+    index_wait_s: float = 0.5
+    """While the index is built: the time between two records of a job that waits for the whole of it."""
     ambiguity_photo_px: int = 256
     """Long side of the photo in which other poses are looked for where a prior pose led to the answer."""
     min_repeated_colour: float = 0.9

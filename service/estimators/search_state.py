@@ -102,6 +102,11 @@ class SearchState:
         retrieval = Retrieval(images, tools.prepared, config.retrieval)
         return cls(tools, images, ViewRenderer(tools.rasterizer), retrieval, config)
 
+    def search_in(self, index: ViewIndex) -> None:
+        """Search in this index from now on."""
+        self.tools = replace(self.tools, prepared=index)
+        self.retrieval = Retrieval(self.images, index, self.config.retrieval)
+
     def verify(
         self,
         found: RefinedPose,

@@ -53,8 +53,9 @@ from service.pose.matching.match_stages import match_candidates, record_of, rend
 from service.pose.matching.render_and_match import render_and_match
 from service.pose.refinement.refine_stage import refine_stage, rematch_and_refine
 from service.pose.retrieval.image_variant import ImageVariant, Retrieval
-from service.pose.retrieval.index import ViewIndex, prepared_index
+from service.pose.retrieval.index import ViewIndex, WholeIndex
 from service.pose.retrieval.scores import top_indices
+from service.pose.retrieval.stored_index import prepared_index
 from service.results import Candidates, IterationRecord, Status
 from service.types import Camera, Query
 
@@ -79,7 +80,7 @@ class Options:
 
 
 def prepare(tools: Tools[None], cache_dir: Path | None) -> ViewIndex:
-    """Make the scene's view index, or read it from the cache: once, 1 to 4 CPU seconds, more for large scenes."""
+    """Make the scene's view index, or read it from the cache: once, in 1 to 4 CPU seconds; or its first part."""
     return prepared_index(tools, cache_dir)
 
 
@@ -102,6 +103,21 @@ def run(
             if query.region is None:  # a prior pose doesn't decide between places that look alike
                 yield from check_ambiguity(state)
             return state.answer()
+    yield from _search(state, options)
+    whole = state.tools.prepared.whole
+    if not state.finished and whole:
+        yield from _await_index(state, whole)
+        yield from _search(state, options)
+    yield from _check_readings(state, options)
+    state = yield from check_lens(state)
+    state = yield from check_shutter(state)
+    yield from refine_by_patches(state)
+    yield from changed(_doubts(state), state.with_answer)
+    return state.answer()
+
+
+def _search(state: SearchState, options: Options) -> Generator[IterationRecord, None, None]:
+    """Run the stages of the search until one ends it."""
     # A generator: a later stage is prepared only if the earlier ones failed.
     for stage in _search_stages(state, options):
         yield from run_stage(state, stage)
@@ -109,12 +125,16 @@ def run(
             yield from run_stage(state, replace(stage, records=_rematch(state.unmatched, state)))
         if state.finished:
             break
-    yield from _check_readings(state, options)
-    state = yield from check_lens(state)
-    state = yield from check_shutter(state)
-    yield from refine_by_patches(state)
-    yield from changed(_doubts(state), state.with_answer)
-    return state.answer()
+
+
+def _await_index(state: SearchState, whole: WholeIndex) -> Generator[IterationRecord, None, None]:
+    """Wait until the index has all of its views, and search among these from then on."""
+    first = state.tools.prepared.views[0].camera.pose
+    # A record each time: between two a job may be cancelled, or its budget end.
+    while (index := whole.result(state.config.index_wait_s)) is None:
+        yield state.with_answer(IterationRecord("await_index", first))
+    yield state.with_answer(IterationRecord("await_index", first))
+    state.search_in(index)
 
 
 def _check_readings(state: SearchState, options: Options) -> Generator[IterationRecord, None, None]:
@@ -150,7 +170,7 @@ def _doubts(state: SearchState) -> Generator[IterationRecord, None, None]:
 
 
 def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
-    """Yield the stages of the search, cheapest first."""
+    """Yield the stages of the search, cheapest first; in a part of an index those that only compare its views."""
     config, retrieval = state.config, state.retrieval
     has_cameras = bool(state.tools.scene.cameras)
     # Views that the scene itself placed are as near as its detail requires, whatever their focal length.
@@ -176,7 +196,7 @@ def _search_stages(state: SearchState, options: Options) -> Iterator[Stage]:
     # A stage ends early where matches or refinement fail; the next goes on with the other views.
     while untried:
         yield Stage(_search_views("retrieve_more_views", variant, untried, state), variant)
-    if options.effort == "fast":
+    if options.effort == "fast" or retrieval.index.whole:
         return
     yield from _free_view_stages(upright, state)
     if options.effort == "normal" and not state.recognised:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from service.errors import Failure
-from service.loaded_scene import LoadedScene
+from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
+from service.pose.retrieval.index import ViewIndex
 from service.scene_formats.remote_scene import RemoteScene
 from service.scene_formats.size_estimate import estimated_bytes
-from service.scene_manager.status import MAX_RETRY_S, RETRY_S, SceneContents, SceneState, SceneStatus
+from service.scene_manager.status import MAX_RETRY_S, RETRY_S, IndexStatus, SceneContents, SceneState, SceneStatus
 from service.scene_origin import shifted_camera
 
 
@@ -38,6 +39,8 @@ class Entry:
     """Its files have changed: it is loaded again as soon as no job uses it."""
     awaited: bool = True
     """Of a required scene: whether it has neither been loaded nor failed to yet."""
+    is_growing: bool = False
+    """It is ready, and its view index is still being built: until it is whole it stays in memory."""
     jobs: int = 0
     """That use it, waiting or running: while there are any it stays."""
     used: float = 0.0
@@ -52,7 +55,7 @@ class Entry:
     @property
     def is_idle(self) -> bool:
         """Whether it is in memory and may be dropped; a scene without a file could not be loaded again."""
-        return self.state == "ready" and not self.jobs and self.path is not None
+        return self.state == "ready" and not self.jobs and not self.is_growing and self.path is not None
 
     @property
     def is_due(self) -> bool:
@@ -98,6 +101,8 @@ class Entry:
             sh_degree=scene.sh_degree,
             cameras=len(scene.cameras),
             memory_bytes=loaded.nbytes,
+            index=_index_status(loaded.prepared(DEFAULT_ESTIMATOR)),
+            warnings=loaded.warnings,
         )
 
     def contents(self) -> SceneContents | None:
@@ -109,3 +114,10 @@ class Entry:
         # Quantiles: floaters far outside would make the box useless.
         bounds = np.quantile(scene.means, [0.01, 0.99], axis=0) + origin if scene.count else None
         return SceneContents(tuple(shifted_camera(named, origin) for named in scene.cameras), bounds)
+
+
+def _index_status(index: ViewIndex | None) -> IndexStatus | None:
+    if index is None:
+        return None
+    views = len(index.views)
+    return IndexStatus(views, index.whole.planned_views if index.whole else views)

@@ -236,10 +236,14 @@ class Scenes:
                 # By identity: the scene of that name may have been replaced meanwhile.
                 if any(entry.loaded is loaded for loaded in held):
                     entry.jobs -= 1
-                    if entry.state == "unloading" and not entry.jobs:
-                        entry.drop()
-                    self._reload_outdated(entry)
+                    self._drop_or_reload(entry)
             self._lock.notify_all()
+
+    def _drop_or_reload(self, entry: Entry) -> None:
+        """Do with a scene that is no longer used what was asked for meanwhile."""
+        if entry.state == "unloading":
+            self._unload(entry)
+        self._reload_outdated(entry)
 
     def _reload(self, entry: Entry) -> None:
         """Load a scene again whose files have changed, once no job uses it."""
@@ -275,7 +279,7 @@ class Scenes:
     def _unload(self, entry: Entry) -> None:
         if entry.state == "ready":
             entry.state = "unloading"
-        if entry.state == "unloading" and not entry.jobs:
+        if entry.state == "unloading" and not entry.jobs and not entry.is_growing:
             entry.drop()
 
     def readiness(self) -> SceneReadiness:
@@ -381,17 +385,31 @@ class Scenes:
                 entry.loaded, entry.state = loaded, "preparing"
             self._settle()
         if entry.loaded is not None and not self._stop.is_set():
-            entry.loaded.prepare(self._estimator)
+            entry.loaded.usable(self._estimator)
             # Compiles and loads what the first photo would wait for.
             warm_up(entry.loaded, self._estimator)
-            if self._cache_dir and self._cache_bytes is not None:
-                evict(self._cache_dir, self._cache_bytes)
         with self._lock:
             entry.state, entry.failures = "ready", 0
+            entry.awaited, entry.is_growing = False, entry.wanted
             if not entry.wanted:
                 self._unload(entry)  # as was asked for in the meantime
             self._lock.notify_all()
+        if entry.is_growing:
+            self._grow(entry)
         self._camera_frames.consider(entry)
+
+    def _grow(self, entry: Entry) -> None:
+        """Build the rest of a scene's view index while jobs use its first part."""
+        try:
+            if entry.loaded is not None and not self._stop.is_set():
+                entry.loaded.prepare(self._estimator)
+        finally:
+            with self._lock:
+                entry.is_growing = False
+                self._drop_or_reload(entry)
+                self._lock.notify_all()
+        if self._cache_dir and self._cache_bytes is not None:
+            evict(self._cache_dir, self._cache_bytes)
 
     def _settle(self) -> None:
         """Give scenes to those who have waited for them, in their order."""

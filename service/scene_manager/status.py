@@ -37,6 +37,16 @@ class StoredScene:
 
 
 @dataclass(frozen=True, slots=True)
+class IndexStatus:
+    """How far a scene's view index is built."""
+
+    views: int
+    """That photos are compared with now."""
+    planned_views: int
+    """That it will have; then photos of every part of the scene are found."""
+
+
+@dataclass(frozen=True, slots=True)
 class SceneStatus:
     """One scene and how far loading it has come."""
 
@@ -55,6 +65,10 @@ class SceneStatus:
     cameras: int | None = None
     """Number of training cameras."""
     memory_bytes: int | None = None
+    index: IndexStatus | None = None
+    """None until there is a first part of it."""
+    warnings: tuple[str, ...] = ()
+    """Of how it is rendered and searched, beside those of its files."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,7 @@ def warm_up(loaded: LoadedScene, estimator: str) -> None:
 
 def _camera(loaded: LoadedScene, estimator: str) -> Camera:
     """Return the indexed view with the most features, from which a photo is found at once; else an overview."""
-    camera = _richest_view(loaded.prepare(estimator))
+    camera = _richest_view(loaded.usable(estimator))
     return overview(loaded, WARM_UP_PX) if camera is None else _sized(camera, WARM_UP_PX)
 
 

@@ -29,7 +29,7 @@ from service.web.schemas.conversion import (
 )
 from service.web.schemas.job_spec import needs_prior, options_adapter
 from service.web.schemas.jobs import JobLinks, JobOut, JobSummary, PhotoOut, Trace
-from service.web.schemas.scenes import SceneLinks, SceneOut, SceneSummary
+from service.web.schemas.scenes import IndexOut, SceneLinks, SceneOut, SceneSummary
 from service.web.schemas.system import Capabilities, Capability, EstimatorCapability
 from service.web.settings import Settings
 
@@ -127,7 +127,7 @@ def scene_out(scene: SceneStatus, contents: SceneContents | None, root: str) -> 
         render_mode=info and info.render_mode,
         bounds_in_world=None if bounds is None else bounds.tolist(),
         frames=[scene_frame_out(frame) for frame in info.frames] if info else [],
-        warnings=list(info.warnings) if info else [],
+        warnings=[*(info.warnings if info else ()), *scene.warnings],
         training_cameras=[named_camera_out(c) for c in contents.cameras] if contents else [],
     )
 
@@ -142,6 +142,7 @@ def _scene(scene: SceneStatus, root: str) -> dict:
         "sh_degree": scene.sh_degree,
         "cameras": scene.cameras,
         "memory_bytes": scene.memory_bytes,
+        "index": scene.index and IndexOut(views=scene.index.views, planned_views=scene.index.planned_views),
         "jobs": scene.jobs,
         "uploaded": scene.uploaded,
         "error": scene.failure and problem_of_failure(scene.failure, self),

@@ -16,6 +16,15 @@ class SceneLinks(Model):
     thumbnail: str
 
 
+class IndexOut(Model):
+    """How far a scene's view index is built. Photos are localized by what there is of it."""
+
+    views: int
+    """That photos are compared with now."""
+    planned_views: int
+    """That it will have."""
+
+
 class SceneSummary(Model):
     """A scene as in the list of scenes."""
 
@@ -29,6 +38,8 @@ class SceneSummary(Model):
     cameras: int | None
     """Number of training cameras."""
     memory_bytes: int | None
+    index: IndexOut | None
+    """Null until there is a first part of it."""
     jobs: int
     """Number of queued and running jobs on the scene."""
     uploaded: bool

@@ -27,7 +27,8 @@
  * @typedef {{index: number, stage: string, elapsed_s: number, world_from_camera: number[][],
  *   frame: Frame | null}} Step
  * @typedef {{id: string, name: string, state: string, uploaded: boolean, gaussians: number | null,
- *   cameras: number | null, memory_bytes: number | null, error: Problem | null, links: Record<string, string>}} Scene
+ *   cameras: number | null, memory_bytes: number | null, index: {views: number, planned_views: number} | null,
+ *   error: Problem | null, links: Record<string, string>}} Scene
  * @typedef {{name: string, position: number[]}} Anchor
  * @typedef {{name: string | null, role: "read" | "localize" | "admin", scenes: string[] | null, rate: string | null,
  *   queue_share: number | null, expires: string | null}} OwnKey

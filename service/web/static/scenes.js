@@ -14,6 +14,16 @@ export function isScene(file) {
   return SCENE_FILE.test(file.name ?? "");
 }
 
+/** Tell whether a scene's view index is still being built. */
+function isGrowing({ index }) {
+  return index !== null && index.views < index.planned_views;
+}
+
+function indexProgress({ name, index: { views, planned_views: planned } }) {
+  return [h("span", { class: "quiet" }, `View index: ${count(views)} of ${count(planned)} views`),
+    h("progress", { "aria-label": `View index of ${name}`, value: views, max: planned })];
+}
+
 /**
  * The list of scenes. `chosen` returns the id of the chosen scene; `onChoose` gets the id that is chosen now, the scenes,
  * and whether the user chose it; `onError` gets what a button or an upload failed with.
@@ -38,7 +48,7 @@ export class SceneList {
     try {
       const scenes = await service.scenes();
       if (this.stopped) return;
-      busy = scenes.some(scene => BUSY.includes(scene.state));
+      busy = scenes.some(scene => BUSY.includes(scene.state) || isGrowing(scene));
       this.#draw(scenes);
     } catch (error) {
       if (this.stopped || error.status === 401) return;
@@ -86,6 +96,7 @@ export class SceneList {
         scene.state === "ready" ? null : h("span", { "data-busy": busy ? scene.id : null, "data-state": scene.state }, busy ? this.#busy(scene.id, scene.state) : sentence(scene.state)),
         h("span", { class: "quiet" }, scene.error ? `${scene.error.detail} ${scene.error.hint}` : facts)),
       busy ? h("progress", { "aria-label": `${scene.name} is ${scene.state}` }) : null,
+      ...(isGrowing(scene) ? indexProgress(scene) : []),
       h("p", { class: "actions" }, this.#actions(scene)));
   }
 
