@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import partialmethod
 from pathlib import Path
@@ -122,12 +121,12 @@ def test_where_building_fails_the_next_one_who_needs_the_index_builds_it() -> No
 
 
 @pytest.fixture
-def growing(room: LoadedScene, monkeypatch: pytest.MonkeyPatch) -> Iterator[LoadedScene]:
+def growing(room: LoadedScene, monkeypatch: pytest.MonkeyPatch) -> LoadedScene:
     """The room with the first two views of its index."""
     monkeypatch.setattr(IndexBuilder, "first_part", partialmethod(IndexBuilder.first_part, config=PARTS))
     loaded = LoadedScene.of(room.scene)
     assert len(loaded.usable(DEFAULT_ESTIMATOR).views) == 2
-    yield loaded
+    return loaded
 
 
 def photo_at(room: LoadedScene, pose: Pose) -> Query:
