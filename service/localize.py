@@ -40,6 +40,7 @@ from service.pose.verification.search_summary import search_summary
 from service.readings_in_scene import contradictions, fused, scene_priors
 from service.registration.registration import Registration
 from service.render.render_counter import Counted
+from service.result_warnings import cautions, of_unfinished_index
 from service.results import IterationRecord, PoseEstimate, Reason, StageTiming, Status, Verdict
 from service.scene_formats.manifest import told_by_manifest
 from service.scene_origin import estimate_in_world, query_in_scene, record_in_world
@@ -133,18 +134,7 @@ def localize_in_scene(
     found = estimate_of(
         query, loaded, request, verdict, trace.records, timings=timings, renders=renders, exhausted=trace.exhausted
     )
-    return replace(found, advice=advice, warnings=found.warnings + _of_unfinished_index(tools, trace.records))
-
-
-def _of_unfinished_index(tools: Tools[Any], records: Sequence[IterationRecord]) -> tuple[str, ...]:
-    """Return a warning where only a part of the scene's views was searched."""
-    index = tools.prepared
-    if not isinstance(index, ViewIndex) or index.whole is None or any(r.stage == "await_index" for r in records):
-        return ()
-    return (
-        f"the scene's view index was still being built: {len(index.views)} of {index.whole.planned_views} views were "
-        "searched; places that look like this one may not have been compared. Localize again when it is whole.",
-    )
+    return replace(found, advice=advice, warnings=found.warnings + of_unfinished_index(tools.prepared, trace.records))
 
 
 def _tools(query: Query, loaded: LoadedScene, request: Request, tally: RenderTally) -> Tools[Any]:
@@ -296,7 +286,7 @@ def estimate_of(
         + info.warnings
         + loaded.warnings
         + _assumptions(query, loaded)
-        + _cautions(query, verdict),
+        + cautions(query, verdict),
         records=tuple(records),
         frames=info.frames,
         search_summary=search_summary(records, verdict),
@@ -341,28 +331,6 @@ def _assumptions(query: Query, loaded: LoadedScene) -> tuple[str, ...]:
         f"the size of the photos that the scene was trained with is unknown: {assumed} px is assumed, which can shift "
         "the pose a little; " + told_by_manifest('"training_size": [width, height]') + ".",
     )
-
-
-def _cautions(query: Query, verdict: Verdict) -> tuple[str, ...]:
-    """Return warnings of what the photo shows of its camera."""
-    cautions = []
-    if query.intrinsics_source == "fisheye":
-        cautions.append(
-            "the photo's lens is a fisheye, not what was sent or assumed: its intrinsics were estimated with the pose. "
-            "Send them with camera model and distortion for an exact pose."
-        )
-    if verdict.intrinsics_untested:
-        cautions.append(
-            "the intrinsics could not be verified by the photo: a focal length that is 1 % off moves the camera by "
-            "about 1 % of its distance, which the covariance allows for."
-        )
-    if verdict.shutter_motion:
-        shear, stretch = verdict.shutter_motion
-        cautions.append(
-            f"the camera turned while the photo was read row by row (rolling shutter: shear {shear:+.3f}, stretch "
-            f"{stretch:+.3f}); the pose is that of the middle row. Hold the camera still for a more exact one."
-        )
-    return tuple(cautions)
 
 
 def _exhausted(request: Request, clock: Clock, tally: RenderTally) -> bool:

@@ -29,7 +29,7 @@ FLOORS = {
         {"interfaces", "geometry", "geodesy", "jit", "photos", "scene_origin", "device_memory"}
         | {"object_store", "s3_objects"},
         {"scene_formats", "render", "matchers", "pose", "lenses"},
-        {"estimators", "registration", "searched_scene"},
+        {"estimators", "registration", "searched_scene", "result_warnings"},
         {"localize", "loaded_scene", "readings_in_scene"},
         {"tracking", "smoothing", "multi_scene", "coverage", "rig"},
         {"scene_manager", "live"},
