@@ -193,6 +193,9 @@ def test_scenes_are_listed_and_inspected(splatfix, room, tmp_path):
     assert bare["floaters"] == {"found": 0, "veil": 0.0, "left_out": False}
     assert facts["floaters"] == "none"
     assert "training size is unknown" in " ".join(bare["warnings"])
+    code, told, _ = splatfix("scenes", "convert", room, tmp_path / "again")
+    wanted = f"{bare['gaussians']} Gaussians, SH degree 0, 24 training cameras: {tmp_path / 'again'}\n"
+    assert (code, told) == (0, wanted)
 
 
 def test_a_photo_that_cannot_be_read_keeps_no_other_from_its_result(splatfix, room, photo, tmp_path):
@@ -244,6 +247,7 @@ def test_what_a_user_can_mend_is_one_line_and_exit_code_2(splatfix, room, photo,
         (("render", "--scene", room, "--pose", pose, "--out", tmp_path / "a.png"), "not a rotation"),
         (("render", "--scene", room, "--pose", "{}", "--out", tmp_path / "a.gif"), ".png"),
         (("scenes", "list", tmp_path / "none"), "none"),
+        (("scenes", "convert", room, tmp_path), "is there already"),
         (("serve", tmp_path / "none", "--port", 0), "none"),
     ]
     for arguments, expected in bad:

@@ -25,6 +25,7 @@ from service.interfaces import Rasterizer
 from service.pose.descent.contribution_pruning import contributions
 from service.scene_formats.gaussians import RawGaussians
 from service.scene_formats.manifest import MANIFEST
+from service.scene_formats.nerfstudio import transforms_of
 from service.scene_formats.similarity import moved_gaussians, moved_pose
 from service.types import SH_C0, Camera, GaussianScene, NamedCamera
 
@@ -94,22 +95,13 @@ def write_folder(scene: GaussianScene, folder: Path, source: Path, *, cameras: b
         manifest["training_size"] = [scene.info.training_long_side_px, scene.info.training_long_side_px * 3 // 4]
     (folder / MANIFEST).write_text(json.dumps(manifest), "utf-8")
     if cameras:
-        (folder / "transforms.json").write_text(
-            json.dumps({"frames": [_frame(named) for named in scene.cameras]}), "utf-8"
-        )
+        (folder / "transforms.json").write_text(json.dumps(transforms_of(scene.cameras)), "utf-8")
     for name in ("truth.json", "photos"):
         if (source / name).is_dir():
             shutil.copytree(source / name, folder / name)
         elif (source / name).is_file():
             shutil.copy(source / name, folder / name)
     return file
-
-
-def _frame(named: NamedCamera) -> dict:
-    k = named.camera.intrinsics
-    pose = named.camera.pose.world_from_camera @ np.diag([1.0, -1, -1, 1])
-    intrinsics = {"w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy}
-    return {"file_path": named.name, "transform_matrix": pose.tolist(), **intrinsics}
 
 
 def _raw(scene: GaussianScene) -> RawGaussians:

@@ -1,4 +1,4 @@
-"""`splatfix scenes list | inspect | index | align | register | coverage`: what is in a scene, and where it is."""
+"""`splatfix scenes list | inspect | convert | index | align | register | coverage`: what and where scenes are."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Annotated
 import typer
 
 from service.cli.scenes_align import align_cameras
+from service.cli.scenes_convert import convert
 from service.cli.scenes_coverage import scene_coverage
 from service.cli.scenes_index import index_scene
 from service.cli.scenes_register import register_scene
 from service.cli.terminal import err, print_json, say
 
-scenes_app = typer.Typer(no_args_is_help=True, help="Inspect, index, align, register and test scenes.")
+scenes_app = typer.Typer(no_args_is_help=True, help="Inspect, convert, index, align, register and test scenes.")
+scenes_app.command("convert")(convert)
 scenes_app.command("index")(index_scene)
 scenes_app.command("align")(align_cameras)
 scenes_app.command("register")(register_scene)

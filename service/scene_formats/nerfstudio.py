@@ -7,6 +7,7 @@ Distortion is left out, as in `colmap`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,6 +127,18 @@ class TransformsFile:
             return next((f for f in files if f.is_relative_to(folder) and f.is_file()), None)
         except (OSError, ValueError):  # too long a name, or no name that a file could have
             return None
+
+
+def transforms_of(cameras: Sequence[NamedCamera]) -> dict[str, Any]:
+    """Return cameras as the content of a `transforms.json`: OpenGL's axes, and intrinsics in each frame."""
+    return {"frames": [_frame(named) for named in cameras]}
+
+
+def _frame(named: NamedCamera) -> dict[str, Any]:
+    k = named.camera.intrinsics
+    matrix = named.camera.pose.world_from_camera @ OPENCV_FROM_OPENGL
+    intrinsics = {"w": k.width, "h": k.height, "fl_x": k.fx, "fl_y": k.fy, "cx": k.cx, "cy": k.cy}
+    return {"file_path": named.name, "transform_matrix": matrix.tolist(), **intrinsics}
 
 
 def transforms_path(folder: Path) -> Path | None:
