@@ -14,7 +14,7 @@ from api_server import GO_ON, photo, until
 from memory_stores import MemoryJobStore, MemoryPhotoStore
 from stand_ins import make_scene
 
-from service.errors import IdempotencyConflict, PhotoGone
+from service.errors import IdempotencyConflict, PhotoGone, SceneNotReady
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.job_order import JobOrder
@@ -100,6 +100,24 @@ def test_a_lease_that_is_renewed_keeps_the_attempt(stepping):
         job = jobs.accept(order(steps=6, pause_s=0.2))
         job = ended(jobs, job)  # four leases long
         assert (job.state, job.attempt, job.lost) == ("succeeded", 1, 0)
+
+
+@pytest.mark.parametrize("error", [SceneNotReady("away.", where="scene"), ValueError("a bug")], ids=["engine", "bug"])
+def test_leases_are_renewed_though_maintenance_fails(stepping, error):
+    """As while a cluster doesn't answer: an error that ended its thread would end all leases, and repeat attempts."""
+
+    class TroubledStore(MemoryJobStore):
+        failed = 0
+
+        def expire_photos(self):
+            self.failed += 1
+            raise error
+
+    store = TroubledStore()
+    with running(store, lease_s=0.3) as jobs:
+        job = ended(jobs, jobs.accept(order(steps=6, pause_s=0.2)))  # four leases long
+        assert (job.state, job.attempt, job.lost) == ("succeeded", 1, 0)
+    assert store.failed > 3
 
 
 def test_a_lost_attempt_is_made_again_and_its_late_result_is_refused(stepping):

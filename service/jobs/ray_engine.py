@@ -17,8 +17,11 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
+# A call while this process is in no cluster must fail, not start one.
+os.environ["RAY_ENABLE_AUTO_CONNECT"] = "0"
+
 import ray  # pyright: ignore[reportMissingImports]
-from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
+from ray.exceptions import RayActorError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
 
 from service import __version__
 from service.errors import SceneNotFound, SceneNotReady, SplatfixError
@@ -43,6 +46,8 @@ from service.types import SceneInfo
 _log = logging.getLogger(__name__)
 
 _HEARTBEAT_S = 5.0
+_AGAIN_S = 0.5
+"""Until who waits for scenes asks again, while the cluster doesn't answer."""
 _AT_ONCE = 1000
 """Calls that a coordinator or a replica may have under way: most of them wait."""
 
@@ -64,6 +69,14 @@ class RayEngine:
     # ------------------------------------------------------------------ the cluster
 
     def start(self) -> None:
+        self._join()
+        if self._coordinator is not None:
+            return
+        self._connect()
+        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
+
+    def _join(self) -> None:
+        """Become a part of the cluster, or start one."""
         if not ray.is_initialized():
             if not self._ray.address and "RAY_AUTH_TOKEN_PATH" not in os.environ:
                 # Ray listens on all addresses, and runs whatever it is sent: with a token of this process only.
@@ -77,10 +90,6 @@ class RayEngine:
             }
             where: dict[str, Any] = {"address": self._ray.address} if self._ray.address else local
             ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
-        if self._coordinator is not None:
-            return
-        self._connect()
-        threading.Thread(target=self._beat, name="heartbeat", daemon=True).start()
 
     def _connect(self) -> None:
         """Find the coordinator or start it, with its replicas, and add all scenes to it."""
@@ -165,6 +174,7 @@ class RayEngine:
                 try:
                     take(self._keep(self._ask("hold_later", self._front, asked)))
                 except _CoordinatorGone:
+                    self._closed.wait(_AGAIN_S)
                     continue
                 except SplatfixError as error:
                     take(error)
@@ -182,7 +192,8 @@ class RayEngine:
     def release(self, token: str) -> None:
         if self._held.pop(token, None):
             # Not waited for: who lets go needs no answer.
-            self._coordinator.release.remote(token)
+            with suppress(Exception):  # of a lost cluster nothing is held
+                self._coordinator.release.remote(token)
 
     def _is_there(self, scene_id: str) -> bool:
         return self.scene(scene_id).memory_bytes is not None
@@ -193,6 +204,8 @@ class RayEngine:
         held = self._held.get(task.held)
         if held is None:
             raise SceneNotReady("the job's scenes were unloaded.", where="scene")
+        if held.replica is None:
+            raise EngineLost
         self._running[task.id] = held.replica
         try:
             for kind, value in self._stream(held.replica.localize, task):
@@ -204,11 +217,11 @@ class RayEngine:
             self.cancel(task.id)  # it may be `on_record` that failed
             raise
         finally:
-            del self._running[task.id]
+            self._running.pop(task.id, None)
 
     def cancel(self, task_id: str) -> None:
         if replica := self._running.get(task_id):
-            with suppress(RayActorError):
+            with suppress(RayError):
                 # Waited for: the next record must not overtake it.
                 ray.get(replica.cancel.remote(task_id))
 
@@ -216,6 +229,8 @@ class RayEngine:
         held = self._held.get(task.held)
         if held is None:
             raise SceneNotReady("the session's scene was unloaded.", where="scene")
+        if held.replica is None:
+            raise EngineLost
         session = secrets.token_hex(8)
         try:
             for kind, value in self._stream(held.replica.live, session, task):
@@ -224,7 +239,8 @@ class RayEngine:
                 elif kind == "record":
                     on_answer(value)
         except BaseException:
-            held.replica.frame.remote(session, None)  # it may be a callback that failed: the session ends
+            if self._held.get(task.held) is held:  # it may be a callback that failed: the session ends
+                held.replica.frame.remote(session, None)
             raise
 
     def render(self, scene_id: str, picture: PictureSpec) -> bytes:
@@ -252,16 +268,52 @@ class RayEngine:
     # ------------------------------------------------------------------ calls
 
     def _ask(self, name: str, *arguments: Any) -> Any:
-        """Call the coordinator. Raises what it raises; _CoordinatorGone after another one was started."""
+        """Call the coordinator. Raises what it raises; _CoordinatorGone where it, or the cluster, doesn't answer: then
+        another one is found or started first, if that can be."""
         coordinator = self._coordinator
         try:
+            if coordinator is None:
+                raise RayError("this process is in no cluster.")
             return self._call(name, *arguments)
-        except RayActorError as error:
-            with self._lock:
-                if self._coordinator is coordinator and not self._closed.is_set():
-                    _log.error("the coordinator of scenes ended: %s", error)
+        except (RayTaskError, SplatfixError):
+            raise
+        except RayError as error:
+            self._connect_again(coordinator, error)
+        except Exception:
+            # A call that another thread leaves the cluster under fails in any way.
+            if self._coordinator is coordinator:
+                raise
+        raise _CoordinatorGone("the engine is started again.", where="scene", hint="Try again later.") from None
+
+    def _connect_again(self, lost: Any, error: Exception) -> None:
+        """Find or start another coordinator than the one that was lost, unless somebody has, or does."""
+        if not self._lock.acquire(blocking=False):
+            return
+        try:
+            if self._coordinator is not lost or self._closed.is_set():
+                return
+            _log.error("the coordinator of scenes ended: %s", error)
+            try:
+                if lost is not None:
                     self._connect()
-            raise _CoordinatorGone("the engine was started again.", where="scene", hint="Try again later.") from None
+                    return
+            except RayError as again:
+                _log.error("Ray's cluster does not know this process: %s", again)
+            # Its head was started again, or is away: the replicas of the cluster before can't be called any more.
+            self._coordinator = None
+            self._forget_replicas()
+            ray.shutdown()
+            self._join()
+            self._connect()
+        except Exception as again:  # of any kind, where the head is away
+            _log.error("Ray's cluster does not answer: %s", again)
+        finally:
+            self._lock.release()
+
+    def _forget_replicas(self) -> None:
+        """Let nobody call the replicas of a cluster that was lost."""
+        self._running.clear()
+        self._held = {token: replace(found, replica=None) for token, found in self._held.items()}
 
     def _call(self, name: str, *arguments: Any) -> Any:
         with _own_errors():
@@ -269,7 +321,7 @@ class RayEngine:
 
     def _ask_replica(self, scene_id: str, name: str, *arguments: Any) -> Any:
         """Call the engine of a replica that has a scene: one that is held needs no way over the coordinator."""
-        held = [found.replica for found in tuple(self._held.values()) if scene_id in found.held.ids]
+        held = [found.replica for found in tuple(self._held.values()) if found.replica and scene_id in found.held.ids]
         for replica in held[-1:]:
             with _own_errors(), suppress(RayActorError):
                 return ray.get(replica.ask.remote(name, *arguments))
@@ -277,7 +329,9 @@ class RayEngine:
         try:
             with _own_errors():
                 return ray.get(replica.ask.remote(name, *arguments))
-        except RayActorError:
+        except RayTaskError:
+            raise
+        except RayError:
             raise SceneNotReady("the scene's process ended.", where="scene", hint="Try again later.") from None
 
     def _stream(self, method: Any, *arguments: Any) -> Iterator[Any]:
@@ -287,7 +341,9 @@ class RayEngine:
                 with _own_errors():
                     found = ray.get(message)
                 yield found
-        except RayActorError as error:
+        except RayTaskError:  # a bug in the replica
+            raise
+        except RayError as error:
             raise EngineLost from error
 
 

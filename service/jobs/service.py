@@ -22,6 +22,7 @@ from service.errors import (
     JobNotFound,
     JobNotReady,
     RecordNotFound,
+    SplatfixError,
     StorageFailed,
 )
 from service.jobs.acceptance import Acceptance
@@ -287,6 +288,10 @@ class Jobs:
                     self._worker.storage_error = ""
             except StorageFailed as error:
                 self._worker.note_storage(error)
+            except SplatfixError as error:  # of the engine
+                _log.warning("maintenance of jobs: %s", error)
+            except Exception:  # a bug must not end the thread: leases would end, and attempts be repeated
+                _log.exception("jobs could not be maintained")
 
     def _renew(self) -> None:
         """Renew the leases of this process; attempts that are stuck are ended by the queue, not by their lease."""
