@@ -44,7 +44,7 @@ test: check
 test-fleet: setup
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray,cloud,s3server,peer]"
 	$(BIN)/pytest -rs tests/test_fronts.py tests/test_shared_state.py tests/test_object_store.py tests/test_gateway.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
-		tests/test_bench_peer.py
+		tests/test_bench_peer.py tests/test_fleet_faults.py
 
 # All tests. Those of `make test` tell which lines they run in their own process; the others, among them live cameras
 # and other tests by the clock, run without a tracer and one a core.

@@ -208,11 +208,11 @@ def outages(up: list[tuple[float, bool]], made: list[tuple[float, str]]) -> dict
 
 def reckon(fleet: Fleet, outcome: Outcome, asked: int) -> dict:
     """Wait for the end of all jobs and compare what was promised with what there is."""
-    import psycopg
+    import psycopg  # pyright: ignore[reportMissingImports]
 
     fleet.await_ready()
     query = "SELECT id, state, attempt, result IS NOT NULL, failure IS NOT NULL, spec, idempotency_key FROM jobs"
-    deadline = time.monotonic() + 240
+    deadline, rows = time.monotonic() + 240, []
     with psycopg.connect(fleet.address, autocommit=True) as database:
         while time.monotonic() < deadline:
             rows = database.execute(query).fetchall()
