@@ -130,6 +130,19 @@ def test_colours_correlate_where_there_are_points_and_over_the_whole_image() -> 
     assert found.score == found.correlation
 
 
+def test_the_finest_look_tells_the_pixels_of_the_small_photos_apart() -> None:
+    rng = np.random.default_rng(0)
+    photo = rng.integers(0, 256, (96, 128, 3), np.uint8)
+    v, u = np.mgrid[:96, :128] + 0.5
+    lens = Intrinsics(128, 96, 100.0, 100.0, 64.0, 48.0)
+    at = np.stack([(u.ravel() - 64) / 50, (v.ravel() - 48) / 50, np.full(u.size, 2.0)], 1)
+    seen, camera = points(at, rgb=photo.reshape(-1, 3) / 255), Camera(lens, HERE.pose)
+    assert evidence(seen, [camera], [photo], FIT.finest).correlation == pytest.approx(1.0, abs=1e-3)
+    # With half of its columns exchanged with their neighbours it is another photo, if neighbours aren't of one cell.
+    exchanged = photo.reshape(96, 32, 4, 3)[:, :, [0, 2, 1, 3]].reshape(96, 128, 3)
+    assert evidence(seen, [camera], [exchanged], FIT.finest).correlation == pytest.approx(0.5, abs=0.05)
+
+
 @pytest.mark.parametrize(("opacity", "kept"), [(0.51, 40), (0.5, 100)])
 def test_points_are_opaque_gaussians_or_all_where_none_is(opacity: float, kept: int) -> None:
     rng = np.random.default_rng(0)
