@@ -80,6 +80,20 @@ def test_a_thin_sky_is_no_floater_and_a_scene_without_cameras_is_not_examined(
     assert not find_floaters(replace(veiled, cameras=())).found.any()
 
 
+def test_gaussians_larger_than_the_content_are_floaters_if_cameras_stand_in_them_and_they_hide_it(
+    room: GaussianScene,
+) -> None:
+    """Whatever is in a cube as large as they are would support them; a sky of such is behind the content."""
+    inside = haze(20, -0.5 * np.ones(3), 0.5 * np.ones(3), 20.0, 0.02)
+    sky = haze(20, (900, -9, -9), (910, 9, 9), 600.0, 0.9)
+    thin = haze(20, (-9, -9, 20), (9, 9, 21), 20.0, 0.5)
+    thin["scales"][:, 2] = 0.5  # reaches over the room, but no camera stood in it
+    found = find_floaters(with_more(room, inside, sky, thin))
+    assert found.found[room.count :].tolist() == [True] * 20 + [False] * 40
+    assert not found.found[: room.count].any()
+    assert found.left_out
+
+
 def test_the_veil_is_the_optical_depth_in_front_of_the_content(room: GaussianScene) -> None:
     """In a long box: density x opacity x 2 pi size^2 x length, the length that counts being 0.02 to 0.7 of 10 units."""
     wall = haze(4000, (-9, -9, 9.999), (9, 9, 10.001), 0.1, 0.95)

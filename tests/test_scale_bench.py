@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import typer
 from test_bench import LENS, estimate, poses
 
 from service.bench import scale
 from service.bench.pose_metrics import Units
+from service.cli.bench_scale import bench_scale
 from service.errors import BackendMissing, InvalidRequest
 from service.geometry import moved
 from service.photos.images import encode_image
@@ -192,3 +195,28 @@ def test_a_scene_is_thinned_or_surrounded_to_its_size(monkeypatch: pytest.Monkey
     scene: Any = SimpleNamespace(count=100)
     assert scale._resize(scene, 99, ()) == ("kept", 99, "renderer")
     assert scale._resize(scene, 100, ("x",)) == ("surrounded", 100, ("x",))
+
+
+def test_a_street_is_measured_with_its_cameras(
+    planted: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[Any] = []
+    street = SimpleNamespace(clean=planted.scene, trained=SimpleNamespace(count=7, sh_degree=0))
+    monkeypatch.setattr(scale, "make_street", lambda config: made.append(config) or street)
+    monkeypatch.setattr(scale, "write_photos", lambda street, folder, seed: made.append((folder.name, seed)))
+    (row,) = scale.run_street(replace(scale.STREET, seed=5), work=tmp_path)
+    assert made == [replace(scale.STREET, seed=5), ("photos", 5)]
+    assert row == {
+        "gaussians": 7,
+        "sh_degree": 0,
+        "file": "scene.ply",
+        "cameras": "given",
+        "file_bytes": 7,
+        "photos": 3,
+    }
+    assert planted.written[-1][1:] == (True, False)
+    assert planted.measured == [("street", True, 8.0)]
+    assert list(tmp_path.iterdir()) == []
+    for folder, with_street in ((None, False), (tmp_path, True)):
+        with pytest.raises(typer.BadParameter, match="either"):
+            bench_scale(folder, with_street)

@@ -22,6 +22,7 @@ import numpy as np
 
 from service.bench.bench_photos import find_photos
 from service.bench.pose_metrics import COARSE, FINE, Outcome, Units, errors, units_of
+from service.bench.street import STREET, StreetConfig, make_street, write_photos
 from service.errors import BackendMissing, InvalidRequest
 from service.loaded_scene import DEFAULT_ESTIMATOR, LoadedScene
 from service.localize import localize
@@ -50,10 +51,7 @@ def run(
     `others` are put around the scene whose photos are localized; without any, varied copies of it. `cameras` as in
     `bench localize`. The large scenes are written to a temporary folder, in `work` if it is given.
     """
-    if find_spec("gsply") is None:
-        raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
-    if not _STATUS.exists():
-        raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
+    _check_tools()
     from service.bench.large_scenes import write_folder  # loads gsply
 
     # As in `bench localize`: no index view may rest on a test photo's pose.
@@ -73,12 +71,43 @@ def run(
             facts |= {"cameras": cameras, "file_bytes": file.stat().st_size}
             # The file on disk is all that the measurement needs.
             del large
-            # A new process, whose peak of memory is this size's alone.
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                rows.append(facts | process.submit(measure_folder, at, units).result())
+            rows.append(facts | _measured_apart(at, units))
         if progress:
             progress(done, len(sizes))
     return rows
+
+
+def run_street(config: StreetConfig = STREET, *, work: Path | None = None) -> list[dict[str, Any]]:
+    """Return the list that `--json` writes for the synthetic street (see `street`): one row. Raises SceneError.
+
+    It is given with its training cameras, in a temporary folder, in `work` if it is given.
+    """
+    _check_tools()
+    from service.bench.large_scenes import write_folder  # loads gsply
+
+    with tempfile.TemporaryDirectory(dir=work) as temporary:
+        photos, at = Path(temporary, "photos"), Path(temporary, "street")
+        street = make_street(config)
+        write_photos(street, photos, config.seed)
+        units = units_of([n.camera for n in street.clean.cameras], _depth_of(street.clean))
+        file = write_folder(street.trained, at, photos, cameras=True, compressed=False)
+        facts = {"gaussians": street.trained.count, "sh_degree": street.trained.sh_degree, "file": file.name}
+        facts |= {"cameras": "given", "file_bytes": file.stat().st_size}
+        del street
+        return [facts | _measured_apart(at, units)]
+
+
+def _check_tools() -> None:
+    if find_spec("gsply") is None:
+        raise BackendMissing("large scenes are written by gsply; install splatfix[bench].", where="bench scale")
+    if not _STATUS.exists():
+        raise InvalidRequest("memory is read from /proc, which this system doesn't have.", where="bench scale")
+
+
+def _measured_apart(folder: Path, units: Units) -> dict[str, Any]:
+    """Measure in a new process, whose peak of memory is this scene's alone."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        return process.submit(measure_folder, folder, units).result()
 
 
 def _depth_of(scene: GaussianScene) -> Callable[[Camera], float]:

@@ -12,7 +12,8 @@ from service.cli.terminal import JsonFileOption, out, short, write_json
 
 
 def bench_scale(
-    folder: Annotated[Path, typer.Argument(help="A scene folder with test photos and their poses.")],
+    folder: Annotated[Path | None, typer.Argument(help="A scene folder with test photos and their poses.")] = None,
+    street: Annotated[bool, typer.Option("--street", help="A synthetic street of 3 million, without FOLDER.")] = False,
     around: Annotated[list[Path] | None, typer.Option(help="Scenes to place around it, not varied copies.")] = None,
     sizes: Annotated[
         list[int] | None, typer.Option("--size", min=1000, help="How many Gaussians; may be repeated.")
@@ -24,18 +25,23 @@ def bench_scale(
     json_file: JsonFileOption = None,
 ) -> None:
     """Measure loading, indexing, memory and localization of scenes of growing size."""
-    from service.bench.scale import SIZES, run
+    from service.bench.scale import SIZES, run, run_street
 
+    if (folder is None) != street:
+        raise typer.BadParameter("give either a scene folder or --street.")
     with measuring("sizes") as progress:
-        rows = run(
-            folder,
-            others=around or (),
-            sizes=sizes or SIZES,
-            cameras=cameras,
-            compressed=compressed,
-            work=work,
-            progress=progress,
-        )
+        if folder is None:
+            rows = run_street(work=work)
+        else:
+            rows = run(
+                folder,
+                others=around or (),
+                sizes=sizes or SIZES,
+                cameras=cameras,
+                compressed=compressed,
+                work=work,
+                progress=progress,
+            )
     write_json(json_file, rows)
     if plot_file:
         from service.bench.paper.figures import growth  # loads matplotlib

@@ -7,6 +7,9 @@ seen from, the area which the others in the cube cover is compared with the cube
     support = max over cubes of  sum of opacity x 2 pi x largest x middle scale of the others / side^2
 
 Only Gaussians among cameras and content are asked for theirs: skies and far backgrounds are thin, but hide nothing.
+Cubes tell nothing of Gaussians that are as large as the content: whatever is in them supports them. But where a camera
+stood there is no surface, so a large Gaussian that has one inside is a floater, unless its middle is farther than the
+content: it is drawn at its middle's depth.
 Captures of real places have such Gaussians, too, which are part of what their photos show. They are left as they are
 unless they veil the content: by their optical depth in front of it (the negative logarithm of the light that passes,
 as of particles in a volume), averaged over the images of training cameras.
@@ -20,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from service.geometry import transformed
+from service.geometry import rotation_from_quat, transformed
 from service.jit import inline, kernel
 from service.pose.retrieval.free_space import SPACE, Space, free_space_of
 from service.types import Camera, GaussianScene
@@ -33,11 +36,17 @@ class FloaterConfig:
     min_support: float = 0.4
     """Planted floaters have 0.02 to 0.3 where they aren't near a surface; 99.9 % of the Gaussians of a scene trained on
     rendered photos have more."""
-    reach: float = 0.05
-    """Side of the cells, three to a cube, as a share of the typical distance."""
+    reach: float = 0.025
+    """Side of the cells, three to a cube, as a share of the typical distance. That is known within a factor of 2.4, and
+    cubes mustn't reach from the middle of a street to its houses."""
     finest_level: int = -6
-    coarsest_level: int = 4
+    coarsest_level: int = 5
     """Powers of two by which cells are smaller or larger than that: from the middle scale of the Gaussian on."""
+    large: float = 0.01
+    """Longest scale, as a share of the typical distance, from which Gaussians are asked for cameras inside."""
+    inside: float = 2.0
+    """Standard deviations from its middle within which a camera is inside of a Gaussian: beyond, a seventh is left of
+    its opacity."""
     cameras: int = 24
     """Training cameras, about, from which the veil is measured."""
     content_quantile: float = 0.25
@@ -78,8 +87,8 @@ def find_floaters(scene: GaussianScene, config: FloaterConfig = FLOATERS) -> Flo
     space = free_space_of(scene)
     among = np.flatnonzero(_among_cameras_and_content(scene, space))
     found[among] = _supports(scene, space, among, config) < config.min_support
-    every = -(-len(scene.cameras) // config.cameras)
-    density = veil(scene, found, [named.camera for named in scene.cameras[::every]], config)
+    found[_around_cameras(scene, space, config)] = True
+    density = veil(scene, found, _some_cameras(scene, config), config)
     return Floaters(found, density, density > config.max_veil)
 
 
@@ -127,6 +136,36 @@ def _depths_in_view(points: Float64[np.ndarray, "n 3"], camera: Camera) -> Float
     column, row = (lens.fx * x / away + lens.cx), (lens.fy * y / away + lens.cy)
     inside = (z > 0) & (column > 0) & (column < lens.width) & (row > 0) & (row < lens.height)
     return np.where(inside, z, np.inf)
+
+
+def _around_cameras(scene: GaussianScene, space: Space, config: FloaterConfig) -> Int64[np.ndarray, "k"]:
+    """Return the large Gaussians that have a training camera inside, ahead of it and nearer than the content."""
+    longest = scene.scales.max(1)
+    who = np.flatnonzero(longest > config.large * space.distance)
+    means, scales = scene.means[who].astype(np.float64), scene.scales[who].astype(np.float64)
+    axes = rotation_from_quat(scene.quats[who])
+    # A sky may have all cameras inside, too, but its middle is farther than the content.
+    reach = np.minimum(config.inside * longest[who], _front(scene, space, config))
+    around = np.zeros(len(who), bool)
+    for pose in (named.camera.pose for named in scene.cameras):
+        away = means - pose.position_in_world
+        near = np.flatnonzero((np.linalg.norm(away, axis=1) < reach) & (away @ pose.axis_in_world > 0) & ~around)
+        along = np.einsum("nij,ni->nj", axes[near], away[near]) / np.maximum(scales[near], 1e-30)
+        around[near] = (along**2).sum(1) < config.inside**2
+    return who[around]
+
+
+def _front(scene: GaussianScene, space: Space, config: FloaterConfig) -> float:
+    """Return the depth of the content's nearer part, the median of some cameras; 0 where none sees any."""
+    solid = space.points[:: -(-len(space.points) // config.content_points)]
+    depths = [_depths_in_view(solid, camera) for camera in _some_cameras(scene, config)]
+    depths = [depth[np.isfinite(depth)] for depth in depths]
+    nearer = [np.quantile(depth, config.content_quantile) for depth in depths if len(depth)]
+    return float(np.median(nearer)) if nearer else 0.0
+
+
+def _some_cameras(scene: GaussianScene, config: FloaterConfig) -> list[Camera]:
+    return [named.camera for named in scene.cameras[:: -(-len(scene.cameras) // config.cameras)]]
 
 
 def _among_cameras_and_content(scene: GaussianScene, space: Space) -> Bool[np.ndarray, "n"]:
