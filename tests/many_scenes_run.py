@@ -31,7 +31,7 @@ from statistics import quantiles
 
 import httpx
 import numpy as np
-from load_run import jobs_of, ready
+from load_run import jobs_of, ready, used
 from small_room import INTRINSICS, pose_at, write_room
 
 from service import jit
@@ -189,6 +189,7 @@ async def run(arguments: argparse.Namespace, scenes: Path, folder: Path) -> dict
     try:
         async with httpx.AsyncClient(base_url=url, timeout=600, trust_env=False) as client:
             ready_s = await seconds_until_ready(client)
+            ready_cpu_s = used(process.pid)
             sender = Sender(client, photo, arguments.scenes)
             numbers = random.Random(1).choices(range(arguments.scenes), k=arguments.requests)
             rescuing: list[asyncio.Task] = []
@@ -213,7 +214,7 @@ async def run(arguments: argparse.Namespace, scenes: Path, folder: Path) -> dict
         (datetime.fromisoformat(job["finished"]) - datetime.fromisoformat(job["created"])).total_seconds()
         for job in jobs
     ]
-    seconds = {"ready_s": ready_s, "took_s": took, "recovered_s": recovered_s}
+    seconds = {"ready_s": ready_s, "ready_cpu_s": ready_cpu_s, "took_s": took, "recovered_s": recovered_s}
     seconds["ready_again_s"] = await started_again(scenes, folder, limit)
     return judged(arguments, sender, drops, during, waits, seconds)
 
