@@ -12,7 +12,9 @@ from service import loaded_scene
 from service.geometry import look_at
 from service.interfaces import Features
 from service.loaded_scene import LoadedScene
+from service.pose.features.in_plane_rotation import Corners
 from service.pose.features.rendered_views import View
+from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.inverted_views import INVERTED, InvertedViews, view_scores
 from service.pose.retrieval.scores import retrieval_scores, top_indices
 from service.pose.retrieval.viewpoints import VIEWPOINTS, choose_spread_poses
@@ -84,9 +86,10 @@ def test_every_camera_of_a_large_building_has_a_view_nearby() -> None:
 def test_a_scene_says_that_its_index_was_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     few = replace(VIEWPOINTS, max_views=7)
     assert [few.cuts(7, 8), few.cuts(7, 7), few.cuts(6, 8), few.cuts(7, 0)] == [True, False, False, False]
-    monkeypatch.setattr(loaded_scene, "ViewIndex", SimpleNamespace)
     monkeypatch.setattr(loaded_scene, "release", lambda _: None)
-    indexes = [SimpleNamespace(views=[0] * 7, is_cut=is_cut, whole=None) for is_cut in (True, False)]
+    views = tuple(building(np.random.default_rng(0))[0][:7])
+    none = Corners(np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))
+    indexes = [ViewIndex(views, none, is_cut=is_cut) for is_cut in (True, False)]
     estimator = SimpleNamespace(prepare=lambda *_: indexes.pop(0))
     monkeypatch.setattr(loaded_scene.ESTIMATORS, "load", lambda _: estimator)
     scenes = [LoadedScene(*[SimpleNamespace()] * 3) for _ in indexes]  # type: ignore[arg-type]

@@ -368,7 +368,7 @@ def state(repeats: bool = False, free_lens: bool = False, place: float = 0.9, be
     )
     config = replace(SEARCH, verification=replace(SEARCH.verification, model=model))
     return SearchState(
-        SimpleNamespace(prepared=SimpleNamespace(repeats_itself=repeats, like_its_mirror_image=True)),  # type: ignore[arg-type]
+        SimpleNamespace(prepared=SimpleNamespace(repeats_itself=repeats, like_its_mirror_image=True, whole=None)),  # type: ignore[arg-type]
         SimpleNamespace(query=SimpleNamespace(lens_prior=object() if free_lens else None)),  # type: ignore[arg-type]
         None,  # type: ignore[arg-type]
         None,  # type: ignore[arg-type]
