@@ -142,17 +142,31 @@ def _around_cameras(scene: GaussianScene, space: Space, config: FloaterConfig) -
     """Return the large Gaussians that have a training camera inside, ahead of it and nearer than the content."""
     longest = scene.scales.max(1)
     who = np.flatnonzero(longest > config.large * space.distance)
-    means, scales = scene.means[who].astype(np.float64), scene.scales[who].astype(np.float64)
-    axes = rotation_from_quat(scene.quats[who])
     # A sky may have all cameras inside, too, but its middle is farther than the content.
     reach = np.minimum(config.inside * longest[who], _front(scene, space, config))
+    means, octaves = scene.means[who].astype(np.float64), np.floor(np.log2(np.maximum(reach, 1e-30)))
+    # By size and along the scene's longest side: a camera is asked of few of many millions.
+    side = int(np.argmax(np.ptp(means, axis=0))) if len(who) else 0
+    order = np.argsort(means[:, side], kind="stable")
     around = np.zeros(len(who), bool)
-    for pose in (named.camera.pose for named in scene.cameras):
-        away = means - pose.position_in_world
-        near = np.flatnonzero((np.linalg.norm(away, axis=1) < reach) & (away @ pose.axis_in_world > 0) & ~around)
-        along = np.einsum("nij,ni->nj", axes[near], away[near]) / np.maximum(scales[near], 1e-30)
-        around[near] = (along**2).sum(1) < config.inside**2
+    for octave in np.unique(octaves):
+        part = order[octaves[order] == octave]
+        places, width = means[part, side], 2.0 ** (octave + 1)
+        for pose in (named.camera.pose for named in scene.cameras):
+            at = pose.position_in_world[side]
+            some = part[slice(*np.searchsorted(places, [at - width, at + width]))]
+            away = means[some] - pose.position_in_world
+            near = (np.linalg.norm(away, axis=1) < reach[some]) & (away @ pose.axis_in_world > 0)
+            around[some[near]] |= _is_inside(scene, who[some[near]], away[near], config)
     return who[around]
+
+
+def _is_inside(
+    scene: GaussianScene, who: Int64[np.ndarray, "n"], away: Float64[np.ndarray, "n 3"], config: FloaterConfig
+) -> Bool[np.ndarray, "n"]:
+    """Return which of these Gaussians a place is inside of, from where their middles are `away`."""
+    along = np.einsum("nij,ni->nj", rotation_from_quat(scene.quats[who]), away)
+    return ((along / np.maximum(scene.scales[who], 1e-30)) ** 2).sum(1) < config.inside**2
 
 
 def _front(scene: GaussianScene, space: Space, config: FloaterConfig) -> float:
