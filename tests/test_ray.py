@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -121,6 +122,39 @@ def test_without_its_coordinator_the_engine_is_started_again(engine, service):
     assert len(replicas(engine)) == len(before)
     job = post(service, prefer="wait=30", options={"steps": 3}).json()
     assert job["state"] == "succeeded"
+
+
+def test_what_waits_for_a_cluster_that_is_left_ends_at_once(engine, service, monkeypatch):
+    """As after a kill of its head; Ray raises SystemExit in the threads that wait, which would end those of workers."""
+    from ray.exceptions import RayError
+
+    job = post(service, prefer="", options={"steps": 200, "pause_s": 0.1}).json()
+    until(lambda: service.get(job["links"]["self"]).json()["records"] >= 2)
+    (running,) = engine._running.values()
+    before, connect, seen = engine._coordinator, engine._connect, []
+
+    def lost() -> None:
+        monkeypatch.setattr(engine, "_connect", connect)
+        raise RayError("the cluster does not know this process.")
+
+    def call(ask) -> None:
+        try:
+            while True:
+                ask()
+        except BaseException as error:
+            seen.append(error)
+
+    monkeypatch.setattr(engine, "_connect", lost)
+    asks = [partial(engine._call_replica, running, "readiness"), partial(engine._ask, "scenes")]
+    threads = [threading.Thread(target=call, args=(ask,), daemon=True) for ask in asks * 2]
+    for thread in threads:
+        thread.start()
+    engine._connect_again(before, RayError("lost"))  # leaves the cluster, and starts another
+    until(lambda: len(seen) == len(threads), 5)
+    assert [error for error in seen if not isinstance(error, Exception)] == []
+    until(lambda: service.get(job["links"]["self"]).json()["attempt"] == 2, 30)
+    service.delete(job["links"]["self"])
+    finished(service, job["links"]["self"])
 
 
 def test_nobody_joins_the_cluster_without_its_token(engine):

@@ -107,10 +107,12 @@ class RayEngine:
             num_cpus=0,
             max_concurrency=_AT_ONCE,
         )
-        self._coordinator = named.remote(spawn, (RayActorError,), placed, _expected_bytes)
-        for scene, required in self._scenes.values():
-            self._call("add", scene, required)
-        self._call("start", self._ray.replicas)
+        coordinator = named.remote(spawn, (RayActorError,), placed, _expected_bytes)
+        for scene, required in tuple(self._scenes.values()):
+            _call(coordinator, "add", scene, required)
+        _call(coordinator, "start", self._ray.replicas)
+        # Last: jobs that asked it before would hear that their scenes are unknown.
+        self._coordinator = coordinator
 
     def close(self) -> None:
         self._closed.set()
@@ -223,7 +225,7 @@ class RayEngine:
         if replica := self._running.get(task_id):
             with suppress(RayError):
                 # Waited for: the next record must not overtake it.
-                ray.get(replica.cancel.remote(task_id))
+                _answer(replica.cancel.remote(task_id))
 
     def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
         held = self._held.get(task.held)
@@ -274,7 +276,7 @@ class RayEngine:
         try:
             if coordinator is None:
                 raise RayError("this process is in no cluster.")
-            return self._call(name, *arguments)
+            return _call(coordinator, name, *arguments)
         except (RayTaskError, SplatfixError):
             raise
         except RayError as error:
@@ -315,31 +317,30 @@ class RayEngine:
         self._running.clear()
         self._held = {token: replace(found, replica=None) for token, found in self._held.items()}
 
-    def _call(self, name: str, *arguments: Any) -> Any:
-        with _own_errors():
-            return ray.get(getattr(self._coordinator, name).remote(*arguments))
-
     def _ask_replica(self, scene_id: str, name: str, *arguments: Any) -> Any:
         """Call the engine of a replica that has a scene: one that is held needs no way over the coordinator."""
         held = [found.replica for found in tuple(self._held.values()) if found.replica and scene_id in found.held.ids]
         for replica in held[-1:]:
-            with _own_errors(), suppress(RayActorError):
-                return ray.get(replica.ask.remote(name, *arguments))
-        replica = self._ask("where", scene_id)
+            with suppress(_ReplicaGone):
+                return self._call_replica(replica, name, *arguments)
+        return self._call_replica(self._ask("where", scene_id), name, *arguments)
+
+    def _call_replica(self, replica: Any, name: str, *arguments: Any) -> Any:
+        """Call the engine of a replica. Raises what it raises, and _ReplicaGone."""
         try:
-            with _own_errors():
-                return ray.get(replica.ask.remote(name, *arguments))
+            return _call(replica, "ask", name, *arguments)
         except RayTaskError:
             raise
         except RayError:
-            raise SceneNotReady("the scene's process ended.", where="scene", hint="Try again later.") from None
+            raise _ReplicaGone("the scene's process ended.", where="scene", hint="Try again later.") from None
 
     def _stream(self, method: Any, *arguments: Any) -> Iterator[Any]:
         """Yield what a method of a replica yields. Raises what it raises, and EngineLost."""
         try:
-            for message in method.options(num_returns="streaming").remote(*arguments):
+            messages = method.options(num_returns="streaming").remote(*arguments)
+            while (message := _waited(partial(next, messages, None))) is not None:
                 with _own_errors():
-                    found = ray.get(message)
+                    found = _answer(message)
                 yield found
         except RayTaskError:  # a bug in the replica
             raise
@@ -348,6 +349,27 @@ class RayEngine:
 
 
 class _CoordinatorGone(SceneNotReady): ...
+
+
+class _ReplicaGone(SceneNotReady): ...
+
+
+def _call(actor: Any, name: str, *arguments: Any) -> Any:
+    with _own_errors():
+        return _answer(getattr(actor, name).remote(*arguments))
+
+
+def _answer(call: Any) -> Any:
+    return _waited(partial(ray.get, call))
+
+
+def _waited(wait: Callable[[], Any]) -> Any:
+    """Return what is waited for. Raises RayError where another thread leaves the cluster meanwhile: Ray itself raises
+    SystemExit there, by which a worker's thread would end, and nobody its attempt."""
+    try:
+        return wait()
+    except SystemExit:
+        raise RayError("the cluster was left.") from None
 
 
 class _own_errors:
