@@ -46,14 +46,25 @@ def so3_log(rotation: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3"]:
 
 def se3_exp(twist: Float64[np.ndarray, "6"]) -> Float64[np.ndarray, "4 4"]:
     """The motion of a twist."""
-    phi, rho = np.asarray(twist[:3], np.float64), np.asarray(twist[3:], np.float64)
-    first, second, third = _rodrigues(math.sqrt(phi @ phi))
-    k = hat(phi)
-    squared = k @ k
-    result = np.eye(4)
-    result[:3, :3] += first * k + second * squared
-    result[:3, 3] = rho + (second * k + third * squared) @ rho  # the left Jacobian
-    return result
+    # By scalars: refinement calls it at each step, and numpy takes microseconds for each of so small arrays.
+    x, y, z, *rho = (float(component) for component in twist)
+    first, second, third = _rodrigues(math.sqrt(x * x + y * y + z * z))
+    once = _cross((x, y, z), rho)
+    twice = _cross((x, y, z), once)
+    # The left Jacobian times rho.
+    at = [r + second * a + third * b for r, a, b in zip(rho, once, twice, strict=True)]
+    return np.array(
+        [
+            [1 - second * (y * y + z * z), second * x * y - first * z, second * x * z + first * y, at[0]],
+            [second * x * y + first * z, 1 - second * (x * x + z * z), second * y * z - first * x, at[1]],
+            [second * x * z - first * y, second * y * z + first * x, 1 - second * (x * x + y * y), at[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 def se3_log(transform: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, "6"]:

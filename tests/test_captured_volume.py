@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from service.geometry import look_at, moved, pose_distance
 from service.interfaces import Frame
 from service.loaded_scene import LoadedScene
 from service.localize import localize
+from service.pose.features.rendered_views import View
 from service.pose.verification.captured_volume import CAPTURE, _in_image, _is_beside_a_view, captured_share, is_outside
 from service.results import Reason, Status
 from service.types import Camera, Intrinsics, Pose, Query
@@ -117,14 +117,14 @@ def test_the_edge_of_an_image_lies_in_the_view_and_what_is_behind_does_not() -> 
 )
 def test_a_pose_beside_a_view_needs_no_render(away: float, turn_deg: float, beside: bool) -> None:
     """The view sees points 4 away, in the median."""
-    points = np.array([[0.0, 0, 3.0], [0.0, 0, 4.0], [0.0, 0, 50.0]])
-    view: Any = SimpleNamespace(camera=Camera(LENS, Pose(np.eye(4))), points_in_world=points)
-    empty: Any = SimpleNamespace(camera=view.camera, points_in_world=points[:0])
+    points = np.array([[0.0, 0, 3.0], [0.0, 0, 4.0], [0.0, 0, 50.0]], np.float32)
+    features: Any = None
+    camera = Camera(LENS, Pose(np.eye(4)))
+    view, empty, one = (View(camera, features, some) for some in (points, points[:0], points[1:2]))
     pose = moved(Pose(np.eye(4)), np.array([0, np.radians(turn_deg), 0, 0, 0, 0]))
     pose = Pose(pose.world_from_camera + np.array([[0, 0, 0, away]] + [[0.0] * 4] * 3))
     assert _is_beside_a_view(pose, [view], CAPTURE) == beside
     assert not _is_beside_a_view(pose, [empty], CAPTURE)
-    one: Any = SimpleNamespace(camera=view.camera, points_in_world=points[1:2])
     assert _is_beside_a_view(pose, [one], CAPTURE) == beside
 
 

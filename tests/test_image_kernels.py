@@ -349,6 +349,21 @@ def test_places_at_the_border_of_a_photo_have_values() -> None:
     assert np.all(columns == -1)
 
 
+@pytest.mark.parametrize("known", [10, 14])
+def test_damped_normal_equations_are_solved_as_by_lapack(known: int) -> None:
+    rng = np.random.default_rng(known)
+    # Unknowns of very different sizes, one without any gradient, as the blur of a flat render.
+    jacobian = rng.normal(size=(known, 40)) * 10.0 ** rng.uniform(-4, 4, (known, 1))
+    jacobian[3] = 0.0
+    hessian, rhs = jacobian @ jacobian.T, jacobian @ rng.normal(size=40)
+    scale = np.diag(1 / np.sqrt(np.maximum(np.diag(hessian), 1e-12)))
+    expected = scale @ np.linalg.solve(scale @ hessian @ scale + 1e-3 * np.eye(known), scale @ rhs)
+    found = refinement.damped_solution(hessian, rhs, 1e-3)
+    assert np.allclose(found, expected, rtol=1e-9, atol=0)
+    assert found[3] == 0.0
+    assert not np.isfinite(refinement.damped_solution(np.full((2, 2), np.nan), rhs[:2], 1e-3)).any()
+
+
 def test_normal_equations_and_scores_by_cell_are_sums() -> None:
     rng = np.random.default_rng(8)
     jacobian = rng.normal(size=(5, 70)).astype(np.float32)

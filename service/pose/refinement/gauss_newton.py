@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from service.geometry import se3_exp
 from service.pose.absolute_pose.lens_prior import FOCAL, K1, SHIFT, correction_vector, prior_precision, stepped
-from service.pose.refinement.kernels import normal_equations
+from service.pose.refinement.kernels import damped_solution, normal_equations
 from service.pose.refinement.pyramid_level import CORRECTION, PHOTOMETRIC, TWIST, PyramidLevel, RefinementState
 from service.pose.refinement.refinement_config import RefinementConfig
 from service.types import Intrinsics
@@ -42,13 +44,13 @@ def minimize(level: PyramidLevel, state: RefinementState, settled_px: float, con
 
 def _motion_px(step: Float64[np.ndarray, "14"], intrinsics: Intrinsics, depth: float) -> float:
     """Return an upper bound of the image motion by a step, in pixels, at this depth."""
-    twist, correction = step[TWIST], step[CORRECTION]
+    twist, correction = step[TWIST].tolist(), step[CORRECTION].tolist()
     # Of focal length and distortion at the end of the longer side.
     radius = 0.5 * intrinsics.long_side / intrinsics.fx
     magnified = radius * abs(correction[FOCAL]) + radius**3 * abs(correction[K1])
-    shifted = intrinsics.long_side * np.abs(correction[SHIFT]).max()
-    moved = np.linalg.norm(twist[:3]) + np.linalg.norm(twist[3:]) / depth + magnified
-    return float(intrinsics.fx * moved + shifted)
+    shifted = intrinsics.long_side * max(map(abs, correction[SHIFT]))
+    moved = math.hypot(*twist[:3]) + math.hypot(*twist[3:]) / depth + magnified
+    return intrinsics.fx * moved + shifted
 
 
 def _step(
@@ -68,17 +70,13 @@ def _step(
     if not config.estimate_photometric:
         jacobian = jacobian.copy()
         jacobian[PHOTOMETRIC] = 0
-    size = len(jacobian)
     hessian, rhs = normal_equations(jacobian, weights, residuals, state.factors)
     if state.prior:
         # With L1 weights the hessian is about `loss` times the information, so the prior is scaled likewise.
         precision = config.correlated_pixels * loss * prior_precision(state.prior, state.correction)
         hessian[range(10, 14), range(10, 14)] += precision
         rhs[CORRECTION] -= precision * correction_vector(state.correction)
-    scale = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-12))
-    # Damping keeps unknowns without any gradient in place, such as the blur of a flat render.
-    damped = hessian * scale * scale[:, None]
-    damped[range(size), range(size)] += 1e-6
     step = np.zeros(14)
-    step[:size] = scale * np.linalg.solve(damped, scale * rhs)
+    # Damping keeps unknowns without any gradient in place, such as the blur of a flat render.
+    step[: len(jacobian)] = damped_solution(hessian, rhs, 1e-6)
     return step

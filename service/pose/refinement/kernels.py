@@ -137,6 +137,33 @@ def normal_equations(jacobian, weights, residuals, factors):
 
 
 @kernel
+def damped_solution(hessian, rhs, damping):
+    """Return D y with (D H D + damping I) y = D rhs, where D = diag(H)^-1/2, by L D L^T without pivoting.
+
+    H is positive semidefinite; not finite where a pivot is 0.
+    """
+    size = len(rhs)
+    scale, low, pivots, x = np.empty(size), np.empty((size, size)), np.empty(size), np.empty(size)
+    for a in range(size):
+        scale[a] = 1.0 / np.sqrt(max(hessian[a, a], 1e-12))
+    for a in range(size):
+        pivots[a] = hessian[a, a] * scale[a] * scale[a] + damping
+        x[a] = scale[a] * rhs[a]
+        for b in range(a):
+            total = hessian[a, b] * scale[a] * scale[b]
+            for k in range(b):
+                total -= low[a, k] * low[b, k] * pivots[k]
+            low[a, b] = total / pivots[b]
+            pivots[a] -= low[a, b] * total
+            x[a] -= low[a, b] * x[b]
+    for a in range(size - 1, -1, -1):
+        x[a] /= pivots[a]
+        for b in range(a + 1, size):
+            x[a] -= low[b, a] * x[b]
+    return x * scale
+
+
+@kernel
 def sum_scores_by_cell(jacobian, weights, residuals, pixels, width, cell_px, count, l1_floor):
     """Return each cell's sums of score J w r and hessian w J J^T, and how many pixels it has.
 

@@ -149,24 +149,20 @@ def _around_cameras(scene: GaussianScene, space: Space, config: FloaterConfig) -
     side = int(np.argmax(np.ptp(means, axis=0))) if len(who) else 0
     order = np.argsort(means[:, side], kind="stable")
     around = np.zeros(len(who), bool)
+    poses = [named.camera.pose for named in scene.cameras]
     for octave in np.unique(octaves):
         part = order[octaves[order] == octave]
-        places, width = means[part, side], 2.0 ** (octave + 1)
-        for pose in (named.camera.pose for named in scene.cameras):
-            at = pose.position_in_world[side]
-            some = part[slice(*np.searchsorted(places, [at - width, at + width]))]
-            away = means[some] - pose.position_in_world
-            near = (np.linalg.norm(away, axis=1) < reach[some]) & (away @ pose.axis_in_world > 0)
-            around[some[near]] |= _is_inside(scene, who[some[near]], away[near], config)
+        middles, width = means[part], 2.0 ** (octave + 1)
+        places = np.ascontiguousarray(middles[:, side])
+        turns = rotation_from_quat(scene.quats[who[part]])
+        scales, reaches = scene.scales[who[part]].astype(np.float64), reach[part]
+        for pose in poses:
+            at = pose.position_in_world
+            some = slice(*np.searchsorted(places, [at[side] - width, at[side] + width]))
+            around[part[some]] |= _is_around(
+                at, pose.axis_in_world, middles[some], turns[some], scales[some], reaches[some], config.inside
+            )
     return who[around]
-
-
-def _is_inside(
-    scene: GaussianScene, who: Int64[np.ndarray, "n"], away: Float64[np.ndarray, "n 3"], config: FloaterConfig
-) -> Bool[np.ndarray, "n"]:
-    """Return which of these Gaussians a place is inside of, from where their middles are `away`."""
-    along = np.einsum("nij,ni->nj", rotation_from_quat(scene.quats[who]), away)
-    return ((along / np.maximum(scene.scales[who], 1e-30)) ** 2).sum(1) < config.inside**2
 
 
 def _front(scene: GaussianScene, space: Space, config: FloaterConfig) -> float:
@@ -259,6 +255,25 @@ def _slot(table, key):
     while table[at] != key and table[at] != -1:
         at = (at + 1) & mask
     return at
+
+
+@kernel
+def _is_around(eye, axis, means, turns, scales, reach, inside):
+    """Return which Gaussians an eye is inside of, ahead of it and nearer than their reach.
+
+    `turns`: their axes as columns; `inside`: standard deviations.
+    """
+    result = np.zeros(len(means), np.bool_)
+    for i in range(len(means)):
+        x, y, z = means[i, 0] - eye[0], means[i, 1] - eye[1], means[i, 2] - eye[2]
+        if x * x + y * y + z * z >= reach[i] * reach[i] or x * axis[0] + y * axis[1] + z * axis[2] <= 0:
+            continue
+        squared = 0.0
+        for k in range(3):
+            along = x * turns[i, 0, k] + y * turns[i, 1, k] + z * turns[i, 2, k]
+            squared += (along / max(scales[i, k], 1e-30)) ** 2
+        result[i] = squared < inside * inside
+    return result
 
 
 @kernel

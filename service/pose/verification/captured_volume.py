@@ -67,14 +67,13 @@ def is_outside(
 
 def _is_beside_a_view(pose: Pose, views: Sequence[View], config: CaptureConfig) -> bool:
     """Return whether the nearest view that looks the same way is near, by what it sees: the usual case."""
-    poses = [view.camera.pose for view in views]
-    alike = [i for i, one in enumerate(poses) if one.axis_in_world @ pose.axis_in_world > _cosine(config.near_turn_deg)]
-    if not alike:
+    poses = np.stack([view.camera.pose.world_from_camera for view in views])
+    alike = poses[:, :3, 2] @ pose.axis_in_world > _cosine(config.near_turn_deg)
+    if not alike.any():
         return False
-    away = [float(np.linalg.norm(poses[i].position_in_world - pose.position_in_world)) for i in alike]
-    nearest = views[alike[int(np.argmin(away))]]
-    points = nearest.points_in_world - nearest.camera.pose.position_in_world
-    return len(points) > 0 and min(away) < config.near_share * float(np.median(np.linalg.norm(points, axis=1)))
+    away = np.where(alike, np.linalg.norm(poses[:, :3, 3] - pose.position_in_world, axis=1), np.inf)
+    nearest = views[int(np.argmin(away))]
+    return len(nearest.points_in_world) > 0 and float(away.min()) < config.near_share * nearest.distance
 
 
 def captured_share(
