@@ -137,6 +137,17 @@ def test_xfeat_agrees_with_the_package_that_it_replaces(capsys: pytest.CaptureFi
     assert np.quantile(cosine, 0.05) > 0.97  # bilinear against bicubic, half a pixel apart at the border
 
 
+def test_local_maxima_are_those_of_opencvs_dilation() -> None:
+    heat = np.random.default_rng(4).random((17, 23)).astype(np.float32)
+    heat[5, 7] = heat[5, 8] = 2.0  # equal neighbours are both largest
+    points, values = MATCHERS.load("xfeat")._local_maxima(heat, 0.6, 2)
+    # Beyond the border OpenCV takes the lowest value.
+    y, x = np.nonzero((heat > 0.6) & (heat == cv2.dilate(heat, np.ones((5, 5), np.uint8))))
+    assert len(values) > 10
+    assert np.array_equal(points, np.stack([x, y], 1) + np.float32(0.5))
+    assert np.array_equal(values, heat[y, x])
+
+
 @pytest.mark.parametrize("size", [(256, 320), (100, 37)])
 def test_xfeat_on_the_gpu_is_xfeat(size: tuple[int, int]) -> None:
     image, xfeat = textured(*size), MATCHERS.load("xfeat")
