@@ -88,6 +88,8 @@ def test_adam_by_hand() -> None:
     adam = Adam(2, 0.1)
     for _ in range(3):
         assert np.allclose(adam.step(np.array([3.0, -0.02])), [0.1, -0.1], rtol=1e-5)
+    # A gradient as small as the paper's epsilon moves half as far.
+    assert np.allclose(Adam(2, 0.1).step(np.array([1e-8, -1e-8])), [0.05, -0.05], rtol=1e-5)
 
 
 # --- the descent's schedule, and what is sampled

@@ -140,7 +140,7 @@ def test_the_time_between_two_attempts_doubles_and_success_resets_it(monkeypatch
     assert waits == [5, 10, 20, 40, 80, 160, 300, 300, 300]
 
 
-def test_who_needs_several_scenes_gets_them_though_others_want_all_the_memory(folder, size):
+def test_who_needs_several_scenes_gets_them_though_others_want_all_the_memory(folder, size, plugins):
     """Each pair needs all there is: loaded one by one in turn, they would drop each other's for ever."""
     scenes = Scenes("stepping", None, memory_bytes=int(2.5 * size))
     for name in ("attic", "cellar", "hall"):
@@ -159,6 +159,8 @@ def test_who_needs_several_scenes_gets_them_though_others_want_all_the_memory(fo
         until(lambda: len(answers) == 4, 60)
     finally:
         scenes.close()
+    scenes._thread.join(30)
+    assert not scenes._thread.is_alive()
     assert all(isinstance(found, Acquired) and " ".join(found.ids) == pair for pair, found in answers)
     assert all(entry.jobs == 0 for entry in scenes.entries())
 

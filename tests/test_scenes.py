@@ -330,6 +330,16 @@ def test_names_in_an_archive_may_be_as_long_as_those_of_files(tmp_path, length, 
     assert [file.name for file in tmp_path.glob("house/*")] == [name] * kept
 
 
+def test_an_archive_that_is_called_a_ply_is_unpacked(tmp_path):
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as opened:
+        opened.writestr("room.ply", ply())
+    with FolderSceneStore([], tmp_path, 10**6).draft("house") as draft:
+        draft.write(buffer.getvalue())
+        draft.commit("house.ply")
+    assert [file.name for file in tmp_path.glob("house/*.ply")] == ["room.ply"]
+
+
 def test_a_scenes_name_has_at_most_64_characters(tmp_path):
     store = FolderSceneStore([], tmp_path, 10**6)
     for name in ("x", "x" * 64):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.geometry import moved, pose_distance, se3_exp, se3_log
-from service.smoothing import SMOOTHING, MotionNoise, TimedPose, _stretches, smoothed, smoothed_states
+from service.smoothing import SMOOTHING, MotionNoise, TimedPose, _filtered, _stretches, smoothed, smoothed_states
 from service.types import Pose
 
 SIGMA = np.array([0.004] * 3 + [0.03, 0.01, 0.02])
@@ -151,6 +151,15 @@ def test_without_covariances_those_of_others_are_taken():
     told = [np.eye(6) * 4e-4, None, np.eye(6) * 2e-4]
     found = smoothed([TimedPose(10.0 * i, pose, c) for i, (pose, c) in enumerate(zip(poses, told, strict=True))])
     assert [f is not None and float(f.covariance[0, 0]) for f in found] == pytest.approx([4e-4, 3e-4, 2e-4])
+
+
+def test_the_third_pose_is_the_first_evidence_of_the_covariances():
+    """The first two tell the velocity. A third one off by d has d^2 / its prediction's variance, of 6 components."""
+    rest, off = walk(1)[0], np.array([0, 0, 0, 0.3, 0, 0])
+    photos = [TimedPose(float(i), moved(rest, off * (i == 2)), np.eye(6) * 1e-4) for i in range(3)]
+    # Of poses at 0 and 1 with the variance v, the one at 2 is predicted with 5 v: 2 x2 - x1.
+    factor = _filtered(photos, MotionNoise(1e-18, 1e-18))[3]
+    assert factor == pytest.approx(0.3**2 / (6e-4 * 6), rel=0.01)
 
 
 def test_photos_of_one_time_have_no_infinite_speed():

@@ -67,7 +67,7 @@ def test_renders_ahead_are_made_in_one_call_where_the_renderer_prefers_that() ->
         return [frame_of(np.full((48, 64), 2.0, np.float32)) for _ in cameras]
 
     others = [Camera(SMALL, moved(HERE, np.array([0, 0, 0, float(k), 0, 0]))) for k in range(3)]
-    for at_once, expected in ((4, [3]), (1, [1, 1])):
+    for at_once, expected in ((2, [3]), (1, [1, 1])):
         calls.clear()
         renderer = ViewRenderer(SimpleNamespace(render=render, cameras_at_once=at_once))  # type: ignore[arg-type]
         renderer.render_ahead(others)

@@ -381,6 +381,8 @@ def test_a_trajectory_needs_a_time_for_each_photo(tmp_path, times):
     photos = [Path("a.jpg"), Path("b.jpg")]
     with pytest.raises(InvalidRequest, match="needs the times of the 2 photos"):
         scenes_register._known_photos(photos, table, times, None)
+    # Neither photos nor a table: points in the scene may be all that is known.
+    assert scenes_register._known_photos([], None, times, None) == (KnownPlaces("points", ()), [])
     _, found = scenes_register._known_photos(photos, table, [1.5, 3], None)
     assert [(place.position[0], path.name) for place, path in found if place.position is not None] == [
         (1.5, "a.jpg"), (3.0, "b.jpg")
