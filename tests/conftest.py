@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from importlib.util import find_spec
+from pathlib import Path
 
 # As on the command line: threads of a library that wait for one another burn the cores that other tests need. Too late
 # if a plug-in of pytest has imported numpy; test_demo.py notices.
@@ -50,6 +51,16 @@ def pytest_collection_finish() -> None:
     """Leave what all tests have imported, some millions of objects, out of each later collection of garbage."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session")
+def scene_cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for `cache_dir` that all workers of a run share: a scene's view index is built once a run.
+
+    What it holds is named by hashes of all that it depends on. Not for tests of what is built when, or of the cache.
+    """
+    run = tmp_path_factory.getbasetemp()
+    return (run.parent if "PYTEST_XDIST_WORKER" in os.environ else run) / "scene-cache"
 
 
 @pytest.fixture(scope="module")

@@ -41,9 +41,8 @@ def test_each_part_is_removed_by_another_value() -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("ablation")
-    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("ablation") / "room"), cache_dir=scene_cache)
 
 
 def without(part: str, room: LoadedScene, query: Query | None = None) -> PoseEstimate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,9 +29,8 @@ DEGREES = 4
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("accuracy")
-    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("accuracy") / "room"), cache_dir=scene_cache)
 
 
 def judged(room: LoadedScene, query: Query, pose: Pose, accuracy: Accuracy) -> Verdict:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import cast
 
 import cv2
@@ -31,9 +32,8 @@ GREY = np.full((48, 64, 3), 0.5, np.float32)
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("advice")
-    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("advice") / "room"), cache_dir=scene_cache)
 
 
 def refused(verdict: Verdict) -> Verdict:

@@ -26,8 +26,8 @@ BEHIND_A_WALL = look_at(np.array([4.5, 0.3, 0.2]), np.zeros(3), UP)
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory) -> LoadedScene:
-    return LoadedScene.load(write_room(tmp_path_factory.mktemp("captured") / "room"))
+def room(tmp_path_factory, scene_cache) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("captured") / "room"), cache_dir=scene_cache)
 
 
 def photo_from(room: LoadedScene, pose: Pose) -> np.ndarray:

@@ -53,9 +53,9 @@ def room(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory):
+def cache(scene_cache):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("SPLATFIX_CACHE_DIR", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("SPLATFIX_CACHE_DIR", str(scene_cache))
         yield
 
 

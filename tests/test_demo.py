@@ -46,13 +46,8 @@ LINES = [
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("cache")
-
-
-@pytest.fixture(scope="module")
-def studio(cache) -> LoadedScene:
-    loaded = LoadedScene.load(STUDIO, cache_dir=cache)
+def studio(scene_cache) -> LoadedScene:
+    loaded = LoadedScene.load(STUDIO, cache_dir=scene_cache)
     loaded.prepare("view_index")
     return loaded
 
@@ -134,19 +129,19 @@ def folder(studio, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def url(studio, cache) -> Iterator[str]:
-    app = create_app(settings(estimator="view_index", cache_dir=cache), {"studio": studio})
+def url(studio, scene_cache) -> Iterator[str]:
+    app = create_app(settings(estimator="view_index", cache_dir=scene_cache), {"studio": studio})
     with serving(app) as client:
         until_ready(client)
         yield str(client.base_url).rstrip("/")
 
 
 @pytest.mark.parametrize("line", LINES)
-def test_a_command_line_works_as_written(line, folder, cache, request):
+def test_a_command_line_works_as_written(line, folder, scene_cache, request):
     if line.startswith("curl "):
         line = line.replace("http://127.0.0.1:8000", request.getfixturevalue("url"))
     environment = os.environ | {
-        "SPLATFIX_CACHE_DIR": str(cache),
+        "SPLATFIX_CACHE_DIR": str(scene_cache),
         "NUMBA_CACHE_DIR": str(jit.numba.config.CACHE_DIR),  # type: ignore[attr-defined]
         "PYTHONPATH": str(ROOT),
         "PATH": f"{folder / '.venv' / 'bin'}{os.pathsep}{os.environ['PATH']}",
@@ -159,10 +154,10 @@ def test_a_command_line_works_as_written(line, folder, cache, request):
 
 
 @pytest.mark.parametrize("document", sorted({block.document for block in PYTHON}))
-def test_the_python_of_a_document_runs(document, folder, cache, monkeypatch):
+def test_the_python_of_a_document_runs(document, folder, scene_cache, monkeypatch):
     """Its blocks one after the other in one namespace; scenes take the index that lies in the cache."""
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(LoadedScene, "load", partial(LoadedScene.load, cache_dir=cache))
+    monkeypatch.setattr(LoadedScene, "load", partial(LoadedScene.load, cache_dir=scene_cache))
     namespace = {}
     for block in PYTHON:
         if block.document == document:

@@ -54,9 +54,8 @@ PHOTOMETRIC = {"inerf", "inerf_dagger", "pnerf", "icomma"}
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("room")
-    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room"), cache_dir=scene_cache)
 
 
 @pytest.fixture(scope="module", params=ESTIMATORS.names())

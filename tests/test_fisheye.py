@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -78,9 +79,8 @@ def test_a_lens_of_neither_model_is_seen_as_such() -> None:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("room")
-    return LoadedScene.load(write_room(folder / "room"), cache_dir=folder / "cache")
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room"), cache_dir=scene_cache)
 
 
 def taken_through(room: LoadedScene, k: tuple[float, float, float, float]) -> np.ndarray:

@@ -164,8 +164,8 @@ class Planted:
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    loaded = LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room"))
+def room(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    loaded = LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room"), cache_dir=scene_cache)
     loaded.image_matcher = Planted()
     return loaded
 

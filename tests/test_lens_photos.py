@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from io import BytesIO
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -35,8 +36,8 @@ RIGHT_UNITS = 0.05
 
 
 @pytest.fixture(scope="module")
-def studio(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    loaded = LoadedScene.load(STUDIO, cache_dir=tmp_path_factory.mktemp("cache"))
+def studio(scene_cache: Path) -> LoadedScene:
+    loaded = LoadedScene.load(STUDIO, cache_dir=scene_cache)
     loaded.prepare("view_index")
     return loaded
 

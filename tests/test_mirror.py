@@ -28,9 +28,9 @@ MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def symmetric(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("symmetric")
-    return LoadedScene.load(write_room(folder / "room", symmetric=True), cache_dir=folder / "cache")
+def symmetric(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    folder = tmp_path_factory.mktemp("symmetric") / "room"
+    return LoadedScene.load(write_room(folder, symmetric=True), cache_dir=scene_cache)
 
 
 @pytest.mark.parametrize("seed", rest_in_ci(0, 1, 2))
@@ -106,11 +106,11 @@ def test_gravity_of_a_rolled_camera_tells_whether_its_photo_is_mirrored(symmetri
 
 
 @pytest.mark.parametrize("kind", ["symmetric", *rest_in_ci("repeated", "ordinary")])
-def test_the_index_knows_what_a_scene_is_like(kind: str, tmp_path: Path) -> None:
+def test_the_index_knows_what_a_scene_is_like(kind: str, tmp_path: Path, scene_cache: Path) -> None:
     """Turned by a half a repeated room is the same, but not in a mirror; a symmetric one the other way round."""
     room = write_room(tmp_path / "room", repeated=kind == "repeated", symmetric=kind == "symmetric")
     for _ in range(2):  # the second reads what the first has stored
-        index = LoadedScene.load(room, cache_dir=tmp_path / "cache").prepare("view_index")
+        index = LoadedScene.load(room, cache_dir=scene_cache).prepare("view_index")
         assert index.repeats_itself == (kind == "repeated")
         assert index.like_its_mirror_image == (kind == "symmetric")
 

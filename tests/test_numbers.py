@@ -67,8 +67,8 @@ def room(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def at_origin(room) -> LoadedScene:
-    return LoadedScene.of(load_scene(room), rasterizer="cpu")
+def at_origin(room, scene_cache) -> LoadedScene:
+    return LoadedScene.of(load_scene(room), rasterizer="cpu", cache_dir=scene_cache)
 
 
 @pytest.fixture(scope="module")

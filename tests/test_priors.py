@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,9 +26,10 @@ TWIN = Pose(HALF_TURN @ TRUTH.world_from_camera)
 
 
 @pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("repeated")
-    return LoadedScene.load(write_room(folder / "room", repeated=True), cache_dir=folder / "cache")
+def repeated(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(
+        write_room(tmp_path_factory.mktemp("repeated") / "room", repeated=True), cache_dir=scene_cache
+    )
 
 
 def box_around(pose: Pose, size: float) -> BoxPrior:

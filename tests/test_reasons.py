@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,10 +35,10 @@ Rooms = dict[str, LoadedScene]
 
 
 @pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
+def rooms(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> Rooms:
     folder = tmp_path_factory.mktemp("rooms")
     kinds = {"ordinary": {}, "repeated": {"repeated": True}, "symmetric": {"symmetric": True}}
-    return {k: LoadedScene.load(write_room(folder / k, **how), cache_dir=folder / "cache") for k, how in kinds.items()}
+    return {k: LoadedScene.load(write_room(folder / k, **how), cache_dir=scene_cache) for k, how in kinds.items()}
 
 
 def judged(room: LoadedScene, query: Query, pose: Pose = TRUTH) -> Verdict:

@@ -34,12 +34,12 @@ MOUNTS = [Pose(WORLD_FROM_RIG.camera_from_world @ pose.world_from_camera) for po
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    return write_room(tmp_path_factory.mktemp("rig") / "room", 12)
+    return write_room(tmp_path_factory.mktemp("rig") / "room")
 
 
 @pytest.fixture(scope="module")
-def room(folder) -> LoadedScene:
-    loaded = LoadedScene.load(folder, cache_dir=folder / "cache")
+def room(folder, scene_cache) -> LoadedScene:
+    loaded = LoadedScene.load(folder, cache_dir=scene_cache)
     loaded.prepare("view_index")
     return loaded
 
@@ -89,9 +89,9 @@ def test_wrong_relative_poses_are_never_localized(room):
 
 
 @pytest.mark.ci
-def test_a_rig_in_a_room_that_repeats_itself_is_ambiguous_unless_a_heading_decides(tmp_path):
+def test_a_rig_in_a_room_that_repeats_itself_is_ambiguous_unless_a_heading_decides(tmp_path, scene_cache):
     """Each of its photos, and so the rig, has two places, half a turn apart."""
-    twice = LoadedScene.load(write_room(tmp_path / "room", 12, repeated=True), cache_dir=tmp_path)
+    twice = LoadedScene.load(write_room(tmp_path / "room", repeated=True), cache_dir=scene_cache)
     info = replace(twice.scene.info, geo_anchor=GeoAnchor(47.3, 8.5, 450.0, np.eye(4)))
     twice = replace(twice, scene=replace(twice.scene, info=info))
     first, *others = photos(twice, hidden=0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,9 +36,10 @@ from service.web.schemas.conversion import result_out
 
 
 @pytest.fixture(scope="module")
-def repeated(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    folder = tmp_path_factory.mktemp("repeated")
-    return LoadedScene.load(write_room(folder / "room", repeated=True), cache_dir=folder / "cache")
+def repeated(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
+    return LoadedScene.load(
+        write_room(tmp_path_factory.mktemp("repeated") / "room", repeated=True), cache_dir=scene_cache
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -97,10 +99,10 @@ def test_answers_are_ranked_by_what_they_leave_unexplained() -> None:
 
 
 @pytest.fixture(scope="module")
-def symmetric(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
+def symmetric(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> LoadedScene:
     """A room that is nearly its own mirror image, taken to repeat itself: colours decide."""
-    folder = tmp_path_factory.mktemp("symmetric")
-    loaded = LoadedScene.load(write_room(folder / "room", symmetric=True), cache_dir=folder / "cache")
+    room = write_room(tmp_path_factory.mktemp("symmetric") / "room", symmetric=True)
+    loaded = LoadedScene.load(room, cache_dir=scene_cache)
     loaded._prepared["view_index"] = replace(loaded.prepare("view_index"), repeats_itself=True)
     return loaded
 
