@@ -10,6 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -22,6 +23,9 @@ from test_scenes import ply
 from service.geometry import look_at, rotation_from_quat
 from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
+from service.pose.retrieval.stored_index import prepared_index
+from service.pose.retrieval.view_placement import PlacementConfig
+from service.pose.retrieval.viewpoints import ViewpointConfig
 from service.types import Camera, Intrinsics
 from service.web.key_file import add_key
 
@@ -44,10 +48,16 @@ def place(tmp_path_factory) -> Iterator[tuple[httpx.Client, str, Path]]:
     (folder / "scene.ply").write_bytes(ply())  # to be uploaded
     key = add_key(folder / "keys.json", "tester", "admin")
     changes = {"estimator": "view_index", "scenes": [room], "cache_dir": folder / "cache"}
-    with serving(create_app(settings(**changes, keys_file=folder / "keys.json"))) as client:
-        until_ready(client)
-        client.headers["Authorization"] = f"Bearer {key}"
-        yield client, key, folder
+    # The uploaded scene has no cameras, and nothing is looked for in it.
+    few = ViewpointConfig(
+        placement=PlacementConfig(volume_candidates=20, best=5, rounds=1, round_candidates=10, min_views=4, max_views=8)
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("service.estimators.view_index.prepared_index", partial(prepared_index, viewpoints=few))
+        with serving(create_app(settings(**changes, keys_file=folder / "keys.json"))) as client:
+            until_ready(client)
+            client.headers["Authorization"] = f"Bearer {key}"
+            yield client, key, folder
 
 
 def blocks(language: str) -> str:

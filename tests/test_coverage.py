@@ -82,8 +82,8 @@ def estimator() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def measured(room, estimator) -> tuple[LoadedScene, CoverageMap, list[tuple[int, int]]]:
-    loaded, seen = LoadedScene.load(room), []
+def measured(room, estimator, scene_cache) -> tuple[LoadedScene, CoverageMap, list[tuple[int, int]]]:
+    loaded, seen = LoadedScene.load(room, cache_dir=scene_cache), []
     how = Measurement(held_out_photos(room), lambda done, total: seen.append((done, total)), config=SMALL)
     return loaded, measured_coverage(loaded, how), seen
 
@@ -326,10 +326,12 @@ def test_the_drawing_has_the_colours_of_the_legend_where_the_cells_are():
     assert (np.abs(image.astype(int) - [190, 40, 40]).sum(2) < 10).any()
 
 
-def test_the_command_prints_writes_and_draws_and_inspect_tells_of_it(room, measured, tmp_path, monkeypatch):
-    monkeypatch.setenv("SPLATFIX_CACHE_DIR", str(tmp_path))
+def test_the_command_prints_writes_and_draws_and_inspect_tells_of_it(
+    room, measured, scene_cache, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("SPLATFIX_CACHE_DIR", str(scene_cache))
     loaded, found, _ = measured
-    write_coverage(found, coverage_file(tmp_path, loaded.searched, "cpu", "xfeat", held_out_photos(room)))
+    write_coverage(found, coverage_file(scene_cache, loaded.searched, "cpu", "xfeat", held_out_photos(room)))
     result = CliRunner().invoke(
         cli, ["scenes", "coverage", str(room), "--json", str(tmp_path / "c.json"), "--image", str(tmp_path / "c.png")]
     )

@@ -33,7 +33,7 @@ PARTS = PartsConfig(first_views=2, min_views=12)
 
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> LoadedScene:
-    return LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room"))
+    return LoadedScene.load(write_room(tmp_path_factory.mktemp("room") / "room", cameras=12))
 
 
 def tools(room: LoadedScene) -> Tools[None]:
@@ -57,13 +57,13 @@ def test_an_index_of_many_views_grows_by_doubling_and_ends_as_if_built_at_once(r
         patch.setattr("service.pose.retrieval.index_builder.WholeIndex", Watched)
         part = IndexBuilder(cameras, tools(room)).first_part(lambda index: replace(index, is_cut=True), PARTS)
         assert part.whole is not None
-        assert (len(part.views), part.whole.planned_views, part.is_cut) == (2, 24, False)
+        assert (len(part.views), part.whole.planned_views, part.is_cut) == (2, 12, False)
         assert part.repeats_itself  # as long as nobody looked
         assert part.whole.so_far() is part
         whole = part.whole.result()
     assert whole is not None
-    assert published == [2, 4, 8, 16]
-    assert (len(whole.views), whole.whole, whole.is_cut) == (24, None, True)
+    assert published == [2, 4, 8]
+    assert (len(whole.views), whole.whole, whole.is_cut) == (12, None, True)
     assert part.whole.so_far() is whole
     assert part.whole.result() is whole
     at_once = IndexBuilder(cameras, tools(room)).whole()
@@ -150,7 +150,7 @@ def test_a_photo_is_localized_by_the_first_views_and_the_answer_says_so(growing:
     assert found.verdict.status is Status.LOCALIZED
     assert max(pose_distance(found.pose, near)) < 0.2
     assert "await_index" not in {record.stage for record in found.records}
-    assert any("2 of 24 views were searched" in warning for warning in found.warnings)
+    assert any("2 of 12 views were searched" in warning for warning in found.warnings)
     assert len(growing.prepared(DEFAULT_ESTIMATOR).views) == 2
     growing.prepare(DEFAULT_ESTIMATOR)
     again = localize(photo_at(growing, near), growing)
@@ -167,7 +167,7 @@ def test_a_photo_that_the_first_views_do_not_show_is_found_in_the_whole_index(gr
     before = stages[: stages.index("await_index")]
     assert not {"retrieve_free_views", "sample_poses"} & set(before)
     assert not any("views were searched" in warning for warning in found.warnings)
-    assert len(growing.prepared(DEFAULT_ESTIMATOR).views) == 24
+    assert len(growing.prepared(DEFAULT_ESTIMATOR).views) == 12
     assert growing.prepare(DEFAULT_ESTIMATOR) is growing.prepared(DEFAULT_ESTIMATOR)
 
 
@@ -200,10 +200,10 @@ def test_an_estimator_without_preparation_has_none(room: LoadedScene, monkeypatc
 def test_a_scene_tells_how_far_its_index_is(growing: LoadedScene, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(entry_module, "estimated_bytes", lambda path: 1)
     entry = Entry("room", Path("room"), state="ready", loaded=growing)
-    assert entry.status().index == IndexStatus(2, 24)
+    assert entry.status().index == IndexStatus(2, 12)
     growing.warnings += ("one",)
     growing.prepare(DEFAULT_ESTIMATOR)
     status = entry.status()
-    assert (status.index, status.warnings) == (IndexStatus(24, 24), ("one",))
+    assert (status.index, status.warnings) == (IndexStatus(12, 12), ("one",))
     bare = Entry("bare", Path("room"), state="preparing", loaded=LoadedScene.of(growing.scene))
     assert bare.status().index is None
