@@ -2,7 +2,9 @@
 
 `{"version": 1, "value": ...}`: a dataclass is an object of its fields, an array nested lists, an enumeration its value,
 a tuple a list. What to read is given by the type hints, so nothing in the text chooses a class. A field with a default
-may be missing; other changes of what is stored need a new version, and a migration of the store.
+may be missing, and one that is not known, of a later release beside which this one runs, is left out. So fields may be
+added; one that a program of the release before must not leave out, a new value of an enumeration, and any other change
+need a migration of the store, which that program can't read.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ def encode(value: Any) -> str:
 def decode(kind: type[_T], text: str) -> _T:
     """Read a `kind` that `encode` wrote.
 
-    Raises ValueError for another version, KeyError for an unknown field, TypeError for a missing one.
+    Raises ValueError for another version, TypeError for a missing field.
     """
     envelope = json.loads(text)
     if envelope["version"] != VERSION:
@@ -61,7 +63,8 @@ def _typed(kind: Any, value: Any) -> Any:
         return _typed(_member(arguments, value), value)
     if dataclasses.is_dataclass(kind):
         hints = _hints(kind)  # type: ignore[arg-type]
-        return kind(**{name: _typed(hints[name], item) for name, item in value.items()})  # type: ignore[operator]
+        known = {name: _typed(hints[name], item) for name, item in value.items() if name in hints}
+        return kind(**known)  # type: ignore[operator]
     # The annotation has dtype and fixed dimensions, so they need not be stored.
     if isinstance(kind, type) and issubclass(kind, AbstractArray):
         return np.array(value, np.dtype(kind.dtypes[0])).reshape(_shape(kind, value))
@@ -85,28 +88,29 @@ def _member(members: tuple[Any, ...], value: Any) -> Any:
     """Return the member of a union that fits a JSON value by its type and, of an object, its fields."""
     if value is None:
         return type(None)
-    for member in members:
-        is_object = dataclasses.is_dataclass(member)
-        if is_object and isinstance(value, dict) and _has_fields(member, value):  # type: ignore[arg-type]
-            return member
+    if isinstance(value, dict):
+        fitting = [member for member in members if dataclasses.is_dataclass(member) and _has_fields(member, value)]
+    else:
         # Unions of the stored classes differ in their fields or in the JSON type.
-        if not is_object and member is not type(None) and _fits(member, value):
-            return member
-    raise ValueError(f"no member of {members} fits {type(value).__name__}")
+        plain = [member for member in members if not dataclasses.is_dataclass(member) and member is not type(None)]
+        fitting = [member for member in plain if _fits(member, value)]
+    if not fitting:
+        raise ValueError(f"no member of {members} fits {type(value).__name__}")
+    return fitting[0]
 
 
-def _has_fields(kind: type, value: dict[str, Any]) -> bool:
-    """Whether an object is of this dataclass: of its fields those with a default may be missing."""
-    fields = dataclasses.fields(kind)
+def _has_fields(kind: Any, value: dict[str, Any]) -> bool:
+    """Whether an object may be of this dataclass: has its fields but those with a default."""
     missing = (dataclasses.MISSING, dataclasses.MISSING)
-    needed = {field.name for field in fields if (field.default, field.default_factory) == missing}
-    return needed <= value.keys() <= {field.name for field in fields}
+    return {
+        field.name for field in dataclasses.fields(kind) if (field.default, field.default_factory) == missing
+    } <= value.keys()
 
 
 def _fits(member: Any, value: Any) -> bool:
     if isinstance(value, list):
         return typing.get_origin(member) is tuple or (isinstance(member, type) and issubclass(member, AbstractArray))
-    return not isinstance(value, dict) and typing.get_origin(member) is not tuple
+    return typing.get_origin(member) is not tuple
 
 
 @cache

@@ -52,14 +52,26 @@ class Part:
     starts: int = 0
     wanted: bool = True
     lock: threading.Lock = field(default_factory=threading.Lock)
+    folder: Path | None = None
+    """Where it runs."""
 
     def start(self) -> None:
         with self.lock, self.log.open("ab") as log:
             if self.wanted and (self.process is None or self.process.poll() is not None):
                 self.process = subprocess.Popen(
-                    self.command, env=self.environment, stdout=log, stderr=log, start_new_session=True
+                    self.command, env=self.environment, stdout=log, stderr=log, start_new_session=True, cwd=self.folder
                 )
                 self.starts += 1
+
+    def running(self) -> bool:
+        return self.process is not None and self.process.poll() is None
+
+    def end(self) -> None:
+        """Let it end, and don't start it again."""
+        assert self.process
+        self.wanted = False
+        self.process.terminate()
+        self.process.wait(90)
 
     def kill(self) -> None:
         """Kill it with all that it started."""
@@ -67,6 +79,20 @@ class Part:
             with suppress(ProcessLookupError):
                 os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
+
+
+def environment_of(tree: Path, ray: Path) -> dict[str, str]:
+    """Return the environment of a release's processes: those of the tree, with `ray` as the cluster's folder."""
+    paths = os.pathsep.join((str(HERE), str(tree)))
+    environment = os.environ | {"PYTHONPATH": paths, "RAY_AUTH_TOKEN": secrets.token_hex(32)}
+    return environment | {"RAY_AUTH_MODE": "token", "RAY_TMPDIR": str(ray), "RAY_DISABLE_IMPORT_WARNING": "1"}
+
+
+def head_command(port: int) -> list[str]:
+    """Return what runs a Ray cluster of two cores."""
+    ray = [str(Path(sys.executable).parent / "ray"), "start", "--head", "--block", f"--port={port}"]
+    ray += ["--node-ip-address=127.0.0.1", "--num-cpus=2", "--include-dashboard=false"]
+    return [*ray, "--object-store-memory=200000000", "--disable-usage-stats"]
 
 
 class Fleet:
@@ -81,13 +107,8 @@ class Fleet:
         self.database.start()
         stack.callback(self.database.stop, "immediate")
         self.address, head, ports = self.database.database(), free_port(), [free_port(), free_port()]
-        paths = os.pathsep.join((str(HERE), str(HERE.parent)))
-        environment = os.environ | {"PYTHONPATH": paths, "RAY_AUTH_TOKEN": secrets.token_hex(32)}
-        environment |= {"RAY_AUTH_MODE": "token", "RAY_TMPDIR": str(folder / "ray"), "RAY_DISABLE_IMPORT_WARNING": "1"}
-        ray = [str(Path(sys.executable).parent / "ray"), "start", "--head", "--block", f"--port={head}"]
-        ray += ["--node-ip-address=127.0.0.1", "--num-cpus=2", "--include-dashboard=false"]
-        ray += ["--object-store-memory=200000000", "--disable-usage-stats"]
-        self.head = Part(ray, environment, folder / "head.log")
+        environment = environment_of(HERE.parent, folder / "ray")
+        self.head = Part(head_command(head), environment, folder / "head.log")
         front = [sys.executable, str(HERE / "fleet_front.py"), self.address, f"127.0.0.1:{head}"]
         self.fronts = [
             Part([*front, str(port), str(folder)], environment, folder / f"front{port}.log") for port in ports
@@ -144,7 +165,7 @@ class Fleet:
 
 
 def replicas(folder: Path) -> list[int]:
-    """Return the ids of the processes that are replicas of this run's cluster."""
+    """Return the ids of the processes that are replicas of the cluster `ray` in a folder."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -206,14 +227,13 @@ def outages(up: list[tuple[float, bool]], made: list[tuple[float, str]]) -> dict
     return found
 
 
-def reckon(fleet: Fleet, outcome: Outcome, asked: int) -> dict:
+def reckon(address: str, outcome: Outcome, asked: int) -> dict:
     """Wait for the end of all jobs and compare what was promised with what there is."""
     import psycopg  # pyright: ignore[reportMissingImports]
 
-    fleet.await_ready()
     query = "SELECT id, state, attempt, result IS NOT NULL, failure IS NOT NULL, spec, idempotency_key FROM jobs"
     deadline, rows = time.monotonic() + 240, []
-    with psycopg.connect(fleet.address, autocommit=True) as database:
+    with psycopg.connect(address, autocommit=True) as database:
         while time.monotonic() < deadline:
             rows = database.execute(query).fetchall()
             if all(state in ENDED for _, state, *_ in rows):
@@ -250,7 +270,7 @@ def reckon(fleet: Fleet, outcome: Outcome, asked: int) -> dict:
     }
 
 
-def _copy_logs(source: Path, target: Path) -> None:
+def copy_logs(source: Path, target: Path) -> None:
     target.mkdir(parents=True, exist_ok=True)
     for log in source.glob("*.log"):
         shutil.copy(log, target)
@@ -266,7 +286,7 @@ def run(jobs: int, seed: int, troubles: Mapping[str, int] = TROUBLES, logs: Path
         folder = Path(temporary)
         folder.chmod(0o755)
         if logs:
-            stack.callback(_copy_logs, folder, logs)
+            stack.callback(copy_logs, folder, logs)
         fleet = Fleet(folder, stack)
         fleet.await_ready()
         helpers = [threading.Thread(target=watch, args=(fleet.url, done, up))]
@@ -281,7 +301,8 @@ def run(jobs: int, seed: int, troubles: Mapping[str, int] = TROUBLES, logs: Path
                         lambda f: outcome.wrong.append(repr(f.exception())) if f.exception() else None
                     )
             helpers[1].join()  # what is planned happens, though the clients may be done
-            report = reckon(fleet, outcome, jobs)
+            fleet.await_ready()
+            report = reckon(fleet.address, outcome, jobs)
         finally:
             done.set()
             for thread in helpers:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -21,35 +22,54 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
-@contextmanager
-def behind_nginx(ports: Sequence[int], folder: Path) -> Iterator[str]:
-    """Run nginx, as docker/nginx configures it, before the fronts at some ports, which may come and go; gives its URL.
+class Gateway:
+    """nginx, as docker/nginx configures it, before the fronts at some ports, which may come and go: one after another.
 
-    It takes them in turn.
+    `url` is its address.
     """
-    nginx = shutil.which("nginx")
-    if nginx is None:
-        pytest.skip("there is no nginx on this machine")
-    folder.mkdir()
-    given, front = ROOT / "docker" / "nginx", free_port()
-    gateway = (given / "gateway.conf").read_text("utf-8")
-    gateway = re.sub(r"/etc/nginx(/[\w./-]*)", lambda found: f'"{given}{found[1]}"', gateway)  # may have spaces
-    gateway = gateway.replace("listen 8080", f"listen 127.0.0.1:{front}").replace("splatfix:8000", "fronts")
-    servers = " ".join(f"server 127.0.0.1:{port} max_fails=0;" for port in ports)
-    kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
-    paths = " ".join(f'{kind}_temp_path "{folder}/{kind}";' for kind in kinds)
-    main = f'daemon off; master_process off; pid "{folder}/pid"; error_log "{folder}/log"; events {{}}'
-    (folder / "nginx.conf").write_text(
-        f"{main} http {{ access_log off; {paths} upstream fronts {{ {servers} }} {gateway} }}"
-    )
-    child = subprocess.Popen([nginx, "-p", folder, "-c", folder / "nginx.conf", "-e", folder / "log"])
-    try:
+
+    def __init__(self, ports: Sequence[int], folder: Path) -> None:
+        nginx = shutil.which("nginx")
+        if nginx is None:
+            pytest.skip("there is no nginx on this machine")
+        folder.mkdir()
+        self._folder, self._port = folder, free_port()
+        self.url = f"http://127.0.0.1:{self._port}"
+        self._configure(ports)
+        command = [nginx, "-p", folder, "-c", folder / "nginx.conf", "-e", folder / "log"]
+        self._process = subprocess.Popen(command)
         while True:
-            assert child.poll() is None, (folder / "log").read_text()
-            with suppress(OSError), socket.create_connection(("127.0.0.1", front), 1):
+            assert self._process.poll() is None, (folder / "log").read_text()
+            with suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 1):
                 break
             time.sleep(0.02)
-        yield f"http://127.0.0.1:{front}"
-    finally:
-        child.terminate()
-        child.wait(10)
+
+    def _configure(self, ports: Sequence[int]) -> None:
+        folder, given = self._folder, ROOT / "docker" / "nginx"
+        gateway = (given / "gateway.conf").read_text("utf-8")
+        gateway = re.sub(r"/etc/nginx(/[\w./-]*)", lambda found: f'"{given}{found[1]}"', gateway)  # may have spaces
+        gateway = gateway.replace("listen 8080", f"listen 127.0.0.1:{self._port}").replace("splatfix:8000", "fronts")
+        servers = " ".join(f"server 127.0.0.1:{port} max_fails=0;" for port in ports)
+        kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+        paths = " ".join(f'{kind}_temp_path "{folder}/{kind}";' for kind in kinds)
+        main = f'daemon off; worker_processes 1; pid "{folder}/pid"; error_log "{folder}/log"; events {{}}'
+        (folder / "nginx.conf").write_text(
+            f"{main} http {{ access_log off; {paths} upstream fronts {{ {servers} }} {gateway} }}"
+        )
+
+    def take(self, ports: Sequence[int]) -> None:
+        """Send new requests to these fronts; those under way stay where they are."""
+        self._configure(ports)
+        self._process.send_signal(signal.SIGHUP)
+        time.sleep(1)  # nginx doesn't tell when its new worker has begun
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait(10)
+
+
+@contextmanager
+def behind_nginx(ports: Sequence[int], folder: Path) -> Iterator[str]:
+    """Run nginx before the fronts at some ports; gives its URL."""
+    with closing(Gateway(ports, folder)) as gateway:
+        yield gateway.url

@@ -120,7 +120,7 @@ WRAPPED = {
     "yaml": {"service/web/openapi.py"},
     "websockets": {"service/web/viewer_relay.py", "service/live_client.py"},
     "httpx": {"service/web/viewer_relay.py", "service/client.py"},
-    "uvicorn": {"service/cli/server.py"},
+    "uvicorn": {"service/cli/server.py", "service/cli/graceful_server.py"},
     "cryptography": {"service/cli/local_certificate.py"},
     "segno": {"service/cli/qr_code.py"},
     "matplotlib": {"service/bench/paper/figures.py"},

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import sqlite3
+import threading
 import time
 from pathlib import Path
 from types import ModuleType
@@ -27,6 +29,7 @@ from stand_ins import make_scene
 
 import service.jobs.photo_store
 import service.web.app
+from service.cli.server import http_server
 from service.errors import StorageFailed
 from service.jobs.embedded_engine import EmbeddedEngine
 from service.jobs.sqlite_store import SqliteJobStore
@@ -130,6 +133,38 @@ def test_a_stopped_service_finishes_or_puts_back_what_runs(stepping, tmp_path, m
         for path, attempt in ((held, 2), (waiting, 1)):
             job = finished(client, path)
             assert (job["state"], job["attempt"]) == ("succeeded", attempt)
+
+
+def test_a_service_that_ends_answers_who_has_connected_and_ends_streams(stepping, tmp_path):
+    """A gateway that has connected may not send its request to another front any more."""
+    chosen, told = settings(data_dir=tmp_path, shutdown_s=0), []
+    served = create_app(chosen, {"room": make_scene()})
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        address = listener.getsockname()
+        with pytest.raises(ConnectionRefusedError):  # a gateway takes another front until this one has started
+            socket.create_connection(address)
+        server = http_server(served, chosen)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        with httpx.Client(base_url=f"http://127.0.0.1:{address[1]}", timeout=20, trust_env=False) as client:
+            until(lambda: server.started)
+            ready(client)
+            job = post(client, prefer="", options={"steps": 100, "pause_s": 0.1}).headers["location"]
+            with client.stream("GET", f"{job}/events") as stream:
+                lines = stream.iter_lines()
+                until(lambda: next(lines).startswith("id: "))
+                early = socket.create_connection(address)
+                server.should_exit = True
+                told += [line for line in lines if line.startswith("id: ")]  # raises where the stream breaks
+        with early:
+            early.sendall(b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert early.recv(100).startswith(b"HTTP/1.1 200")
+        thread.join()
+    assert "id: end" not in told
+    with serving(app(tmp_path)) as client:
+        assert client.get(job).json()["state"] in ("queued", "running")
+        client.delete(job)
 
 
 def test_a_folder_has_one_service(stepping, tmp_path):

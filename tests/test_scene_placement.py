@@ -348,7 +348,8 @@ def test_a_load_is_made_once_for_all_who_wait():
             await coordinator.remove("x")
         for found in held:
             await coordinator.release(found.held.token)
-        await coordinator.remove("x")
+        listed, _ = await asyncio.gather(coordinator.scenes(), coordinator.remove("x"))
+        assert "x" not in {scene.id for scene in listed}  # it went while they were asked one by one
         assert fleet.replicas[0].scenes == set()
         with pytest.raises(SceneNotFound):
             await coordinator.hold("f", "x")

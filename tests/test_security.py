@@ -12,6 +12,7 @@ import socket
 import stat
 import threading
 import time
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import httpx
@@ -23,6 +24,7 @@ from stand_ins import make_scene
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from service.cli.graceful_server import GracefulServer
 from service.cli.server import run
 from service.errors import InvalidRequest, QueueFull, StorageFailed
 from service.jobs.job_order import JobOrder
@@ -149,12 +151,12 @@ def test_serve_beyond_this_machine_makes_a_key_and_prints_it_in_the_url(stepping
     """On loopback, which is taken for something else: a test opens no door."""
     servers, out = [], io.StringIO()
 
-    class Server(uvicorn.Server):
-        def __init__(self, config: uvicorn.Config) -> None:
-            super().__init__(config)
+    class Server(GracefulServer):
+        def __init__(self, config: uvicorn.Config, dismiss: Callable[[], None]) -> None:
+            super().__init__(config, dismiss)
             servers.append(self)
 
-    monkeypatch.setattr("service.cli.server.uvicorn.Server", Server)
+    monkeypatch.setattr("service.cli.server.GracefulServer", Server)
     for place in ("service.cli.server", "service.web.app"):
         monkeypatch.setattr(f"{place}.is_loopback", lambda host: False)
     chosen = settings(port=0, keys_file=tmp_path / "none.json", data_dir=tmp_path / "data", log_json=False)

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from service import __version__
 from service.cli.example_request import curl_line
+from service.cli.graceful_server import GracefulServer
 from service.cli.local_certificate import fingerprint, local_addresses, local_certificate
 from service.cli.qr_code import qr_lines
 from service.errors import InvalidRequest
@@ -55,7 +56,7 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
             pass
         # After the port: the viewer gets the address of the service.
         application = create_app(settings, keys=keys)
-        server = _server(application, settings)
+        server = http_server(application, settings)
         logging.getLogger("service").setLevel(logging.INFO)
         # A lasting key isn't known here, only its hash.
         shell_key = key or ("$SPLATFIX_KEY" if keys else "")
@@ -67,8 +68,9 @@ def run(settings: Settings, out: Console, err: Console, browser: bool = False) -
         server.run(sockets=[listener])
 
 
-def _server(application: FastAPI, settings: Settings) -> uvicorn.Server:
-    return uvicorn.Server(
+def http_server(application: FastAPI, settings: Settings) -> uvicorn.Server:
+    """Return the server of an app; `run` serves on the sockets that it is given until SIGTERM or SIGINT."""
+    return GracefulServer(
         uvicorn.Config(
             application,
             # Its lines go through this process' handlers, like all others.
@@ -79,10 +81,12 @@ def _server(application: FastAPI, settings: Settings) -> uvicorn.Server:
             ws="websockets-sansio",
             ws_max_size=2**26,
             ws_per_message_deflate=False,  # scenes are sent whole: compressing them costs more than it saves
-            timeout_graceful_shutdown=_CONNECTIONS_S,
+            # Uploads may take as long as jobs.
+            timeout_graceful_shutdown=max(_CONNECTIONS_S, round(settings.shutdown_s)),
             ssl_certfile=settings.certificate if settings.https else None,
             ssl_keyfile=settings.certificate_key if settings.https else None,
-        )
+        ),
+        lambda: application.state.app_state.jobs.dismiss(),
     )
 
 
@@ -103,11 +107,19 @@ def _with_certificate(settings: Settings) -> Settings:
 
 
 def _listener(host: str, port: int) -> socket.socket:
+    """Return a bound socket, which listens once the server runs: until then a gateway takes another front."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
     try:
-        return socket.create_server((host, port), family=family)
+        if os.name == "posix":  # elsewhere it would let two processes have one port
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if family == socket.AF_INET6:
+            listener.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)
+        listener.bind((host, port))
     except OSError as error:
+        listener.close()
         raise InvalidRequest(f"can't listen there: {error.strerror}.", where=f"{host}:{port}") from error
+    return listener
 
 
 def _local_certificate(settings: Settings) -> Path | None:

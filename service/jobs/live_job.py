@@ -35,6 +35,7 @@ class LiveJob:
         """The attempt, 0 before the first, and its records: one value, so that readers never mix two attempts."""
         self.ended = threading.Event()
         """Its end is on disk, or it is over with this process."""
+        self._dismissed = threading.Event()
         self._heard = time.monotonic()
         self._listeners: set[Callable[[], None]] = set()
         self._lock = threading.Lock()
@@ -96,6 +97,11 @@ class LiveJob:
         self.ended.set()
         self.announce()
 
+    def dismiss(self) -> None:
+        """Send those away who listen; the job goes on."""
+        self._dismissed.set()
+        self.announce()
+
     def announce(self) -> None:
         """Wake those who listen."""
         with self._lock:
@@ -104,7 +110,10 @@ class LiveJob:
                     wake()
 
     async def changes(self) -> AsyncIterator[bool]:
-        """Yield `ended` at once and after each change, up to the first True. Changes may be merged."""
+        """Yield whether it is over for listeners, at once and after each change, up to the first True.
+
+        Changes may be merged.
+        """
         loop, changed = asyncio.get_running_loop(), asyncio.Event()
 
         def wake() -> None:
@@ -118,7 +127,7 @@ class LiveJob:
             while not ended:
                 # Cleared before `ended` is read: a change after that sets it again, and none is missed.
                 changed.clear()
-                ended = self.ended.is_set()
+                ended = self.ended.is_set() or self._dismissed.is_set()
                 yield ended
                 if not ended:
                     await changed.wait()

@@ -15,7 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from service.errors import Failure, SplatfixError
+from service.errors import Failure, SceneNotFound, SplatfixError
 from service.jobs.engine import HeldScenes
 from service.jobs.fleet_scenes import FleetScene, FleetScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
@@ -181,7 +181,11 @@ class SceneCoordinator:
 
     async def scenes(self) -> list[SceneStatus]:
         """Return all scenes with their states."""
-        return list(await asyncio.gather(*(self.scene(scene_id) for scene_id in list(self._scenes))))
+        found = await asyncio.gather(*map(self.scene, list(self._scenes)), return_exceptions=True)
+        if errors := [one for one in found if isinstance(one, BaseException) and not isinstance(one, SceneNotFound)]:
+            raise errors[0]
+        # Without those that were deleted while the others were asked.
+        return [one for one in found if isinstance(one, SceneStatus)]
 
     async def scene(self, scene_id: str | None) -> SceneStatus:
         """Return a scene; None: the only one. Raises SceneNotFound."""

@@ -92,6 +92,8 @@ class Jobs:
         self._shared = SharedJobs(watch, store, engine, self._queue, self._worker, take) if watch else None
         self._left_over = LeftOverPhotos(store, photos)
         self._renew_at = 0.0
+        self._dismissing = threading.Event()
+        """Set once this process is to end."""
         self._maintenance = threading.Thread(target=self._maintain, name="maintenance", daemon=True)
 
     def start(self) -> None:
@@ -137,7 +139,12 @@ class Jobs:
         return [self._current(job) for job in self._store.page(wanted, limit)]
 
     def live(self, job: StoredJob) -> LiveJob | None:
-        """Return the job as it goes on, here or at another front; None if it has ended. Not for the event loop."""
+        """Return the job as it goes on, here or at another front; None if it has ended, or nobody may wait for it.
+
+        Not for the event loop.
+        """
+        if self._dismissing.is_set():
+            return None
         if (live := self._live.get(job.id)) or self._shared is None or job.ended:
             return live
         return self._shared.follow(job)
@@ -239,6 +246,17 @@ class Jobs:
         if not self._store.delete(job.id) and job.id in self._store.ids():
             raise JobNotReady(f"the job is {job.state}.", where="job", hint="Cancel it first: DELETE /jobs/ID.")
         self._photos.delete(job.id)
+
+    def dismiss(self) -> None:
+        """Send all away who listen to jobs: what they wait for is told by the next process, or another one.
+
+        Jobs go on, and are accepted as before.
+        """
+        self._dismissing.set()
+        for live in tuple(self._live.values()):
+            live.dismiss()
+        if self._shared:
+            self._shared.dismiss()
 
     def close(self) -> None:
         """Let what runs finish within the grace period; the rest waits on disk for the next start."""

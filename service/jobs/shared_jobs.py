@@ -58,6 +58,12 @@ class SharedJobs:
         """Begin to listen."""
         self._thread.start()
 
+    def dismiss(self) -> None:
+        """Send all away who listen to jobs of other fronts."""
+        with self._lock:
+            for live in self._followed.values():
+                live.dismiss()
+
     def close(self) -> None:
         """Stop listening; for those who follow jobs it is over here."""
         self._closing.set()
