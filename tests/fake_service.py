@@ -254,7 +254,7 @@ class FakeService:
         self.jobs: list[FakeJob] = []
         self.scenes = ["ball"]
         """Ids; all have the same content."""
-        self.run = "first"
+        self.viewer_started = 0.0
         """Of the viewer."""
         self.pending: list[str] = []
         """What `/readyz` waits for."""
@@ -282,8 +282,8 @@ class FakeService:
                 self.port = port
 
             @property
-            def run(self) -> str:
-                return fake.run
+            def started(self) -> float:
+                return fake.viewer_started
 
         return _Upstream()
 

@@ -95,7 +95,7 @@ def routes(app: FastAPI) -> Iterator[str]:
 class Upstream:
     """A viewer that keeps the tokens that sockets are opened with."""
 
-    run = "1"
+    started = 0.0
 
     def __init__(self) -> None:
         self.tokens: list[str] = []
@@ -316,7 +316,7 @@ def test_the_viewer_shows_what_its_user_may_see(site):
     viewer = Viewer(lambda token: Client(url, token, use_proxy=False), "127.0.0.1", 0)
     ring = site.app.state.app_state.keys
     app = create_app(settings(estimator="view_index"), keys=ring)
-    app.include_router(Relay(SimpleNamespace(port=viewer.server.get_port(), run="1"), ring).router)
+    app.include_router(Relay(SimpleNamespace(port=viewer.server.get_port(), started=0.0), ring).router)
     try:
         with serving(app) as front, ExitStack() as opened:
             # The job of `vault` is asked for by both.

@@ -39,7 +39,7 @@ PAGE = b"<html><head></head>the one page</html>"
 @dataclass
 class Upstream:
     port: int
-    run: str = "a run"
+    started: float = 0.0
 
 
 class Viewer:

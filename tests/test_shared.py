@@ -75,8 +75,7 @@ def test_nobody_else_may_frame_the_page_unless_the_operator_says_so(service, mon
     assert service.client.get("/").headers["x-frame-options"] == "SAMEORIGIN"
 
 
-def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path, monkeypatch):
-    monkeypatch.setattr("service.web.api_keys._RECHECK_S", 0.0)
+def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path):
     file = tmp_path / "keys.json"
     key = add_key(file, "ann", "localize")
     ring = KeyRing(file)

@@ -52,7 +52,7 @@ def list_keys() -> None:
 
 @keys_app.command("remove")
 def remove_key(name: str) -> None:
-    """Delete a key; running services refuse it within a second."""
+    """Delete a key; running services refuse it at once."""
     from service.web import key_file
 
     key_file.remove_key(_keys_file(), name)

@@ -36,6 +36,7 @@ from service.jobs.model import (
     JobFilter,
     JobRecord,
     JobResult,
+    JobState,
     Retention,
     StoredJob,
 )
@@ -137,6 +138,11 @@ class Jobs:
     def page(self, wanted: JobFilter, limit: int) -> list[StoredJob]:
         """Return the newest jobs that fit, at most `limit`."""
         return [self._current(job) for job in self._store.page(wanted, limit)]
+
+    def unfinished(self, scene_id: str) -> int:
+        """Return how many jobs of a scene wait or run, at any front; at most 1000."""
+        states: tuple[JobState, ...] = "queued", "running"
+        return sum(len(self.page(JobFilter(scene=scene_id, state=state), 500)) for state in states)
 
     def live(self, job: StoredJob) -> LiveJob | None:
         """Return the job as it goes on, here or at another front; None if it has ended, or nobody may wait for it.

@@ -117,7 +117,8 @@ class SharedJobs:
             try:
                 self._look(self._watch.wait(_POLL_S))
             except StorageFailed as error:
-                self._worker.note_storage(error)
+                if not self._closing.is_set():  # else it is how the wait was ended
+                    self._worker.note_storage(error)
                 self._closing.wait(_POLL_S)
             except SplatfixError as error:  # of the engine
                 _log.warning("the jobs of other fronts: %s", error)

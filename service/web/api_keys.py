@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hmac
 import json
-import math
+import os
 import secrets
 import time
 from collections.abc import Iterator
@@ -29,8 +29,6 @@ from service.web.key_file import (
 
 _SESSION, _SHARED, _VIEWER = "session:", "share:", "viewer:"
 """Kinds of tokens. They are signed with the kind before them, so that none passes for one of another kind."""
-_RECHECK_S = 1.0
-"""Time between two checks of the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +63,7 @@ class KeyRing:
         self._temporary: list[StoredKey] = []
         # Until `keep_sessions`: tokens end with the process.
         self._secret = secrets.token_bytes()
-        self._read_at, self._stamp = 0.0, (0, 0)
+        self._stamp = (0, 0, 0)
         self._stored: list[StoredKey] = []
         self._refresh()
 
@@ -102,10 +100,7 @@ class KeyRing:
         """Make a key and store its hash; return the key. Raises InvalidRequest, StorageFailed."""
         if any(key.name == name for key in self._temporary):
             raise key_exists(name)
-        key = add_key(self._stored_in(), name, role, limits)
-        # The file is read again at the next request, not at the next check: the key is used at once.
-        self._read_at = -math.inf
-        return key
+        return add_key(self._stored_in(), name, role, limits)
 
     def remove(self, name: str) -> None:
         """Remove a key, with all that stands for it. Raises KeyNotFound, InvalidRequest, StorageFailed."""
@@ -114,7 +109,6 @@ class KeyRing:
             self._temporary = left
             return
         remove_key(self._stored_in(), name)
-        self._read_at = -math.inf
 
     def _stored_in(self) -> Path:
         if self._path is None:
@@ -194,16 +188,17 @@ class KeyRing:
         return hmac.new(self._secret, text.encode(), "sha256").hexdigest()
 
     def _refresh(self) -> None:
-        if self._path is None or time.monotonic() - self._read_at < _RECHECK_S:
+        if self._path is None:
             return
-        self._read_at = time.monotonic()
+        # Each time, for some microseconds: a key that another front has made or removed is known here at once.
         try:
-            found = self._path.stat()
+            found = os.stat(self._path)
         except FileNotFoundError:
             # Removed with its last key, or not there yet.
-            self._stored, self._stamp = [], (0, 0)
+            self._stored, self._stamp = [], (0, 0, 0)
             return
-        stamp = found.st_mtime_ns, found.st_size
+        # The file is replaced when it changes: another one may be as old and as large as the last.
+        stamp = found.st_ino, found.st_mtime_ns, found.st_size
         if stamp != self._stamp:
             self._stored, self._stamp = read_keys(self._path), stamp
 

@@ -160,14 +160,14 @@ async def _start(
     # Registered after the engine's, hence called before: running jobs need it until they end.
     stack.push_async_callback(to_thread.run_sync, jobs.close)
     await to_thread.run_sync(jobs.start)
-    if isinstance(scene_store, ObjectSceneStore):
-        watch = CatalogueWatch(scene_store, engine)
-        watch.start()
-        stack.push_async_callback(to_thread.run_sync, watch.close)
+    catalogue = CatalogueWatch(scene_store, engine) if isinstance(scene_store, ObjectSceneStore) else None
+    if catalogue:
+        catalogue.start()
+        stack.push_async_callback(to_thread.run_sync, catalogue.close)
     limits = anyio.CapacityLimiter(settings.jobs_at_once), anyio.CapacityLimiter(2)
     add_gauges(metrics, settings, engine, jobs, folder)
     anchors = FileAnchorStore(scene_store.find, settings.data_dir)
-    state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, shared, metrics, *limits)
+    state = AppState(settings, engine, scene_store, anchors, jobs, lenses, keys, shared, metrics, *limits, catalogue)
     metrics.gauge("live_sessions", "Open live sessions", (), lambda: {(): len(state.live)})
     return state
 

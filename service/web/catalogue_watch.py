@@ -14,12 +14,13 @@ _LOOK_S = 2.0
 
 
 class CatalogueWatch:
-    """Looks every two seconds, on a thread of its own."""
+    """Looks every two seconds, on a thread of its own, and whenever it is asked to."""
 
     def __init__(self, store: ObjectSceneStore, engine: Engine) -> None:
         self._store, self._engine = store, engine
         self._going: set[str] = set()
         """Deleted scenes that jobs still use here."""
+        self._lock = threading.Lock()
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="catalogue of scenes", daemon=True)
 
@@ -33,6 +34,10 @@ class CatalogueWatch:
 
     def look(self) -> None:
         """Look once. Raises StorageFailed."""
+        with self._lock:  # what one has seen changed, the next one takes for known
+            self._look()
+
+    def _look(self) -> None:
         found, gone = self._store.refresh()
         self._going |= set(gone)
         for scene in found:

@@ -160,7 +160,7 @@ def key_exists(name: str) -> InvalidRequest:
 
 
 def remove_key(path: Path, name: str) -> None:
-    """Remove a key; running services refuse it from the next second on.
+    """Remove a key; running services refuse it from the next request on.
 
     Raises KeyNotFound, InvalidRequest, StorageFailed.
     """

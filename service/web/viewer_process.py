@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-import secrets
 import socket
 import sys
 import time
@@ -35,7 +34,7 @@ class ViewerChild:
         # It finds modules where this process does, and not (-P) in a working directory that has a `viewer` of its own.
         self._environment = {"MALLOC_ARENA_MAX": "2"} | os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
         self.port = _free_port()
-        self.run = ""
+        self.started = 0.0
         self.command = [sys.executable, "-P", "-m", "viewer", "--service", service_url]
         self.command += ["--port", str(self.port), "--end-with-stdin"]
         self.command += ["--certificate", str(certificate)] if certificate else []
@@ -60,8 +59,7 @@ class ViewerChild:
             stdout=asyncio.subprocess.DEVNULL,
             env=self._environment,
         )
-        # Not the process id alone: after a restart in a container it may be the same.
-        self.run = f"{child.pid}-{secrets.token_hex(4)}"
+        self.started = time.monotonic()
         try:
             code = await child.wait()
             _log.warning("the viewer ended with code %s; it is started again", code)

@@ -5,13 +5,14 @@ The viewer's page derives the address of its WebSocket from its own: the page /v
 relay returns it for every path that the viewer has no file for. A header has the token with which the viewer asks the
 service: in the name of the browser's user, so that it shows what that one may see. A script (`static/viewer.js`) sets
 cookies with its time zone and whether it has a GPU; the relay passes them on as query parameters. The
-same script asks `/viewer-run` whether the viewer is still the one that the page was opened with.
+same script asks `/viewer-run` whether the viewer was started after the page was opened.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Coroutine
 from contextlib import suppress
 from typing import Any, Protocol, runtime_checkable
@@ -40,10 +41,8 @@ class Upstream(Protocol):
     port: int
     """On loopback. Nothing may listen there, while the viewer starts."""
 
-    @property
-    def run(self) -> str:
-        """Another text for each process that has listened there."""
-        ...
+    started: float
+    """When the process that listens there was started, by `time.monotonic`."""
 
 
 class Relay:
@@ -77,10 +76,14 @@ class Relay:
         return Response(content, answer.status_code, media_type=kind)
 
     @route_policy(role="read")
-    async def _run(self) -> str:
-        """Return which run of the viewer answers: an open page belongs to one, and is loaded anew for the next."""
+    async def _run(self) -> float:
+        """Return for how many seconds the viewer has run: a page that was opened before is loaded anew.
+
+        Behind a gateway any front answers, of whose viewer the page knows nothing; but one that has run for longer than
+        the page is open has not come after the page's own.
+        """
         await self._ask("")
-        return self._upstream.run
+        return time.monotonic() - self._upstream.started
 
     async def _ask(self, path: str) -> httpx.Response:
         try:

@@ -28,7 +28,7 @@ GET    /capabilities, /version, /livez, /readyz, /metrics
 
 from __future__ import annotations
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Depends
 
 from service.web.routes import (
     anchors,
@@ -44,7 +44,10 @@ from service.web.routes import (
     shared,
     system,
 )
+from service.web.routes.dependencies import see_other_fronts_scenes
 
 router = APIRouter()
-for part in (localize, geopose, jobs, shared, scenes, anchors, coverage, registrations, live, lenses, keys, system):
+for part in (localize, geopose, jobs, shared, lenses, keys, system):
     router.include_router(part.router)
+for part in (scenes, anchors, coverage, registrations, live):
+    router.include_router(part.router, dependencies=[Depends(see_other_fronts_scenes)])

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
 import anyio
 from anyio import to_thread
 from fastapi import Depends, Path, Request
+from fastapi.requests import HTTPConnection
 
-from service.errors import CorruptScene, JobNotFound, SceneNotFound
+from service.errors import CorruptScene, JobNotFound, SceneNotFound, StorageFailed
 from service.jobs.engine import Engine
 from service.jobs.model import StoredJob
 from service.jobs.service import Jobs
@@ -22,6 +23,7 @@ from service.scene_manager.scene_errors import nothing_to_search
 from service.scene_manager.scene_store import SceneStore
 from service.scene_manager.status import AUTO, SceneStatus
 from service.web.api_keys import Caller, KeyRing
+from service.web.catalogue_watch import CatalogueWatch
 from service.web.key_file import UNLIMITED, KeyLimits
 from service.web.metrics import Metrics
 from service.web.schemas import resources
@@ -49,8 +51,26 @@ class AppState:
     """Limits the photos that are decoded at once: one may take 450 MB."""
     rendering: anyio.CapacityLimiter
     """Limits the images that are rendered at once for clients: each thread of a renderer keeps working memory."""
+    catalogue: CatalogueWatch | None = None
+    """Knows of scenes that other fronts add and delete; None: there are no others."""
     live: set[str] = field(default_factory=set)
     """Live sessions under way at this front."""
+
+    def known_scenes(self, asked: Collection[str] = ()) -> list[SceneStatus]:
+        """Return all scenes, after a look at what other fronts have added if one that is asked for isn't known."""
+        known = self.engine.scenes()
+        if self.catalogue is None or set(asked) <= {AUTO, *(scene.id for scene in known)}:
+            return known
+        self.look_at_catalogue()
+        return self.engine.scenes()
+
+    def look_at_catalogue(self) -> None:
+        """See what other fronts have added and deleted; without the object store what is known stays."""
+        try:
+            if self.catalogue:
+                self.catalogue.look()
+        except StorageFailed as error:
+            _log.warning("the catalogue of scenes can't be looked at: %s", error)
 
     async def render_in_thread(self, scene_id: str, draw: Callable[[], bytes]) -> bytes:
         """Render an image for a client in a thread, and count it in the metrics."""
@@ -113,8 +133,20 @@ class Visible:
         return found
 
 
-def _app_state(request: Request) -> AppState:
-    return request.app.state.app_state
+def _app_state(connection: HTTPConnection) -> AppState:
+    return connection.app.state.app_state
+
+
+async def see_other_fronts_scenes(connection: HTTPConnection, app_state: AppStateOf) -> None:
+    """See what other fronts have added and deleted, before a request that lists or describes scenes, or names one that
+    isn't known here: the front that was asked before may have answered with it."""
+    if app_state.catalogue is None:
+        return
+    # Not before each request: a look takes one to the object store.
+    if connection.scope["route"].path in ("/scenes", "/scenes/{scene_id}"):
+        await to_thread.run_sync(app_state.look_at_catalogue)
+    elif scene_id := connection.path_params.get("scene_id"):
+        await to_thread.run_sync(app_state.known_scenes, (scene_id,))
 
 
 def _root(request: Request) -> str:

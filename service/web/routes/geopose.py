@@ -95,7 +95,7 @@ def _anchored_scene(
 
     Raises SceneError, NoGeoAnchor.
     """
-    known = app_state.engine.scenes()
+    known = app_state.known_scenes([asked] if asked else ())
     if asked:
         visible.asked(asked, known)  # raises SceneNotFound
     named = asked or gpp.nearest_scene(visible.scenes(known), wanted)

@@ -150,7 +150,8 @@ async def create_job(
         absent = {name for name in later if getattr(fields, name) is None}
         digest = hashlib.sha256((fields.model_dump_json(exclude=absent) + sha256).encode()).hexdigest()
         spec = job_spec(fields, app_state.settings.estimator)
-        spec = replace(spec, scene=visible.asked(spec.scene, app_state.engine.scenes()))
+        named = (spec.scene,) if isinstance(spec.scene, str) else spec.scene or ()
+        spec = replace(spec, scene=visible.asked(spec.scene, app_state.known_scenes(named)))
         most = most_queued(request.state.caller, app_state.settings.queue_size)
         order = JobOrder(body.photo, body.name, sha256, spec, client, idempotency_key, digest, client, most)
         return app_state.jobs.accept(order)

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from service.errors import SceneExists, SceneInUse
 from service.scene_manager import splat_sample as splats
+from service.scene_manager.scene_errors import scene_in_use
 from service.scene_manager.scene_images import PICTURE_TYPES
 from service.scene_manager.status import PictureSpec
 from service.web.route_policy import SCENE_BODY, SMALL_BODY, route_policy
@@ -112,7 +113,9 @@ def delete_scene(scene_id: str, app_state: AppStateOf) -> None:
     stored = app_state.scene_store.find(scene_id)
     if stored is None or not stored.uploaded:
         raise SceneInUse("this scene is in the service's settings; it can only be unloaded.", where="scene")
-    # First from the engine, which refuses while jobs use it.
+    # The engine refuses while jobs of its own use it; those of other fronts are in the store.
+    if used := app_state.jobs.unfinished(scene_id):
+        raise scene_in_use(used)
     app_state.engine.remove(scene_id)
     app_state.scene_store.delete(scene_id)
 

@@ -30,9 +30,11 @@ document.addEventListener("click", event => {
 
 // The page belongs to one run of the viewer, with which its state ends. After a restart, be it of the service with
 // another version of viser's page, it is loaded anew at once, so that it is there when the scenes are; until then a bar
-// says why nothing moves.
+// says why nothing moves. Of several services behind one address any answers: a viewer that was started before the page
+// was opened does not replace the page's own.
 const CHECK_MS = 1000;
-let run = null, ready = false;
+const opened = Date.now(); // not performance.now(), which stands still while a computer sleeps
+let ready = false;
 
 async function check() {
   if (!document.hidden) {
@@ -45,6 +47,7 @@ async function check() {
 }
 
 async function compare() {
+  const open_s = (Date.now() - opened) / 1000; // before it is asked: the answer takes its time
   const answer = await fetch(new URL("viewer-run", root), { cache: "no-store" });
   if (answer.status === 401) {
     const then = encodeURIComponent(location.pathname.slice(root.pathname.length));
@@ -52,9 +55,7 @@ async function compare() {
     return;
   }
   if (!answer.ok) throw new Error(answer.status);
-  const current = await answer.text();
-  run ??= current;
-  if (run !== current) {
+  if (await answer.json() < open_s) {
     location.reload();
     return;
   }
