@@ -66,8 +66,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def room(folder) -> LoadedScene:
-    loaded = LoadedScene.load(folder, cache_dir=folder / "cache")
+def room(folder, scene_cache) -> LoadedScene:
+    loaded = LoadedScene.load(folder, cache_dir=scene_cache)
     loaded.prepare("view_index")
     return loaded
 
@@ -225,9 +225,9 @@ class TestBench:
             assert nearest[0] < bench.SEQUENCE.step_deg
             assert nearest[1] < bench.SEQUENCE.step_units
 
-    def test_the_outcome_counts_what_happened(self, folder):
+    def test_the_outcome_counts_what_happened(self, folder, scene_cache):
         shown, wall, cpu = [], time.perf_counter(), time.process_time()
-        outcome = bench.run(folder, frames=8, seed=3, progress=lambda *now: shown.append(now))
+        outcome = bench.run(folder, frames=8, seed=3, progress=lambda *now: shown.append(now), cache_dir=scene_cache)
         assert shown == [(k, 8) for k in range(1, 9)]
         assert (outcome["frames"], outcome["followed"], outcome["false_localized"]) == (8, 7, 0)
         assert outcome["success_1deg_0p01"] == 1.0
