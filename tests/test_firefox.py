@@ -26,9 +26,9 @@ STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
 
 
 @pytest.fixture(scope="module")
-def url() -> Iterator[str]:
+def url(scene_cache: Path) -> Iterator[str]:
     port = free_port()
-    with served(create_app(Settings(scenes=[STUDIO], port=port, cache_dir=None)), port) as url:
+    with served(create_app(Settings(scenes=[STUDIO], port=port, cache_dir=scene_cache)), port) as url:
         until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         yield url
 

@@ -49,9 +49,9 @@ def film(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def url(scene: Path) -> Iterator[str]:
+def url(scene: Path, scene_cache: Path) -> Iterator[str]:
     port = free_port()
-    with served(create_app(Settings(scenes=[scene], port=port, cache_dir=None, viewer=False)), port) as url:
+    with served(create_app(Settings(scenes=[scene], port=port, cache_dir=scene_cache, viewer=False)), port) as url:
         until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         yield url
 
@@ -99,8 +99,8 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
     expect(page.locator(".verdict .badge")).to_have_text("Off")
 
 
-def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path) -> None:
-    port, settings = free_port(), {"scenes": [scene], "cache_dir": None, "viewer": False}
+def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path, scene_cache: Path) -> None:
+    port, settings = free_port(), {"scenes": [scene], "cache_dir": scene_cache, "viewer": False}
     with served(create_app(Settings(port=port, **settings)), port) as url:
         until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
         page = opened(browser, f"{url}/live", 390, 844)

@@ -48,10 +48,10 @@ FOG = Image.linear_gradient("L").resize((320, 240)).convert("RGB")
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def url(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> Iterator[str]:
     port = free_port()
     room = write_room(tmp_path_factory.mktemp("scenes") / "room")
-    settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=None)
+    settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=scene_cache)
     with served(create_app(settings), port) as url:
         until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)  # kernels may be compiled
         yield url
@@ -840,13 +840,15 @@ def test_a_sequences_photo_is_the_one_of_the_shown_pose(page: Page, url: str) ->
 
 @pytest.mark.parametrize("nginx", [False, True], ids=["direct", "nginx"])
 @pytest.mark.parametrize("keys", [True, False], ids=["keys", "open"])
-def test_a_page_and_a_viewer_live_on_after_a_restart(browser: Browser, tmp_path: Path, keys: bool, nginx: bool) -> None:
+def test_a_page_and_a_viewer_live_on_after_a_restart(
+    browser: Browser, tmp_path: Path, scene_cache: Path, keys: bool, nginx: bool
+) -> None:
     port, room = free_port(), write_room(tmp_path / "room")
     key = add_key(tmp_path / "keys.json", "tester", "localize") if keys else ""
     chosen = Settings(
         scenes=[room],
         port=port,
-        cache_dir=None,
+        cache_dir=scene_cache,
         data_dir=tmp_path / "data",
         keys_file=tmp_path / "keys.json",
         shutdown_s=0,
