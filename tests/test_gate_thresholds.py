@@ -11,7 +11,8 @@ import pytest
 
 from service.accuracy import Accuracy
 from service.geometry import look_at, moved
-from service.interfaces import Frame
+from service.interfaces import Features, Frame
+from service.pose.features.rendered_views import View
 from service.pose.matching.correspondences import Correspondences
 from service.pose.refinement.lens_test import LensFit, moves_pose
 from service.pose.refinement.uncertainty import PoseIfCropped, PoseUncertainty
@@ -408,8 +409,9 @@ def test_a_pose_is_outside_if_less_than_half_of_what_it_sees_was_captured() -> N
     for away, turned, beside in ((1.9, 44, True), (2.1, 44, False), (1.9, 46, False)):
         pose = moved(HERE, np.array([0, np.radians(turned), 0, 0, 0, 0]))
         pose = Pose(np.block([[pose.world_from_camera[:3, :3], np.array([[away], [0], [0]])], [0, 0, 0, 1]]))
-        view = SimpleNamespace(camera=Camera(lens, HERE), points_in_world=np.array([[0, 0, 4.0]] * 3))
-        assert is_outside(lens, pose, Rendered(1.0), [view]) is not beside  # type: ignore[arg-type,list-item]
+        nothing = Features(*(np.zeros(shape, np.float32) for shape in ((3, 2), (3,), (3, 64))))
+        view = View(Camera(lens, HERE), nothing, np.array([[0, 0, 4.0]] * 3, np.float32))
+        assert is_outside(lens, pose, Rendered(1.0), [view]) is not beside  # type: ignore[arg-type]
 
 
 # ------------------------------------------------------------------ what is said about a photo
