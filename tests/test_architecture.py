@@ -124,7 +124,7 @@ WRAPPED = {
     "cryptography": {"service/cli/local_certificate.py"},
     "segno": {"service/cli/qr_code.py"},
     "matplotlib": {"service/bench/paper/figures.py"},
-    "ray": {"service/jobs/ray_engine.py"},
+    "ray": {"service/jobs/ray_engine.py", "service/jobs/ray_calls.py"},
     "pycolmap": {"service/bench/peer/colmap.py"},
     "obstore": {"service/s3_objects.py"},
     "psycopg": {"service/jobs/postgres_database.py"},

@@ -11,9 +11,9 @@ import logging
 import os
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -28,6 +28,7 @@ from service.errors import SceneNotFound, SceneNotReady, SplatfixError
 from service.jobs.embedded_engine import EngineConfig, with_left_out
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.jobs.placement import PlacementConfig
+from service.jobs.ray_calls import call, stream
 from service.jobs.ray_config import RayConfig
 from service.jobs.replica import Replica, SetUp
 from service.jobs.scene_coordinator import HeldAt, SceneCoordinator
@@ -59,7 +60,9 @@ class RayEngine:
         self._config, self._ray, self._set_up = config, ray_config, set_up
         self._front = secrets.token_hex(8)
         self._scenes: dict[str, tuple[StoredScene, bool]] = {}
-        self._held: dict[str, HeldAt] = {}
+        self._held: dict[str, _Held] = {}
+        self._handles: dict[str, Any] = {}
+        """Replicas by their names."""
         self._running: dict[str, Any] = {}
         """The replica of each attempt."""
         self._coordinator: Any = None
@@ -88,6 +91,8 @@ class RayEngine:
                 # Ray's default is a share of the machine's memory, which scenes need.
                 "object_store_memory": 500_000_000,
             }
+            # Ray's default, 15, lets replicas wait for all else on the machine.
+            os.environ.setdefault("RAY_worker_niceness", "0")
             where: dict[str, Any] = {"address": self._ray.address} if self._ray.address else local
             ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
 
@@ -109,8 +114,8 @@ class RayEngine:
         )
         coordinator = named.remote(spawn, (RayActorError,), placed, _expected_bytes)
         for scene, required in tuple(self._scenes.values()):
-            _call(coordinator, "add", scene, required)
-        _call(coordinator, "start", self._ray.replicas)
+            call(coordinator, "add", scene, required)
+        call(coordinator, "start", self._ray.replicas)
         # Last: jobs that asked it before would hear that their scenes are unknown.
         self._coordinator = coordinator
 
@@ -188,8 +193,14 @@ class RayEngine:
         threading.Thread(target=wait, name="hold", daemon=True).start()
 
     def _keep(self, found: HeldAt) -> HeldScenes:
-        self._held[found.held.token] = found
+        self._held[found.held.token] = _Held(found.held, self._handle(found.replica))
         return found.held
+
+    def _handle(self, name: str) -> Any:
+        handle = self._handles.get(name) or self._ask("handle", name)
+        if handle:
+            self._handles[name] = handle
+        return handle
 
     def release(self, token: str) -> None:
         if self._held.pop(token, None):
@@ -210,7 +221,7 @@ class RayEngine:
             raise EngineLost
         self._running[task.id] = held.replica
         try:
-            for kind, value in self._stream(held.replica.localize, task):
+            for kind, value in stream(held.replica.localize, task):
                 if kind == "answer":
                     return replace(value, result=with_left_out(value.result, held.held.left_out))
                 on_record(*value)
@@ -225,7 +236,7 @@ class RayEngine:
         if replica := self._running.get(task_id):
             with suppress(RayError):
                 # Waited for: the next record must not overtake it.
-                _answer(replica.cancel.remote(task_id))
+                call(replica, "cancel", task_id)
 
     def live(self, task: LiveTask, next_frame: NextFrame, on_answer: OnAnswer) -> None:
         held = self._held.get(task.held)
@@ -235,7 +246,7 @@ class RayEngine:
             raise EngineLost
         session = secrets.token_hex(8)
         try:
-            for kind, value in self._stream(held.replica.live, session, task):
+            for kind, value in stream(held.replica.live, session, task):
                 if kind == "frame?":
                     held.replica.frame.remote(session, next_frame())
                 elif kind == "record":
@@ -276,7 +287,7 @@ class RayEngine:
         try:
             if coordinator is None:
                 raise RayError("this process is in no cluster.")
-            return _call(coordinator, name, *arguments)
+            return call(coordinator, name, *arguments)
         except (RayTaskError, SplatfixError):
             raise
         except RayError as error:
@@ -315,6 +326,7 @@ class RayEngine:
     def _forget_replicas(self) -> None:
         """Let nobody call the replicas of a cluster that was lost."""
         self._running.clear()
+        self._handles.clear()
         self._held = {token: replace(found, replica=None) for token, found in self._held.items()}
 
     def _ask_replica(self, scene_id: str, name: str, *arguments: Any) -> Any:
@@ -328,59 +340,24 @@ class RayEngine:
     def _call_replica(self, replica: Any, name: str, *arguments: Any) -> Any:
         """Call the engine of a replica. Raises what it raises, and _ReplicaGone."""
         try:
-            return _call(replica, "ask", name, *arguments)
+            return call(replica, "ask", name, *arguments)
         except RayTaskError:
             raise
         except RayError:
             raise _ReplicaGone("the scene's process ended.", where="scene", hint="Try again later.") from None
 
-    def _stream(self, method: Any, *arguments: Any) -> Iterator[Any]:
-        """Yield what a method of a replica yields. Raises what it raises, and EngineLost."""
-        try:
-            messages = method.options(num_returns="streaming").remote(*arguments)
-            while (message := _waited(partial(next, messages, None))) is not None:
-                with _own_errors():
-                    found = _answer(message)
-                yield found
-        except RayTaskError:  # a bug in the replica
-            raise
-        except RayError as error:
-            raise EngineLost from error
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    held: HeldScenes
+    replica: Any
+    """Its handle; None once it can't be called any more."""
 
 
 class _CoordinatorGone(SceneNotReady): ...
 
 
 class _ReplicaGone(SceneNotReady): ...
-
-
-def _call(actor: Any, name: str, *arguments: Any) -> Any:
-    with _own_errors():
-        return _answer(getattr(actor, name).remote(*arguments))
-
-
-def _answer(call: Any) -> Any:
-    return _waited(partial(ray.get, call))
-
-
-def _waited(wait: Callable[[], Any]) -> Any:
-    """Return what is waited for. Raises RayError where another thread leaves the cluster meanwhile: Ray itself raises
-    SystemExit there, by which a worker's thread would end, and nobody its attempt."""
-    try:
-        return wait()
-    except SystemExit:
-        raise RayError("the cluster was left.") from None
-
-
-class _own_errors:
-    """Raises errors of our own as they were raised in the actor."""
-
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        cause = getattr(error, "cause", None) if isinstance(error, RayTaskError) else None
-        if isinstance(cause, Exception):
-            raise cause from None
 
 
 def _expected_bytes(scene: StoredScene) -> int:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import secrets
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
-from service.errors import Failure, SceneNotFound, SplatfixError
+from service.errors import Failure, SplatfixError
 from service.jobs.engine import HeldScenes
 from service.jobs.fleet_scenes import FleetScene, FleetScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
@@ -34,8 +35,8 @@ class HeldAt:
     """Scenes that are held, and the replica where they are."""
 
     held: HeldScenes
-    replica: Any
-    """Its handle."""
+    replica: str
+    """Its name: an answer with a handle takes some ms longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,6 @@ class SceneCoordinator:
         self._holds: dict[str, _Hold] = {}
         self._fronts: dict[str, float] = {}
         self._changed = asyncio.Event()
-        self._started = 0
         self._tasks: set[asyncio.Task[Any]] = set()
 
     # ------------------------------------------------------------------ replicas
@@ -82,8 +82,8 @@ class SceneCoordinator:
                 self._in_background(self._preload(scene_id))
 
     async def _start_replica(self) -> None:
-        self._started += 1
-        name, handle = f"r{self._started}", self._spawn()
+        # Fronts keep handles by these names, also of a coordinator before this one.
+        name, handle = secrets.token_hex(4), self._spawn()
         built_in = await handle.built_in.remote()
         self._replicas[name] = handle
         self._placement.add_replica(name)
@@ -180,17 +180,15 @@ class SceneCoordinator:
         return await self.scene(scene_id)
 
     async def scenes(self) -> list[SceneStatus]:
-        """Return all scenes with their states."""
-        found = await asyncio.gather(*map(self.scene, list(self._scenes)), return_exceptions=True)
-        if errors := [one for one in found if isinstance(one, BaseException) and not isinstance(one, SceneNotFound)]:
-            raise errors[0]
-        # Without those that were deleted while the others were asked.
-        return [one for one in found if isinstance(one, SceneStatus)]
+        """Return all scenes with their states, as they are now: one may be deleted while the others are asked."""
+        return list(await asyncio.gather(*(self._status(*known) for known in list(self._scenes.items()))))
 
     async def scene(self, scene_id: str | None) -> SceneStatus:
         """Return a scene; None: the only one. Raises SceneNotFound."""
         scene = self._scenes.named(scene_id)
-        scene_id = next(name for name, other in self._scenes.items() if other is scene)
+        return await self._status(next(name for name, other in self._scenes.items() if other is scene), scene)
+
+    async def _status(self, scene_id: str, scene: FleetScene) -> SceneStatus:
         copies, jobs = self._placement.copies(scene_id), self._jobs(scene_id)
         uploaded = scene.stored is not None and scene.stored.uploaded
         ready = [name for name, copy in copies.items() if copy.ready]
@@ -237,6 +235,10 @@ class SceneCoordinator:
         if not copies:
             self._in_background(self._preload(scene_id))
         raise scene_not_ready(scene_id, "loading")
+
+    async def handle(self, name: str) -> Any:
+        """Return the handle of a replica; None if it has ended."""
+        return self._replicas.get(name)
 
     async def hold(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
         """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded."""
@@ -290,7 +292,7 @@ class SceneCoordinator:
 
     async def _hold_at(self, front: str, choice: Choice, ids: tuple[str, ...], left_out: tuple[str, ...]) -> HeldAt:
         """Carry out a choice: drop, load, hold."""
-        # Nothing is awaited up to the call: replicas get calls in the order of the decisions.
+        # Nothing is awaited up to the call, so that replicas get calls in order.
         self._placement.take(choice, ids)
         stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
         call = self._replicas[choice.replica].hold.remote(choice.drop, stored, ids)
@@ -304,7 +306,7 @@ class SceneCoordinator:
         except asyncio.CancelledError:
             task.add_done_callback(self._release_unwanted)
             raise
-        return HeldAt(replace(held, left_out=left_out), self._replicas[choice.replica])
+        return HeldAt(replace(held, left_out=left_out), choice.replica)
 
     async def _copy(self, extra: Choice, scene_id: str) -> None:
         """Load another copy of a scene, beside the jobs."""
@@ -359,8 +361,9 @@ class SceneCoordinator:
         """Load and prepare a scene that no job waits for; without effect if that isn't possible."""
         try:
             held = await self.hold_later("", scene_id)
-            with suppress(SplatfixError):
-                await held.replica.prepared.remote(scene_id)
+            if handle := self._replicas.get(held.replica):
+                with suppress(ReplicaLost):
+                    await self._asked(held.replica, handle.prepared.remote(scene_id))
             await self.release(held.held.token)
         finally:
             if scene := self._scenes.get(scene_id):
