@@ -13,7 +13,11 @@ export PYTHONDONTWRITEBYTECODE :=
 # Four on two cores, too: tests of servers mostly wait.
 PYTEST := $(BIN)/pytest -n 4 --dist loadfile
 
-.PHONY: setup demo test test-fleet coverage newest lint check release-check studio another-day clean
+GATEWAY_TESTS := $(addprefix tests/test_,$(addsuffix .py,anchors api client client_js clients coverage durable hostile \
+	key_scopes keys_api lens_memory live registration_api report rig route_policy scene_memory scenes security sequences \
+	shared web_limits pages live_page browser))
+
+.PHONY: setup demo test test-fleet test-gateway coverage newest lint check release-check studio another-day clean
 
 setup: .venv/ready
 
@@ -45,6 +49,12 @@ test-fleet: setup
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,postgres,ray,cloud,s3server,peer]"
 	$(BIN)/pytest -rs tests/test_fronts.py tests/test_shared_state.py tests/test_object_store.py tests/test_gateway.py tests/test_ray.py tests/test_engine_contract.py tests/test_store_contracts.py tests/test_lenses.py \
 		tests/test_bench_peer.py tests/test_fleet_faults.py
+	SPLATFIX_TEST_GATEWAY=1 $(BIN)/pytest -n 0 tests/test_shared.py tests/test_keys_api.py tests/test_key_scopes.py
+
+# By hand, after `make test-fleet`: the tests of the API and of the pages, each through nginx that takes two fronts in
+# turn, with keys. `tests/two_fronts.py` lists those that can't.
+test-gateway:
+	SPLATFIX_TEST_GATEWAY=1 $(BIN)/pytest -n 0 -rs $(GATEWAY_TESTS)
 
 # All tests. Those of `make test` tell which lines they run in their own process; the others, among them live cameras
 # and other tests by the clock, run without a tracer and one a core.

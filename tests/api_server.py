@@ -26,6 +26,7 @@ from fastapi import FastAPI
 from PIL import Image
 from stand_ins import FileEvent, make_scene, packed, set_up_engine
 from subprocess_engine import SubprocessEngine
+from two_fronts import KEYS, THROUGH_A_GATEWAY, Made, two_fronts
 
 import service.estimators
 import service.web.app
@@ -37,6 +38,7 @@ from service.web.schemas.error_examples import EXAMPLES
 from service.web.settings import Settings
 
 ROOT = Path(__file__).parents[1]
+ESTIMATORS = str(ROOT / "tests" / "fake_estimators")
 IN_SUBPROCESS = os.environ.get("SPLATFIX_TEST_ENGINE") == "subprocess"
 """Run all tests of the API on the engine of `subprocess_engine`; by hand, since each server takes seconds to start."""
 NOT_IN_A_SUBPROCESS = {
@@ -67,11 +69,21 @@ def create_app(
         engine = EmbeddedEngine(settings.engine_config)
         for scene_id, loaded in (scenes or {}).items():
             engine.add_loaded(scene_id, loaded)
-    return service.web.app.create_app(settings, engine, keys)
+    app = service.web.app.create_app(settings, engine, keys)
+    if THROUGH_A_GATEWAY:
+        fake = ESTIMATORS in service.estimators.__path__
+        small = {name: packed(scene) for name, scene in (scenes or {}).items()}
+        app.state.made = Made(settings, small, keys, GO_ON if fake or small else None)
+    return app
 
 
 @contextmanager
 def serving(app: FastAPI) -> Iterator[httpx.Client]:
+    """Serve an app, or two of what it was made of behind nginx, where that is asked for."""
+    if hasattr(app.state, "made"):
+        with two_fronts(app) as url, _client(url) as client:
+            yield client
+        return
     listener = socket.create_server(("127.0.0.1", 0))
     config = uvicorn.Config(app, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=1)
     server = uvicorn.Server(config)
@@ -79,15 +91,19 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
     thread.start()
     url = f"http://127.0.0.1:{listener.getsockname()[1]}"
     try:
-        hooks = {"response": [assert_documented]}
-        seconds = 90 if IN_SUBPROCESS else 20  # the first request may wait for the child's imports
-        with httpx.Client(base_url=url, timeout=seconds, trust_env=False, event_hooks=hooks) as client:
+        with _client(url) as client:
             until(lambda: server.started)
             yield client
     finally:
         server.should_exit = True
         thread.join()
         listener.close()
+
+
+def _client(url: str) -> httpx.Client:
+    hooks = {"response": [assert_documented]}
+    seconds = 90 if IN_SUBPROCESS or THROUGH_A_GATEWAY else 20  # the first request may wait for a child's imports
+    return httpx.Client(base_url=url, timeout=seconds, trust_env=False, event_hooks=hooks)
 
 
 def until(condition, seconds: float = 20) -> None:
@@ -97,6 +113,12 @@ def until(condition, seconds: float = 20) -> None:
         waited = time.monotonic() - began
         assert waited < seconds, "waited for too long"
         time.sleep(min(max(0.005, waited / 8), 0.05))
+
+
+def key_line(client: httpx.Client) -> str:
+    """Return the line with the key for a request that a test writes itself; empty unless it goes through a gateway."""
+    key = KEYS.get(client.base_url.port or 0)
+    return f"Authorization: Bearer {key}\r\n" if key else ""
 
 
 def assert_as_shown(problem: dict[str, Any]) -> None:
@@ -123,16 +145,17 @@ def _without_values(text: str) -> str:
 
 def until_ready(client: httpx.Client) -> None:
     """Wait until the scenes are loaded and prepared, which takes long where other processes use the CPU."""
-    until(lambda: client.get("/readyz").status_code == 200, 120)
+    # Twice: behind a gateway the fronts answer in turn.
+    until(lambda: all(client.get("/readyz").status_code == 200 for _ in range(2)), 120)
 
 
 @contextmanager
 def fake_estimators() -> Iterator[ModuleType]:
     """The estimators of tests/fake_estimators, registered as any: by lying in the package's folder."""
     with pytest.MonkeyPatch.context() as patch:
-        folder, paths = str(ROOT / "tests" / "fake_estimators"), list(service.estimators.__path__)
-        if folder not in paths:  # fixtures of two modules may hold it at once
-            patch.setattr(service.estimators, "__path__", [*paths, folder])
+        paths = list(service.estimators.__path__)
+        if ESTIMATORS not in paths:  # fixtures of two modules may hold it at once
+            patch.setattr(service.estimators, "__path__", [*paths, ESTIMATORS])
         stepping = importlib.import_module("service.estimators.stepping")
         patch.setattr(stepping, "GO_ON", GO_ON)
         yield stepping

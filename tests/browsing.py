@@ -13,7 +13,8 @@ import pytest
 import uvicorn
 from axe_playwright_python.sync_playwright import Axe
 from fastapi import FastAPI
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, expect, sync_playwright
+from two_fronts import KEYS, two_fronts
 
 CHROMIUM = shutil.which("chromium") or ""
 # WebGL in software where there is no GPU, which has to be asked for; no services in the background.
@@ -49,8 +50,21 @@ def launched(*flags: str) -> Iterator[Browser]:
 def opened(browser: Browser, address: str, width: int = 1100, height: int = 700) -> Page:
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(PATIENCE_MS)
+    sign_in(page.context, address)
     page.goto(address)
     return page
+
+
+def is_ready(url: str) -> bool:
+    """Return whether a service is ready; asked twice, since behind a gateway the fronts answer in turn."""
+    return all(HTTP.get(f"{url}/readyz").status_code == 200 for _ in range(2))
+
+
+def sign_in(context: BrowserContext, address: str) -> None:
+    """Get a session where the tests go through a gateway, whose service has keys."""
+    url = httpx.URL(address)
+    if key := KEYS.get(url.port or 0):
+        context.request.get(str(url.copy_with(path="/", query=None, fragment=None)), params={"key": key})
 
 
 def serious(page: Page) -> list[str]:
@@ -66,7 +80,11 @@ def serious(page: Page) -> list[str]:
 
 @contextmanager
 def served(app: FastAPI, port: int = 0) -> Iterator[str]:
-    """Serve an app in a thread; gives its URL."""
+    """Serve an app in a thread, or two of what it was made of behind nginx, where that is asked for; gives the URL."""
+    if hasattr(app.state, "made"):
+        with two_fronts(app, port) as url:
+            yield url
+        return
     # Streams of open pages would keep it from ending.
     config = uvicorn.Config(
         app, port=port, log_level="critical", ws="websockets-sansio", ws_max_size=2**26, timeout_graceful_shutdown=1

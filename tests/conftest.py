@@ -34,16 +34,23 @@ collect_ignore = [] if find_spec("gsply") else ["test_bench_gpu.py", "test_large
 # The API's tests; imported where they are used, since other tests needn't wait for the engine.
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what can't run with the engine of another process, where that is asked for."""
-    if os.environ.get("SPLATFIX_TEST_ENGINE") != "subprocess":
-        return
-    from api_server import NOT_IN_A_SUBPROCESS
+def pytest_configure(config: pytest.Config) -> None:
+    if os.environ.get("SPLATFIX_TEST_GATEWAY") == "1":
+        import gateway_report
 
+        config.pluginmanager.register(gateway_report)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip what can't run with the engine of another process, or through a gateway, where that is asked for."""
+    reasons: dict[str, str] = {}
+    if os.environ.get("SPLATFIX_TEST_ENGINE") == "subprocess":
+        from api_server import NOT_IN_A_SUBPROCESS as reasons
+    if os.environ.get("SPLATFIX_TEST_GATEWAY") == "1":
+        from two_fronts import NOT_THROUGH_A_GATEWAY as reasons
     for item in items:
-        name = item.name.partition("[")[0]
-        reason = NOT_IN_A_SUBPROCESS.get(name) or NOT_IN_A_SUBPROCESS.get(item.path.name)
-        if reason:
+        names = item.name, item.name.partition("[")[0], item.path.name
+        if reason := next((reasons[name] for name in names if name in reasons), None):
             item.add_marker(pytest.mark.skip(reason=reason))
 
 
@@ -82,7 +89,8 @@ def shared(plugins) -> Iterator:
     """A server for tests that leave nothing behind."""
     from api_server import ready_service
 
-    with ready_service() as client:
+    # Not limited: tests that send much at once follow one another.
+    with ready_service(rate_limit="") as client:
         yield client
 
 

@@ -25,15 +25,16 @@ def free_port() -> int:
 class Gateway:
     """nginx, as docker/nginx configures it, before the fronts at some ports, which may come and go: one after another.
 
-    `url` is its address.
+    `url` is its address, at a given port or, with 0, at any. A line of `access_log` is the address of the front
+    that was asked, and the request.
     """
 
-    def __init__(self, ports: Sequence[int], folder: Path) -> None:
+    def __init__(self, ports: Sequence[int], folder: Path, *, port: int = 0, access_log: Path | None = None) -> None:
         nginx = shutil.which("nginx")
         if nginx is None:
             pytest.skip("there is no nginx on this machine")
         folder.mkdir()
-        self._folder, self._port = folder, free_port()
+        self._folder, self._port, self._access_log = folder, port or free_port(), access_log
         self.url = f"http://127.0.0.1:{self._port}"
         self._configure(ports)
         command = [nginx, "-p", folder, "-c", folder / "nginx.conf", "-e", folder / "log"]
@@ -53,9 +54,9 @@ class Gateway:
         kinds = ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
         paths = " ".join(f'{kind}_temp_path "{folder}/{kind}";' for kind in kinds)
         main = f'daemon off; worker_processes 1; pid "{folder}/pid"; error_log "{folder}/log"; events {{}}'
-        (folder / "nginx.conf").write_text(
-            f"{main} http {{ access_log off; {paths} upstream fronts {{ {servers} }} {gateway} }}"
-        )
+        log = f"log_format front '$upstream_addr $request'; access_log \"{self._access_log}\" front;"
+        log = log if self._access_log else "access_log off;"
+        (folder / "nginx.conf").write_text(f"{main} http {{ {log} {paths} upstream fronts {{ {servers} }} {gateway} }}")
 
     def take(self, ports: Sequence[int]) -> None:
         """Send new requests to these fronts; those under way stay where they are."""
@@ -69,7 +70,7 @@ class Gateway:
 
 
 @contextmanager
-def behind_nginx(ports: Sequence[int], folder: Path) -> Iterator[str]:
-    """Run nginx before the fronts at some ports; gives its URL."""
-    with closing(Gateway(ports, folder)) as gateway:
+def behind_nginx(ports: Sequence[int], folder: Path, **options) -> Iterator[str]:
+    """Run nginx before the fronts at some ports, with the options of `Gateway`; gives its URL."""
+    with closing(Gateway(ports, folder, **options)) as gateway:
         yield gateway.url

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from api_server import until
-from browsing import HTTP, served
+from api_server import create_app, until
+from browsing import HTTP, is_ready, served
 from firefox import FIREFOX, XVFB, Page, firefox
 from gateway import free_port
 from PIL import Image
 
-from service.web.app import create_app
 from service.web.settings import Settings
 
 pytestmark = [
@@ -29,7 +28,7 @@ STUDIO = Path(__file__).parents[1] / "scenes" / "studio"
 def url(scene_cache: Path) -> Iterator[str]:
     port = free_port()
     with served(create_app(Settings(scenes=[STUDIO], port=port, cache_dir=scene_cache)), port) as url:
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
+        until(lambda: is_ready(url), 240)
         yield url
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from api_server import until
+from api_server import create_app, until
 from axe_playwright_python.sync_playwright import Axe
-from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, served
+from browsing import NEEDS_CHROMIUM, PATIENCE_MS, is_ready, launched, opened, served
 from gateway import free_port
 from playwright.sync_api import Browser, Page, expect
 from small_room import FOCAL, pose_at, write_room
@@ -20,7 +20,6 @@ from service.geometry import moved, pose_distance
 from service.loaded_scene import LoadedScene
 from service.photos.images import encode_image
 from service.types import Camera, Intrinsics, Pose
-from service.web.app import create_app
 from service.web.settings import Settings
 
 pytestmark = NEEDS_CHROMIUM
@@ -52,7 +51,7 @@ def film(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def url(scene: Path, scene_cache: Path) -> Iterator[str]:
     port = free_port()
     with served(create_app(Settings(scenes=[scene], port=port, cache_dir=scene_cache, viewer=False)), port) as url:
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
+        until(lambda: is_ready(url), 240)
         yield url
 
 
@@ -102,7 +101,7 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
 def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path, scene_cache: Path) -> None:
     port, settings = free_port(), {"scenes": [scene], "cache_dir": scene_cache, "viewer": False}
     with served(create_app(Settings(port=port, **settings)), port) as url:
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
+        until(lambda: is_ready(url), 240)
         page = opened(browser, f"{url}/live", 390, 844)
         page.get_by_role("button", name="Start camera").click()
         expect(page.locator(".verdict .badge")).to_have_text("Localized")

@@ -19,8 +19,9 @@ from zipfile import ZipFile
 
 import numpy as np
 import pytest
+from api_server import create_app
 from axe_playwright_python.sync_playwright import Axe
-from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, launched, opened, serious, served
+from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, is_ready, launched, opened, serious, served, sign_in
 from gateway import behind_nginx, free_port
 from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
@@ -36,7 +37,6 @@ from service.localize import Cancelled
 from service.results import Status
 from service.types import Pose
 from service.web.api_keys import KeyRing
-from service.web.app import create_app
 from service.web.key_file import Role, add_key, read_keys
 from service.web.settings import Settings
 
@@ -53,7 +53,7 @@ def url(tmp_path_factory: pytest.TempPathFactory, scene_cache: Path) -> Iterator
     room = write_room(tmp_path_factory.mktemp("scenes") / "room")
     settings = Settings(scenes=[STUDIO, room], port=port, cache_dir=scene_cache)
     with served(create_app(settings), port) as url:
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)  # kernels may be compiled
+        until(lambda: is_ready(url), 240)  # kernels may be compiled
         yield url
 
 
@@ -485,7 +485,7 @@ def _audit(page: Page) -> None:
 def test_the_whole_way_goes_by_keyboard(page: Page) -> None:
     page.get_by_role("radio").first.wait_for()
     focused: list[str] = []
-    for _ in range(9):
+    for _ in range(10):  # with keys there is a link to them
         page.keyboard.press("Tab")
         focused.append(
             page.evaluate(
@@ -863,8 +863,9 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
     port = settings.port
     slow = {"estimator": "mc_do", "options": json.dumps({"hypotheses": 4096, "refinement_steps": 10000})}
     with served(create_app(settings), port):
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
+        until(lambda: is_ready(url), 240)
         context = browser.new_context(viewport={"width": 1000, "height": 700})
+        sign_in(context, url)
         page, viewer = context.new_page(), context.new_page()
         page.bring_to_front()
         page.goto(f"{url}/#/key" if key else f"{url}/")
@@ -888,7 +889,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
     viewer.bring_to_front()
     expect(viewer.locator(".splatfix-lost")).to_contain_text("Reconnecting")
     with served(create_app(settings), port):
-        until(lambda: HTTP.get(f"{url}/readyz").status_code == 200, 240)
+        until(lambda: is_ready(url), 240)
         ready = time.monotonic()
         viewer.wait_for_function("!window.old", timeout=PATIENCE_MS)
         expect(viewer.locator(".splatfix-lost")).to_have_count(0)
@@ -907,6 +908,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
     context = browser.new_context(viewport={"width": 360, "height": 740}, has_touch=True, is_mobile=True)
+    sign_in(context, url)
     page = context.new_page()
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}/")

@@ -18,7 +18,18 @@ from types import SimpleNamespace
 import httpx
 import pytest
 import uvicorn
-from api_server import assert_problem, create_app, finished, photo, post, serving, settings, until, until_ready
+from api_server import (
+    assert_problem,
+    create_app,
+    finished,
+    key_line,
+    photo,
+    post,
+    serving,
+    settings,
+    until,
+    until_ready,
+)
 from rich.console import Console
 from stand_ins import make_scene
 from websockets.exceptions import InvalidStatus
@@ -329,6 +340,7 @@ def head(client: httpx.Client, lines: str, body: bytes = b"") -> bytes:
     """Send the head of a request, and never its body; return the answer."""
     with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
         connection.settimeout(10)
+        lines = key_line(client) + lines
         connection.sendall(f"POST /localize HTTP/1.1\r\nHost: 127.0.0.1\r\n{lines}\r\n\r\n".encode() + body)
         answer = b""
         while b"\r\n\r\n" not in answer or not answer.endswith(b"}"):  # problem documents are JSON
