@@ -15,7 +15,9 @@ from service.types import GaussianScene, SceneInfo
 def space_of(filled: np.ndarray, cell: float = 0.5, distance: float = 1.0) -> Space:
     points = np.zeros((1, 3))
     up = np.array([0.0, 0.0, 1.0])
-    return Space(points, np.ones(1), np.array([1.0, 2.0, 3.0]), cell, filled, np.zeros(3), 1.0, up, distance)
+    return Space(
+        points, np.ones(1), np.array([1.0, 2.0, 3.0]), cell, filled, np.zeros(3), 1.0, up, distance, np.empty((0, 4))
+    )
 
 
 def scene_of(means: np.ndarray, sizes: np.ndarray, opacity: float | np.ndarray = 0.9, **info: Any) -> GaussianScene:

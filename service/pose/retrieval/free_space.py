@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from service.jit import kernel
+from service.pose.retrieval.outer_planes import outer_planes
 from service.types import GaussianScene
 
 
@@ -29,6 +30,9 @@ class SpaceConfig:
     max_typical_radii: float = 2.0
     max_radii: float = 5.0
     """Radii of the scene that the typical distance, and any, is at most: few, large Gaussians seem to be far away."""
+    far_radii: float = 8.0
+    """What is farther from the middle, such as a shell of sky, has no part in the outer planes nor, where there are
+    some, in the grid."""
     min_good_views: int = 200
     max_good_views: int = 1200
     good_views_per_area: int = 40
@@ -57,6 +61,8 @@ class Space:
     up: Float64[np.ndarray, "3"]
     distance: float
     """The typical one."""
+    planes: Float64[np.ndarray, "k 4"]
+    """The outer ones (`outer_planes`)."""
 
     @property
     def wanted_good_views(self) -> float:
@@ -122,6 +128,20 @@ def free_space_of(scene: GaussianScene) -> Space:
     sizes = np.clip(sizes, *np.quantile(sizes, [0.1, 0.9]))
     info = scene.info
     focal = info.training_focal_px or info.training_long_side_px or SPACE.assumed_focal_px
+    middle = np.median(points, axis=0)
+    away = np.linalg.norm(points - middle, axis=1)
+    radius = float(np.median(away))
+    distances = np.clip(sizes * focal / SPACE.gaussian_px, 1e-9, max(SPACE.max_radii * radius, 1e-9))
+    typical = float(min(np.median(distances), SPACE.max_typical_radii * radius))
+    near = points[away <= SPACE.far_radii * radius]
+    planes = outer_planes(near, typical)
+    low, cell, filled = _grid(near if len(planes) else points)
+    up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
+    return Space(points, distances, low, cell, filled, middle, radius, up, typical, planes)
+
+
+def _grid(points: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarray, "3"], float, Bool[np.ndarray, "x y z"]]:
+    """Return the corner, the cells' side and the filled cells of a grid over the middle 98 % of the points."""
     # Floaters far away would make the grid too coarse.
     low, high = np.quantile(points, [0.01, 0.99], axis=0)
     low, high = low - 0.02 * (high - low), high + 0.02 * (high - low)  # walls may lie exactly there
@@ -132,21 +152,7 @@ def free_space_of(scene: GaussianScene) -> Space:
     index = np.floor((points - low) / cell).astype(int)
     index = index[np.all((index >= 0) & (index < shape), axis=1)]
     counts = np.bincount(np.ravel_multi_index(index.T, shape), minlength=int(np.prod(shape)))
-    middle = np.median(points, axis=0)
-    radius = float(np.median(np.linalg.norm(points - middle, axis=1)))
-    up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
-    distances = np.clip(sizes * focal / SPACE.gaussian_px, 1e-9, max(SPACE.max_radii * radius, 1e-9))
-    return Space(
-        points,
-        distances,
-        low,
-        cell,
-        (counts >= 2).reshape(shape),
-        middle,
-        radius,
-        up,
-        float(min(np.median(distances), SPACE.max_typical_radii * radius)),
-    )
+    return low, cell, (counts >= 2).reshape(shape)
 
 
 def fibonacci_directions(count: int) -> Float64[np.ndarray, "n 3"]:

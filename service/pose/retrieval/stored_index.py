@@ -20,12 +20,13 @@ from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.index_builder import IndexBuilder
 from service.pose.retrieval.inverted_views import INVERTED, InvertedViews
 from service.pose.retrieval.lod_proxy import LOD
+from service.pose.retrieval.outer_planes import PLANES
 from service.pose.retrieval.scene_symmetries import SYMMETRY, Repetitions
 from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.viewpoints import VIEWPOINTS, ViewpointConfig, index_cameras
 
-VERSION = 12
+VERSION = 13
 """Raise it with any change of the code that makes stored indexes differ from fresh ones; `_key` covers the configs."""
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,7 @@ def _key(tools: Tools[None], *more: object) -> str:
     visible = int(np.count_nonzero(tools.scene.opacities))  # floaters are left out
     scene = (tools.scene.info.sha256, visible, len(tools.scene.cameras), tools.scene.info.background_rgb)
     # Dataclasses of numbers: their repr names each value.
-    configs = (*more, SPACE, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES, INVERTED)
+    configs = (*more, SPACE, PLANES, FLOATERS, LOD, VIEWS, CORNERS, SYMMETRY, AMBIGUITY, SCORES, INVERTED)
     parts = (VERSION, *scene, tools.matcher.name, tools.rasterizer.name, *configs)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:24]
 

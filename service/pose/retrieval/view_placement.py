@@ -30,6 +30,7 @@ from service.geometry import look_at, transformed, unproject
 from service.interfaces import Frame, Rasterizer
 from service.pose.retrieval.free_space import Space, fibonacci_directions, free_space_of
 from service.pose.retrieval.lod_proxy import lod_proxy
+from service.pose.retrieval.outer_planes import before_planes
 from service.types import Camera, GaussianScene, Intrinsics, Pose
 
 
@@ -220,11 +221,12 @@ class _Views:
         self._voxels, self._voxel_of = np.unique(points, return_inverse=True)
 
     def add_candidates(self, poses: Sequence[Pose]) -> None:
-        """Render the candidates small, except those among Gaussians and those known to be outside."""
+        """Render the candidates small, except those among Gaussians, behind planes and known to be outside."""
         positions = np.stack([pose.position_in_world for pose in poses])
         enclosures = self._space.enclosures(positions)
         # Rendering is what costs, so candidates are filtered by geometry first.
-        worth = np.flatnonzero(~self._space.occupied(positions) & (enclosures >= self._least_enclosed))
+        free = ~self._space.occupied(positions) & before_planes(positions, self._space.planes)
+        worth = np.flatnonzero(free & (enclosures >= self._least_enclosed))
         lens = search_camera(self._config.render_px, self._config.fov_deg)
         self.add([Camera(lens, poses[i]) for i in worth.tolist()])
         self._enclosures += enclosures[worth].tolist()
