@@ -323,7 +323,7 @@ def jobs() -> Any:
     made: Any = Jobs.__new__(Jobs)
     made._store, made._live, made._shared = MemoryJobStore(), {}, None
     made._queue = SimpleNamespace(full=lambda: False, waiting=lambda: 7, stuck=lambda: 0)
-    made._worker = SimpleNamespace(storage_error="")
+    made._worker, made._dismissing = SimpleNamespace(storage_error=""), threading.Event()
     made._acceptance = Acceptance.__new__(Acceptance)
     made._acceptance._store, made._acceptance._queue = made._store, made._queue
     return made
@@ -394,6 +394,9 @@ def test_who_asks_for_a_job_that_another_front_has_follows_it(jobs):
     del jobs._live["j"]
     jobs._store.end_queued(job, Ending("cancelled"), None)
     assert jobs.live(jobs._store.get("j")) is None
+    jobs._live["j"] = own
+    jobs._dismissing.set()  # the front ends: whoever waits asks another one
+    assert jobs.live(job) is None
 
 
 def test_only_an_ended_job_is_deleted_with_its_photo(jobs):
