@@ -16,7 +16,17 @@ def space_of(filled: np.ndarray, cell: float = 0.5, distance: float = 1.0) -> Sp
     points = np.zeros((1, 3))
     up = np.array([0.0, 0.0, 1.0])
     return Space(
-        points, np.ones(1), np.array([1.0, 2.0, 3.0]), cell, filled, np.zeros(3), 1.0, up, distance, np.empty((0, 4))
+        points,
+        np.ones(1),
+        np.array([1.0, 2.0, 3.0]),
+        cell,
+        filled,
+        np.zeros(3),
+        1.0,
+        up,
+        True,
+        distance,
+        np.empty((0, 4)),
     )
 
 

@@ -8,7 +8,7 @@ from test_free_space import ball, scene_of
 
 from service.geometry import rotation_from_quat
 from service.pose.retrieval.free_space import free_space_of
-from service.pose.retrieval.outer_planes import before_planes, outer_planes
+from service.pose.retrieval.outer_planes import before_planes, ground_normal, outer_planes
 
 TURN = rotation_from_quat(np.array([0.9, 0.3, -0.5, 0.2]))
 
@@ -29,14 +29,19 @@ def street(rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def test_a_streets_ground_and_facades_are_outer_planes_wherever_it_lies() -> None:
+@pytest.mark.parametrize("distance", [2.5, 6.0, 15.0])
+def test_a_streets_ground_and_facades_are_outer_planes_wherever_it_lies(distance: float) -> None:
+    """However wrong the typical distance is."""
     rng = np.random.default_rng(1)
     points = street(rng) @ TURN.T + [500.0, -20.0, 7.0]
-    planes = outer_planes(points, 6.0)
+    planes = outer_planes(points, distance)
     expected = np.array([[0, 0, 1.0], [0, 1.0, 0], [0, -1.0, 0]]) @ TURN.T
     assert len(planes) == 3
     assert sorted(np.argmax(planes[:, :3] @ expected.T, axis=1)) == [0, 1, 2]
     assert (planes[:, :3] @ expected.T).max(1).min() > 0.999
+    up = ground_normal(planes)
+    assert up is not None
+    assert up @ expected[0] > 0.999
 
     def inside(at: list[float]) -> bool:
         return bool(before_planes(np.array([at]) @ TURN.T + [500.0, -20.0, 7.0], planes)[0])
@@ -47,6 +52,24 @@ def test_a_streets_ground_and_facades_are_outer_planes_wherever_it_lies() -> Non
     assert not inside([30, 0, -0.5])
     assert not inside([30, 3.5, 2])
     assert not inside([30, -3.5, 2])
+
+
+@pytest.mark.parametrize(
+    ("normals", "up"),
+    [
+        ([[0, 0, 1], [0, 1, 0], [0, -1, 0]], [0, 0, 1]),  # a street
+        ([[0, 1, 0], [0, 0, -1], [0, -1, 0]], [0, 0, -1]),
+        ([[0, 0, 1], [0, 0, -1], [0, 1, 0], [0, -1, 0]], None),  # a corridor with its ceiling
+        ([[0, 0, 1], [0, 1, 0]], None),  # one row of houses: either may be the ground
+        ([[0, 0, 1], [0, 1, 0], [0, -1, 0], [1, 0, 0]], None),  # a yard that is open at one side
+        ([[0, 0, 1]], None),
+        ([], None),
+    ],
+)
+def test_the_ground_is_the_one_plane_without_another_opposite(normals: list, up: list | None) -> None:
+    found = ground_normal(np.array([[*normal, 1.0] for normal in normals]).reshape(-1, 4))
+    assert (found is None) == (up is None)
+    assert found is None or np.array_equal(found, up)
 
 
 @pytest.mark.parametrize("distance", [2.0, 4.0])
@@ -62,7 +85,8 @@ def test_a_wall_between_two_halls_is_none() -> None:
     rng = np.random.default_rng(3)
     halls = rng.uniform([0, -9, 0], [90, 9, 4], (6000, 3))
     wall = rectangle(rng, 4000, [0, 0, 0], [90, 0, 4])
-    assert len(outer_planes(np.concatenate([halls, wall]), 6.0)) == 0
+    planes = outer_planes(np.concatenate([halls, wall]), 6.0)
+    assert before_planes(np.array([[45.0, -4, 2], [45.0, 4, 2]]), planes).all()
 
 
 def test_few_points_or_all_at_one_place_have_none() -> None:
@@ -82,3 +106,6 @@ def test_a_shell_of_sky_has_no_part_in_the_grid() -> None:
     assert under.cell == pytest.approx(alone.cell, rel=0.05)
     assert np.allclose(under.low, alone.low, atol=0.2)
     assert len(under.planes) == len(alone.planes) == 3
+    assert under.is_up_known
+    assert under.up @ [0, 0, 1] > 0.999
+    assert not free_space_of(scene_of(ball(500), np.full((500, 3), 0.006))).is_up_known

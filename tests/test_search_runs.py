@@ -231,7 +231,7 @@ def searched(
         def seen(self, chosen: np.ndarray) -> np.ndarray:
             return (np.arange(1000) < 1000 * next(left, covered[-1])).astype(np.int64)
 
-    space = SimpleNamespace(wanted_good_views=wanted, distance=2.0)
+    space = SimpleNamespace(wanted_good_views=wanted, distance=2.0, is_up_known=up)
     monkeypatch.setattr(view_placement, "free_space_of", lambda scene: space)
     monkeypatch.setattr(view_placement, "lod_proxy", lambda *_: None)
     monkeypatch.setattr(view_placement, "_Views", Views)
@@ -244,8 +244,7 @@ def searched(
     config = replace(
         PLACEMENT, size_candidates=5, best=6, candidates_near_each=2, round_candidates=14, rounds=4, max_views=9
     )
-    info = SimpleNamespace(up_in_world=(0.0, 0.0, 1.0) if up else None)
-    found = view_placement.find_views(SimpleNamespace(info=info), None, np.random.default_rng(0), config)  # type: ignore[arg-type]
+    found = view_placement.find_views(SimpleNamespace(), None, np.random.default_rng(0), config)  # type: ignore[arg-type]
     return sizes, (asked[0].max_views, len(found.cameras))
 
 

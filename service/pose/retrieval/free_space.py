@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from service.jit import kernel
-from service.pose.retrieval.outer_planes import outer_planes
+from service.pose.retrieval.outer_planes import ground_normal, outer_planes
 from service.types import GaussianScene
 
 
@@ -59,6 +59,8 @@ class Space:
     radius: float
     """Holds half of the points."""
     up: Float64[np.ndarray, "3"]
+    is_up_known: bool
+    """Whether the scene's file or its ground tells it; else it is z."""
     distance: float
     """The typical one."""
     planes: Float64[np.ndarray, "k 4"]
@@ -136,8 +138,10 @@ def free_space_of(scene: GaussianScene) -> Space:
     near = points[away <= SPACE.far_radii * radius]
     planes = outer_planes(near, typical)
     low, cell, filled = _grid(near if len(planes) else points)
-    up = np.array(info.up_in_world or (0.0, 0.0, 1.0))
-    return Space(points, distances, low, cell, filled, middle, radius, up, typical, planes)
+    ground = ground_normal(planes)
+    up = np.array(info.up_in_world or ((0.0, 0.0, 1.0) if ground is None else ground))
+    known = info.up_in_world is not None or ground is not None
+    return Space(points, distances, low, cell, filled, middle, radius, up, known, typical, planes)
 
 
 def _grid(points: Float64[np.ndarray, "n 3"]) -> tuple[Float64[np.ndarray, "3"], float, Bool[np.ndarray, "x y z"]]:

@@ -31,7 +31,9 @@ from service.geometry import look_at, transformed, unproject
 from service.interfaces import Features, Frame, Matcher, Rasterizer
 from service.pose.features.image_sizes import sized
 from service.pose.features.rendered_views import View, in_batches, views_of
+from service.pose.retrieval.free_space import free_space_of
 from service.pose.retrieval.lod_proxy import lod_proxy
+from service.pose.retrieval.outer_planes import before_planes
 from service.pose.retrieval.scores import SCORES
 from service.pose.retrieval.view_files import read_views, write_views
 from service.pose.retrieval.view_placement import cell_ids, search_camera, shows_single_surface
@@ -133,6 +135,8 @@ def free_view_cameras(
     lens = search_camera(config.candidate_px)
     limit = min(config.max_views, config.views_per_index_view * len(index))
     poses = _candidates(seeing, rng, config.candidates_per_view * limit, config)
+    before = before_planes(np.stack([pose.position_in_world for pose in poses]), free_space_of(scene).planes)
+    poses = [pose for pose, is_before in zip(poses, before, strict=True) if is_before]
     nearest = config.min_distance * float(np.median([view.distance for view in seeing]))
     batches = list(in_batches([Camera(lens, pose) for pose in poses], search.cameras_at_once))
     cells = list(chain.from_iterable(mapped(lambda some: _solid_cells(some, search, nearest, config), batches)))

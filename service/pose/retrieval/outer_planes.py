@@ -20,8 +20,9 @@ class PlaneConfig:
     points: int = 8000
     """That take part."""
     trials: int = 400
-    near: float = 0.03
-    """Distance of a plane's points from it, as a share of the typical distance, which is known within a factor of 3."""
+    near: tuple[float, ...] = (0.015, 0.03, 0.06, 0.12)
+    """Distances of a plane's points from it, as shares of the typical distance, which is known within a factor of 3:
+    that with which the most outer planes are found, the least of these."""
     min_share: float = 0.08
     """Of all points, from which on they are a plane..."""
     max_beyond: float = 0.03
@@ -31,6 +32,9 @@ class PlaneConfig:
     distance has 3.5, a cube 0.3, a room 0.4."""
     most: int = 6
     """Planes that are looked at."""
+    parallel: float = 0.9
+    perpendicular: float = 0.3
+    """Cosines of normals from which on, and up to which, two planes are so."""
 
 
 PLANES = PlaneConfig()
@@ -43,9 +47,15 @@ def outer_planes(
 
     `distance`: from which the scene was photographed, typically. The same planes each time.
     """
-    rng = np.random.default_rng(0)
     points = points[:: -(-len(points) // config.points) or 1]
-    left, near = points, config.near * distance
+    found = [_outer_planes(points, near * distance, config.min_extent * distance, config) for near in config.near]
+    return max(found, key=len)
+
+
+def _outer_planes(
+    points: Float64[np.ndarray, "n 3"], near: float, min_extent: float, config: PlaneConfig
+) -> Float64[np.ndarray, "k 4"]:
+    rng, left = np.random.default_rng(0), points
     least = max(4.0, config.min_share * len(points))
     found: list[Float64[np.ndarray, "4"]] = []
     for _ in range(config.most):
@@ -58,7 +68,7 @@ def outer_planes(
             break
         extent = np.sqrt(np.linalg.eigvalsh(np.cov(own.T))[-1])
         before, beyond = (float((side * (points @ plane[:3] + plane[3]) >= near).mean()) for side in (1, -1))
-        if extent < config.min_extent * distance or min(before, beyond) > config.max_beyond:
+        if extent < min_extent or min(before, beyond) > config.max_beyond:
             continue
         if max(before, beyond) > config.min_share:
             found.append(plane if before > beyond else -plane)
@@ -68,6 +78,18 @@ def outer_planes(
 def before_planes(positions: Float64[np.ndarray, "n 3"], planes: Float64[np.ndarray, "k 4"]) -> Bool[np.ndarray, "n"]:
     """Return which positions are on the scene's side of all planes."""
     return np.asarray((positions @ planes[:, :3].T + planes[:, 3] > 0).all(1))
+
+
+def ground_normal(planes: Float64[np.ndarray, "k 4"], config: PlaneConfig = PLANES) -> Float64[np.ndarray, "3"] | None:
+    """Return the normal of the outer plane that alone has none opposite, between two walls; None: there is none.
+
+    It points up from the ground of a street. A ceiling, of which it points down, has a floor opposite.
+    """
+    cosines = planes[:, :3] @ planes[:, :3].T
+    has_opposite = (cosines < -config.parallel).any(1)
+    walls = np.flatnonzero(has_opposite)
+    alone = [i for i in np.flatnonzero(~has_opposite) if (np.abs(cosines[i, walls]) < config.perpendicular).any()]
+    return planes[alone[0], :3] if len(alone) == 1 else None
 
 
 def _largest_plane(

@@ -8,8 +8,9 @@ Three kinds of places: on shells around the middle (objects), anywhere in the vo
 inferred from a Gaussian's size: training splits and merges Gaussians until each fills about a pixel of the photos, so
 distance = size x focal length, whatever the scene's unit and however far its background is.
 
-Photos are taken upright, and features tolerate a roll of some 30 degrees. Where the scene's up direction is unknown,
-z and -y are assumed, as Blender's and nerfstudio's scenes and COLMAP's have it: each place has a view upright by each.
+Photos are taken upright, and features tolerate a roll of some 30 degrees. Where neither the scene's file nor a ground
+between walls tells the up direction, z and -y are assumed, as Blender's and nerfstudio's scenes and COLMAP's have it:
+each place has a view upright by each.
 
 A view is good if it is solid, free and inside. Solid: most of the image shows one opaque surface, not nearer than a
 floater would be; from behind walls, inside floaters and towards parts never photographed, the depths along a ray
@@ -143,7 +144,7 @@ def find_views(
         seen = views.seen(good)
         if _covered(seen) - before < config.min_gain and not few:
             break
-    others = () if scene.info.up_in_world else OTHER_UPS
+    others = () if space.is_up_known else OTHER_UPS
     # With a second up direction each place may have two views.
     limited = replace(config, max_views=config.max_views // (1 + len(others)))
     chosen = _chosen(views, good, limited)
