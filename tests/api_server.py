@@ -87,7 +87,7 @@ def serving(app: FastAPI) -> Iterator[httpx.Client]:
     listener = socket.create_server(("127.0.0.1", 0))
     # Longer than the client keeps a connection: else one may be closed as the next request is sent on it.
     config = uvicorn.Config(
-        app, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=1, timeout_keep_alive=60
+        app, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=1, timeout_keep_alive=8
     )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})

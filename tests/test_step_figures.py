@@ -250,6 +250,9 @@ def test_cameras_beside_the_index_are_the_chosen_solid_candidates(monkeypatch: p
     poses = [moved(HERE, np.array([0, 0, 0, float(k), 0, 0])) for k in range(8)]
     cells: list[Any] = [None, np.array([1]), None, np.array([2]), np.array([3]), None, np.array([4]), None]
     monkeypatch.setattr(free_views, "lod_proxy", lambda *_: rasterizer)
+    # The first two candidates are behind an outer plane.
+    space = SimpleNamespace(planes=np.array([[1.0, 0, 0, -1.5]]))
+    monkeypatch.setattr(free_views, "free_space_of", lambda scene: space)
 
     def candidates(views, rng, count, config):
         asked["count"], asked["views"] = count, len(views)
@@ -261,7 +264,7 @@ def test_cameras_beside_the_index_are_the_chosen_solid_candidates(monkeypatch: p
 
     def choice(found, known, limit, config):
         asked["limit"], asked["found"] = limit, [own.tolist() for own in found]
-        return [3, 0]
+        return [2, 0]
 
     for name, step in (("_candidates", candidates), ("_solid_cells", solid), ("_choice", choice)):
         monkeypatch.setattr(free_views, name, step)
@@ -279,8 +282,8 @@ def test_cameras_beside_the_index_are_the_chosen_solid_candidates(monkeypatch: p
     # Six for each of the four views, but 20 at most; seven candidates for each.
     assert (asked["limit"], asked["count"], asked["views"]) == (20, 140, 3)
     assert asked["nearest"] == pytest.approx(0.06 * 5)
-    assert asked["found"] == [[1], [2], [3], [4]]
-    assert [camera.pose for camera in found] == [poses[6], poses[1]]
+    assert asked["found"] == [[2], [3], [4]]
+    assert [camera.pose for camera in found] == [poses[6], poses[3]]
     assert {camera.intrinsics.width for camera in found} == {384}
     free_views.free_view_cameras(scene, rasterizer, index)
     assert asked["limit"] == 24
