@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import uvicorn
 from numba.core.caching import NullCache
 from numba.core.registry import CPUDispatcher
 from PIL import ExifTags, Image
@@ -33,7 +35,9 @@ import service.__main__
 from service import jit
 from service.accuracy import Accuracy
 from service.bench.rigs import MODIFICATIONS as RIG_MODIFICATIONS
+from service.cli.graceful_server import GracefulServer
 from service.cli.render import render
+from service.cli.server import _listener
 from service.geometry import moved, pose_distance
 from service.scene_manager.anchor_store import Anchor, FileAnchorStore
 from service.scene_manager.status import StoredScene
@@ -760,3 +764,22 @@ def test_a_scene_is_registered_by_another_one(splatfix, room, tmp_path):
     assert code == 0, errors
     found = np.array(json.loads(told)["target_from_world"])
     assert found @ similarity == pytest.approx(np.diag([3.0, 3.0, 3.0, 1.0]), abs=0.05)
+
+
+def test_a_server_whose_port_another_one_has_taken_since_ends_with_a_message(caplog: pytest.LogCaptureFixture) -> None:
+    """Both were bound before either listened."""
+    ended: list[str] = []
+
+    async def app(scope: dict, receive: Callable, send: Callable) -> None:
+        while (message := (await receive())["type"]) != "lifespan.shutdown":
+            await send({"type": f"{message}.complete"})
+        ended.append(message)
+        await send({"type": f"{message}.complete"})
+
+    with _listener("127.0.0.1", 0) as first, _listener("127.0.0.1", first.getsockname()[1]) as second:
+        first.listen()
+        server = GracefulServer(uvicorn.Config(app, log_config=None), lambda: None)
+        with pytest.raises(SystemExit, match="1"):
+            server.run(sockets=[second])
+    assert "can't listen there: Address already in use" in caplog.text
+    assert ended == ["lifespan.shutdown"]

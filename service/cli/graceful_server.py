@@ -7,13 +7,16 @@ who has connected is answered, be it that nobody has accepted the connection yet
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import uvicorn
 
+_log = logging.getLogger(__name__)
 _ON_THE_WAY_S = 1.0
 """From a connection to its request."""
 
@@ -24,6 +27,15 @@ class GracefulServer(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, dismiss: Callable[[], None]) -> None:
         super().__init__(config)
         self._dismiss = dismiss
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """As uvicorn's; ends the process where another one has begun to listen there since the sockets were bound."""
+        try:
+            await super().startup(sockets)
+        except OSError as error:
+            _log.error("can't listen there: %s", error.strerror)
+            await self.lifespan.shutdown()
+            sys.exit(1)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         waiting = [connection for listener in sockets or () for connection in _connected(listener)]
