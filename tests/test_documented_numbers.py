@@ -15,6 +15,7 @@ from api_server import ROOT
 from PIL import Image
 from test_bench import poses
 
+from service.accuracy import DEFAULT_ACCURACY
 from service.bench.bench_photos import BenchPhoto
 from service.bench.datasets import LAYOUTS
 from service.bench.field_queries import FieldQuery, decoded, send
@@ -29,12 +30,30 @@ from service.bench.pose_metrics import Units
 from service.bench.scene_modifications import SCENE_MODIFICATIONS, require_scene_modifications
 from service.bench.start_poses import start_pose
 from service.cli.server import _CONNECTIONS_S
+from service.coverage.calibration import MIN_PHOTOS
+from service.coverage.measurement import COVERAGE
+from service.coverage.plan import PLAN
 from service.errors import InvalidOptions
+from service.estimators.search_config import SEARCH
+from service.estimators.shutter_check import ShutterCheckConfig
 from service.geometry import pose_distance
 from service.jobs.config import JobsConfig
 from service.photos.decode_config import DEFAULTS
+from service.pose.refinement.refinement_config import REFINEMENT
+from service.pose.retrieval.floaters import FLOATERS
+from service.pose.retrieval.free_views import FREE_VIEWS
+from service.pose.retrieval.index_builder import PARTS as WHOLE
+from service.pose.retrieval.inverted_views import INVERTED
+from service.pose.retrieval.viewpoints import VIEWPOINTS
+from service.pose.training_photos.corners import CORNERS
+from service.pose.training_photos.patch_matching import PATCHES
+from service.pose.training_photos.patch_pose import PATCH_POSE
+from service.pose.training_photos.surface_points import TRIANGULATION
+from service.pose.verification.captured_volume import CAPTURE
+from service.pose.verification.gate import VERIFICATION
+from service.pose.verification.mirror_images import MIRROR
 from service.smoothing import SMOOTHING
-from service.types import LENS_PRIORS, Camera, Intrinsics
+from service.types import LENS_PRIORS, Camera, Intrinsics, LensPrior
 from service.web.settings import Settings
 
 LENS = Intrinsics(240, 180, 200.0, 204.0, 124.0, 86.0)
@@ -273,3 +292,80 @@ def test_a_container_is_given_time_to_end_its_jobs() -> None:
     )]  # fmt: skip
     # Open connections first, then the jobs, then what is written last; twice the time for a busy machine.
     assert 2 * (_CONNECTIONS_S + Settings(scenes=[]).shutdown_s) <= min(given)
+
+
+# ------------------------------------------------------------------ the method
+
+
+def said(document: str, pattern: str) -> tuple[float, ...]:
+    """Return the numbers that stand for each `#` of a pattern in a document; it occurs once, on one line or several."""
+    text = " ".join((ROOT / "docs" / document).read_text("utf-8").split())
+    (found,) = re.findall(re.escape(pattern).replace(r"\#", r"(\d[\d,]*(?:\.\d+)?)"), text)
+    if "#" not in pattern:
+        return ()
+    return tuple(float(each.replace(",", "")) for each in ([found] if isinstance(found, str) else found))
+
+
+METHOD = "how-it-works.md"
+
+
+def test_the_index_and_its_retrieval_are_as_large_as_said() -> None:
+    assert said(METHOD, "There are as many as the scene needs, up to #:") == (VIEWPOINTS.max_views,)
+    assert said(METHOD, "An index of # views and more is used before it is whole") == (WHOLE.min_views,)
+    assert said(METHOD, "first # views are of all over the scene, then their number doubles") == (WHOLE.first_views,)
+    assert WHOLE.growth == 2
+    assert said(METHOD, "From # views on it is compared only with features") == (INVERTED.min_views,)
+    assert said(METHOD, "the scores of the best # views are then computed exactly") == (INVERTED.exact_views,)
+    assert said(METHOD, "some # seconds of CPU time with # of them")[1] == FREE_VIEWS.max_views
+    assert said(METHOD, "up to six times as many as the index has") == ()
+    assert FREE_VIEWS.views_per_index_view == 6
+
+
+def test_the_gate_accepts_and_doubts_from_the_values_said() -> None:
+    assert said(METHOD, "a `right_place` of #;") == (VERIFICATION.min_localized,)
+    assert said(METHOD, "the scene in # % of the photo") == (100 * VERIFICATION.min_coverage,)
+    assert said(METHOD, "by the covariance a probability of # that") == (VERIFICATION.min_precise,)
+    bounds = said(
+        METHOD, "turned by more than # degrees, or # times nearer or # times farther, for half of the picture"
+    )
+    assert bounds == (CAPTURE.max_turn_deg, CAPTURE.max_finer, CAPTURE.max_coarser)
+    assert CAPTURE.min_share == 0.5
+    test = REFINEMENT.lens_test
+    bounds = said(METHOD, "off by more than # degrees, or # % of the distance")
+    assert bounds == (test.contradicting_deg, 100 * test.contradicting_share)
+    assert said(METHOD, "the position would be uncertain by # % of the distance") == (100 * test.untestable_share,)
+    focal, k1, centre = said(METHOD, "the focal length by # %, k1 by #, the principal point by # of the long side")
+    assert LensPrior(focal / 100, k1, centre) == test.untested
+    assert said(METHOD, "if it leaves # of the residual or less") == (ShutterCheckConfig().max_loss_ratio,)
+    assert said(METHOD, "it must fit four times as well") == ()
+    assert MIRROR.max_ratio_elsewhere == 1 / 4
+    assert said(METHOD, "less alike at each of them, by a tenth or more") == ()
+    assert SEARCH.max_rival_ratio == 1 - 1 / 10
+
+
+def test_training_photos_and_floaters_are_as_said() -> None:
+    assert said(METHOD, "Up to # of their patches, spread over the photo") == (PATCH_POSE.max_patches,)
+    assert said(METHOD, "within # pixels, by least-squares matching") == (PATCH_POSE.max_motion_px,)
+    assert said(METHOD, "rules out points that are more than # % off it") == (100 * TRIANGULATION.max_depth_error,)
+    count, side, other = said(
+        "scenes.md",
+        "up to # surface points of a photo, triangulated over three photos or more, each with a patch of # x #",
+    )
+    assert (CORNERS.count, PATCHES.side_px, PATCHES.side_px) == (count, side, other)
+    assert TRIANGULATION.min_views == 3
+    assert said("scenes.md", "a long side of # pixels or more are localized more exactly") == (PATCH_POSE.min_photo_px,)
+    percent, depth = said("scenes.md", "more than some # % of the light (optical depth #, the median")
+    assert FLOATERS.max_veil == depth == percent / 100
+
+
+def test_a_coverage_map_is_measured_as_said() -> None:
+    document = "coverage.md"
+    assert said(document, "up to a quarter of the distance to what these see") == ()
+    assert PLAN.reach == 1 / 4
+    assert said(document, "in each # headings") == (PLAN.headings,)
+    assert said(document, "**Photos.** # renders, spread evenly") == (COVERAGE.trials,)
+    assert said(document, "with a budget of # renders") == (COVERAGE.budget_renders,)
+    assert said(document, "at least four photos that it was not trained on") == ()
+    assert MIN_PHOTOS == 4
+    bounds = said(document, "`localized` within # degrees and # % of the distance")
+    assert bounds == (DEFAULT_ACCURACY.deg, 100 * (DEFAULT_ACCURACY.share or 0))

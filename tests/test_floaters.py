@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -109,6 +110,30 @@ def test_the_veil_is_the_optical_depth_in_front_of_the_content(room: GaussianSce
 def test_gaussians_at_one_place_are_examined(room: GaussianScene) -> None:
     one = replace(room, **{name: getattr(room, name)[[0, 0]] for name in NAMES})
     assert find_floaters(one).left_out is False
+
+
+def test_cubes_are_of_the_gaussians_own_size_and_smaller_ones_up_to_the_usual_cell(monkeypatch) -> None:
+    """Cells are a fortieth of the typical distance, 40, hence 1: a cube's side is 3, times a power of two."""
+    asked: list[tuple[float, list[int]]] = []
+
+    def around(means, areas, largest, side, who):
+        asked.append((side / 3, who.tolist()))
+        return np.where(who == 4, FLOATERS.min_support * side**2, 0.0)
+
+    monkeypatch.setattr(module, "_area_around", around)
+    middle = [2.0**-9, 0.3, 1.5, 9.0, 0.3, 200.0]
+    scene = SimpleNamespace(
+        means=np.zeros((6, 3), np.float32),
+        scales=np.array([[1e-6, size, 2 * size] for size in middle], np.float32),
+        opacities=np.full(6, 0.5, np.float32),
+    )
+    space = SimpleNamespace(distance=40.0, middle=np.zeros(3))
+    found = module._supports(scene, space, np.arange(6), FLOATERS)  # type: ignore[arg-type]
+    # From a 64th to 32 cells; the fifth is supported at the first level and asked no more.
+    assert asked == [(1, [0, 1, 2, 4]), (8, [3]), (32, [5]), (0.5, [0, 1]), (0.25, [0, 1]), (0.125, [0])] + [
+        (2.0**level, [0]) for level in (-4, -5, -6)
+    ]
+    assert found == pytest.approx([0, 0, 0, 0, FLOATERS.min_support, 0])
 
 
 def test_areas_around_are_those_of_a_sum_over_all_pairs() -> None:

@@ -14,9 +14,10 @@ from service.interfaces import Features
 from service.loaded_scene import LoadedScene
 from service.pose.features.in_plane_rotation import Corners
 from service.pose.features.rendered_views import View
+from service.pose.retrieval import inverted_views
 from service.pose.retrieval.index import ViewIndex
 from service.pose.retrieval.inverted_views import INVERTED, InvertedViews, view_scores
-from service.pose.retrieval.scores import retrieval_scores, top_indices
+from service.pose.retrieval.scores import ScoreConfig, retrieval_scores, top_indices
 from service.pose.retrieval.viewpoints import VIEWPOINTS, choose_spread_poses
 from service.types import Camera, Intrinsics
 
@@ -60,6 +61,41 @@ def test_scores_by_words_find_the_room_as_exact_ones_do() -> None:
         # Seen: 0.93 to 0.96 of the exact scores, since words miss some features.
         assert found[in_room].mean() == pytest.approx(exact[in_room].mean(), rel=0.2)
     assert not view_scores(np.zeros((0, 32), np.float32), views, words).any()
+
+
+def test_as_many_words_views_and_bits_are_used_as_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(1)
+    for count, words in ((600 * 17, 17), (600 * 17 - 1, 16), (900, 16)):
+        found = InvertedViews.of([unit(rng.normal(size=(count, 4)))], ScoreConfig(view_features=count))
+        assert len(found.words) == words
+        assert len(found.entries) == count
+        assert np.allclose(np.linalg.norm(found.words, axis=1), 1, atol=1e-5)
+    # A word is looked for in a sample of forty descriptors for each.
+    sampled: list[int] = []
+    nearest = inverted_views._nearest
+    monkeypatch.setattr(
+        inverted_views, "_nearest", lambda some, words: sampled.append(len(some)) or nearest(some, words)
+    )
+    inverted_views._words(unit(rng.normal(size=(600 * 17, 4))), INVERTED)
+    assert sampled == [40 * 17] * 4
+    steps = np.float32([[0.5, -0.5, 0.705, 0.71], [-0.705, -0.71, 0.0, 1 / 360 + 1e-4]])
+    assert inverted_views._quantized(steps).tolist() == [[90, -90, 127, 127], [-127, -127, 0, 1]]
+    looked_up: list[tuple[int, int]] = []
+    highest, similarities = inverted_views._highest, inverted_views.best_similarities
+    monkeypatch.setattr(
+        inverted_views,
+        "_highest",
+        lambda values, count: looked_up.append((len(values), count)) or highest(values, count),
+    )
+    monkeypatch.setattr(
+        inverted_views,
+        "best_similarities",
+        lambda photo, views, scores: looked_up.append((len(photo), len(views))) or similarities(photo, views, scores),
+    )
+    views = [unit(rng.normal(size=(5, 4))) for _ in range(40)]
+    InvertedViews.of(views).scores(unit(rng.normal(size=(200, 4))), views)
+    # The photo's strongest 150 features, in the four nearest words each; the best 32 views exactly.
+    assert looked_up == [(150, 4), (150, 32)]
 
 
 def test_words_are_the_same_from_their_arrays() -> None:

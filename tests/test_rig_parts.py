@@ -220,6 +220,25 @@ def test_a_planted_rig_and_its_inliers_are_found(monkeypatch: pytest.MonkeyPatch
     assert len(sampled) >= 2 * 20 - 1
 
 
+def test_a_found_rig_is_at_the_minimum_of_cauchys_loss_of_its_inliers() -> None:
+    """At half of the limits, as the scale of the loss is asked for."""
+    planted = Rig(12, (14, 12), wrong=2, noise=0.002)
+    rotation, translation, inlier = searched(planted, np.zeros((0, 4, 3)))
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = rotation, translation
+
+    def loss(matrix: np.ndarray) -> float:
+        errors = zip(planted.errors(matrix), planted.limits, inlier, planted.counts, strict=True)
+        return sum(
+            float(np.log1p((error[own[:count]] ** 2).sum(1) / (0.5 * limit) ** 2).sum())
+            for error, limit, own, count in errors
+        )
+
+    assert inlier.sum() >= 20
+    for step in 1e-4 * np.vstack([np.eye(6), -np.eye(6)]):
+        assert loss(se3_exp(step) @ found) > loss(found)
+
+
 def test_four_matches_of_a_camera_are_sampled_and_end_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """All of them agree: after the fewest trials, of two cameras."""
     planted, sampled = Rig(11, (4, 3, 4)), []

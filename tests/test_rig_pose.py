@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from service.geometry import moved, pose_distance, transformed
+from service.geometry import moved, pose_distance, reprojection_error_px, transformed
 from service.pose.absolute_pose.pnp import estimate_absolute_pose
 from service.pose.absolute_pose.rig_pose import RigMatches, estimate_rig_pose
 from service.types import Intrinsics, Pose
@@ -31,6 +33,29 @@ def rig(seed: int, right: int, wrong: int, cameras: int = 4, noise_px: float = 0
         order = rng.permutation(right + wrong)
         found.append(RigMatches(px[order], world[order], lens, mount, 3.0))
     return found
+
+
+def test_exact_matches_of_two_cameras_give_the_exact_pose():
+    """Their principal points are not in the middle, and no wrong match is among them."""
+    cameras = rig(3, 20, 0, cameras=2, noise_px=0.0)
+    found = estimate_rig_pose(cameras, 200)
+    assert found is not None
+    turned, way = pose_distance(found.world_from_rig, TRUTH)
+    assert turned < 1e-4
+    assert way < 1e-6
+    assert found.num_inliers == 40
+    assert [inlier.tolist() for inlier in found.inliers] == [[True] * 20] * 2
+    for camera in cameras:
+        world_from_camera = found.world_from_rig.world_from_camera @ camera.rig_from_camera.world_from_camera
+        error_px = reprojection_error_px(
+            camera.photo_px, camera.points_in_world, camera.intrinsics, Pose(world_from_camera)
+        )
+        assert error_px.max() < 1e-3
+    few = [
+        replace(camera, photo_px=camera.photo_px[:3], points_in_world=camera.points_in_world[:3]) for camera in cameras
+    ]
+    assert estimate_rig_pose(few, 200) is None
+    assert estimate_rig_pose([], 200) is None
 
 
 @pytest.mark.ci

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from threading import Event
 from types import SimpleNamespace
 from typing import Any
@@ -10,12 +11,15 @@ import numpy as np
 import pytest
 
 from service import rig
+from service.accuracy import Accuracy
 from service.errors import InvalidRequest
-from service.geometry import se3_exp
+from service.geometry import adjoint, se3_exp
 from service.localize import Cancelled, Request
 from service.pose.absolute_pose.rig_pose import RigMatches
 from service.pose.features.image_sizes import PHOTO_PX
+from service.pose.matching.correspondences import Correspondences
 from service.pose.retrieval.scene_symmetries import NO_REPETITIONS
+from service.results import Reason, Status, Verdict
 from service.rig import RIG, RigPhoto, _Hypothesis, _nearness, _scaled, _Search, _units_per_metre
 from service.types import Intrinsics, Pose
 
@@ -189,6 +193,168 @@ def test_a_pose_by_one_view_is_tried_from_ten_matches_on(monkeypatch, inliers, s
     part: Any = SimpleNamespace(photo_px=np.zeros((20, 2), np.float32), points_in_world=np.zeros((20, 3), np.float32))
     found = search()._starts(photo(at(1.0)), [part], 2.0)
     assert [(pose.position_in_world[0], count) for pose, count in found] == [(2.0, 10)][:starts]
+
+
+def run_with(monkeypatch: pytest.MonkeyPatch, best: int, rivals: list[int], covariance: Any) -> tuple[Any, dict]:
+    """Run a search that has found a pose 5 beside the origin, and that ends 6 beside it."""
+    one, asked = search(photo(at()), photo(at(1.0))), {}
+    one._photos[0].query.accuracy = Accuracy()
+    one._loaded, one._tally = None, SimpleNamespace(count=7)
+    elsewhere = [_Hypothesis(at(9.0), inliers, 100, NONE) for inliers in rivals]
+    one._searched = lambda: (_Hypothesis(at(5.0), best, 100, np.eye(6)), elsewhere)
+    one._renderer = SimpleNamespace(at=lambda query, pose: SimpleNamespace(frame=pose.position_in_world[0]))
+    one._with_readings = lambda verdict, pose, found: ("query", verdict, pose, found)
+    bare = Verdict(Status.UNCERTAIN, Reason.FEW_INLIERS, 0.1, 30, 0.5, 1.0, None)
+
+    def refined(cameras, pose, information, renderer):
+        asked["refined"] = [mount.position_in_world[0] for _, mount in cameras], pose.position_in_world[0]
+        return at(6.0), covariance
+
+    def judged(verdicts, covariance, bounds, rival):
+        asked.update(verdicts=verdicts, covariance=covariance, bounds=bounds, rival=rival)
+        return replace(bare, inliers=99)
+
+    monkeypatch.setattr(rig, "refine_rig", refined)
+    monkeypatch.setattr(rig, "verify", lambda images, pose, rendered: replace(bare, coverage=rendered.frame))
+    # The first photo's depth alone counts.
+    monkeypatch.setattr(rig, "typical_depth", lambda frame: asked.setdefault("depths", []).append(frame) or 10.0)
+    monkeypatch.setattr(rig, "rig_verdict", judged)
+    monkeypatch.setattr(rig, "estimate_of", lambda *given, **more: asked.update(told=given, **more))
+    return one.run(), asked
+
+
+@pytest.mark.parametrize(
+    ("best", "rivals", "share"), [(60, [12, 30], 0.5), (60, [], 0.0), (0, [3], 3.0), (1, [2], 2.0), (60, [60], 1.0)]
+)
+def test_a_rig_is_judged_by_its_photos_and_its_best_rival(monkeypatch, best, rivals, share):
+    spread = np.diag([1.0, 2, 3, 4, 5, 6])
+    found, asked = run_with(monkeypatch, best, rivals, spread)
+    assert asked["refined"] == ([0.0, 1.0], 5.0)
+    assert found.world_from_rig.position_in_world[0] == 6.0
+    assert [pose.position_in_world[0] for pose, _ in found.photos] == [6.0, 7.0]
+    assert asked["rival"] == share
+    assert (asked["bounds"].deg, asked["bounds"].units, asked["depths"]) == (5.0, pytest.approx(0.2), [6.0])
+    assert [verdict.coverage for verdict in asked["verdicts"]] == [6.0, 7.0]
+    # Of the first photo, which is the rig's own frame; the second's is turned by what lies between.
+    assert np.array_equal(asked["covariance"], spread)
+    between = adjoint(at(-1.0).world_from_camera)
+    assert [verdict.covariance for _, verdict in found.photos] == [
+        pytest.approx(spread),
+        pytest.approx(between @ spread @ between.T),
+    ]
+    assert asked["told"][0] == "query"
+    assert (asked["told"][3].inliers, asked["renders"]) == (99, 7)
+    assert [record.stage for record in asked["told"][4]] == ["refine_rig", "verify_rig"]
+    unknown, asked = run_with(monkeypatch, best, rivals, None)
+    assert asked["covariance"] is None
+    assert [verdict.covariance for _, verdict in unknown.photos] == [None, None]
+
+
+def test_readings_move_the_whole_rig_if_they_move_its_first_photo(monkeypatch):
+    one = search(photo(at(1.0)), photo(at(3.0)))
+    one._photos[0].query.warnings = ("before",)
+    one._request, one._loaded = Request(), SimpleNamespace(scene=SimpleNamespace(info=SimpleNamespace(sha256="a")))
+    monkeypatch.setattr(rig, "contradictions", lambda *_: ("against",))
+    monkeypatch.setattr(rig, "replace", lambda value, **changes: SimpleNamespace(**vars(value) | changes))
+    found = [(at(6.0), SimpleNamespace(covariance=None)), (at(8.0), SimpleNamespace(covariance=None))]
+    told = SimpleNamespace(covariance=np.diag([1.0, 2, 3, 4, 5, 6]))
+    moved_to = at(6.5)
+    for own, verdict, moves in (
+        (found[0][0], told, False),
+        (moved_to, SimpleNamespace(covariance=None), False),
+        (moved_to, told, True),
+    ):
+        monkeypatch.setattr(rig, "fused", lambda *_, own=own, verdict=verdict: (own, verdict))
+        query, final, pose, photos = one._with_readings("verdict", at(5.0), found)
+        assert query.warnings == ("before", "against")
+        if not moves:
+            assert (final, photos) == ("verdict", found)
+            assert pose.position_in_world[0] == 5.0
+            continue
+        assert final is told
+        assert pose.position_in_world[0] == 5.5
+        assert [each.position_in_world[0] for each, _ in photos] == [6.5, 8.5]
+        # Two units lie between the two.
+        between = adjoint(at(-2.0).world_from_camera)
+        assert photos[0][1].covariance == pytest.approx(told.covariance)
+        assert photos[1][1].covariance == pytest.approx(between @ told.covariance @ between.T)
+
+
+@pytest.mark.parametrize(
+    ("inliers", "preferred", "best", "left_over"),
+    [(80, True, 80, [20]), (79, True, 100, [20, 79]), (80, False, 100, [20, 80])],
+)
+def test_readings_decide_between_poses_with_four_fifths_of_the_matches(inliers, preferred, best, left_over):
+    one, left = search(photo(at())), iter([100, inliers, 20])
+    one._hypotheses = lambda views, factor: iter([(at(float(views)), 5)])
+    one._rematched = lambda pose: _Hypothesis(pose, next(left), 1000, NONE)
+    one._twins = lambda found: 1 / 0  # none is sure
+    one._readings_prefer = lambda a, b: preferred and (a.inliers, b.inliers) in ((80, 100), (79, 100))
+    found, rivals = one._searched()
+    assert found.inliers == best
+    # What the readings speak against is no rival.
+    assert sorted(rival.inliers for rival in rivals) == left_over
+
+
+def test_twins_of_a_sure_pose_are_tried_and_what_explains_its_matches_is_none():
+    one, left = search(photo(at())), iter([70, 65, 64])
+    one._hypotheses = lambda views, factor: iter([(at(1.0), 5)])
+    one._twins = lambda found: [at(found.world_from_rig.position_in_world[0] + k) for k in (10, 20)]
+    one._rematched = lambda pose: _Hypothesis(pose, next(left), 100, NONE)
+    one._is_same = lambda other, best: other.inliers == 64
+    found, rivals = one._searched()
+    assert found.inliers == 70
+    assert [(rival.inliers, rival.world_from_rig.position_in_world[0]) for rival in rivals] == [(65, 11.0)]
+
+
+def test_hypotheses_are_those_of_all_matches_then_of_single_views_then_of_the_rest(monkeypatch):
+    one = search(photo(at()), photo(at(1.0)))
+    one._images = [None, None]
+    asked: list[Any] = []
+    variant = SimpleNamespace(scaled=lambda factor: SimpleNamespace(max_error_px=4.0, factor=factor))
+
+    def ranked(of, count, support):
+        asked.append((of.factor, count, support.tolist()))
+        return [0, 1]
+
+    one._retrievals = [
+        SimpleNamespace(
+            upright_variant=lambda: variant,
+            rotated_variant=lambda upright: upright,
+            features=lambda v: v,
+            ranked=ranked,
+        )
+    ] * 2
+    one._support = lambda: np.array([[0.25, 0.5], [1.0, 0.0]])
+    one._index, one._loaded = SimpleNamespace(views=["first", "second"]), SimpleNamespace(matcher=None)
+    one._starts = lambda of, parts, error_px: [
+        (at(100 * of.rig_from_camera.position_in_world[0] + len(parts)), error_px)
+    ]
+    two = Correspondences(*(np.zeros((3, size), np.float32) for size in (2, 2, 3)))
+    monkeypatch.setattr(rig, "correspondences", lambda *_: two)
+    solved: list[Any] = []
+
+    def estimate(matches, trials, starts):
+        solved.append(([len(each.photo_px) for each in matches], trials, len(starts)))
+        if len(solved) > 2:
+            return None
+        agree = [np.arange(len(each.photo_px)) < 2 for each in matches]
+        return SimpleNamespace(world_from_rig=at(float(len(solved))), num_inliers=4, inliers=agree)
+
+    monkeypatch.setattr(rig, "estimate_rig_pose", estimate)
+    found = list(one._hypotheses(7, 0.5))
+    # What the other photos say of a view counts twice.
+    assert asked == [(0.5, 7, [0.5, 1.0]), (0.5, 7, [2.0, 0.0])]
+    assert [pose.position_in_world[0] for pose, _ in found] == [1.0, 2.0, 102.0, 2.0]
+    # The matches that agreed are left out in turn; starts are tried once.
+    assert solved == [([6, 6], 1000, 2), ([4, 4], 1000, 0), ([2, 2], 1000, 0)]
+
+
+def test_the_likeliest_pose_has_the_first_photo_at_the_view_most_like_it():
+    one = search(photo(at(1.0)), photo(at(2.0)))
+    one._index = SimpleNamespace(views=[SimpleNamespace(camera=SimpleNamespace(pose=at(x))) for x in (3.0, 5.0, 7.0)])
+    one._retrievals = [SimpleNamespace(upright_variant=lambda: None, scores=lambda _: np.array([0.1, 0.9, 0.3]))]
+    assert one._likeliest().position_in_world[0] == 4.0
 
 
 def test_other_photos_speak_for_views_that_put_this_one_near_them():

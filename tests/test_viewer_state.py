@@ -13,7 +13,7 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import Mock
+from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
@@ -239,6 +239,35 @@ def test_buttons_are_there_for_what_can_be_done(count: int, saving: bool) -> Non
         if saving:  # and it can be saved again afterwards
             found.set_saving_replay(False)
             assert found.replay.disabled is (count == 0)
+
+
+@pytest.mark.parametrize("splats", [True, False])
+def test_both_panels_are_one_column_at_the_right_and_most_layers_are_shown(splats: bool) -> None:
+    client = MagicMock()
+    gui = client.gui
+    found = Controls(client, splats=splats)
+    gui.main_panel.dock_right.assert_called_once_with()
+    gui.main_panel.set_width.assert_called_once_with(430)
+    gui.add_panel.assert_called_once_with(visible=False)
+    found.window.dock_below.assert_called_once_with(gui.main_panel)
+    assert found.flush is client.flush
+    assert found.saving_replay is False
+    boxes = {call.args[0]: call.args[1] for call in gui.add_checkbox.call_args_list if len(call.args) > 1}
+    assert {name for name, shown in boxes.items() if not shown} == {
+        *("measure distances", "name a point", "plan view"),
+        *("axes and scale", "poses of all jobs", "coverage", "floor plan"),
+        *(() if splats else ("splats",)),
+    }
+    assert set(found.layers) <= boxes.keys()
+    assert gui.add_slider.call_args_list[0].args == ("step", 0, 0, 1, 0)
+    sliders = {call.args[0]: call for call in gui.add_slider.call_args_list[1:]}
+    for name in ("photo opacity", "render opacity"):
+        assert sliders[name].args[1:] == (0.0, 1.0, 0.05, 0.5)
+        assert sliders[name].kwargs["visible"] is False
+    # What needs a record can't be used yet.
+    assert {call.args[0] for call in gui.add_button.call_args_list if call.kwargs.get("disabled")} == {
+        "look through this camera", "fly to result", "save as replay file",
+    }  # fmt: skip
 
 
 def test_a_window_without_images_stays_hidden() -> None:
