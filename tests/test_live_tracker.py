@@ -202,6 +202,64 @@ def test_frames_go_together_where_lengths_are_known(tracker, monkeypatch, sigma,
     assert tracker._rig(query) == []
 
 
+DYADIC = replace(
+    LIVE, stale_s=0.5, unverified_s=1.0, retry_s=3.0, retry_every_s=0.125, kept_every_s=0.0625, search_after_s=0.125,
+    check_every_s=1.0, most_scale_sigma=0.25,
+)  # fmt: skip
+"""Times that are exact in binary: differences of frames' times are at the bounds themselves."""
+
+
+@pytest.mark.parametrize(
+    ("now_s", "verified_s", "tried_s", "due"),
+    [
+        (10.5, 9.5, 10.4, True), (10.51, 9.6, 10.45, False), (10.5, 9.49, 10.45, False),
+        (12.5, 9.5, 12.375, True), (12.5, 9.5, 12.376, False), (12.5, 9.49, 12.0, False),
+    ],
+)  # fmt: skip
+def test_times_at_their_bounds_are_in_time(tracker, now_s, verified_s, tried_s, due):
+    tracker._config = DYADIC
+    tracker._past.append((10.0, at()))
+    tracker._verified_s, tracker._tried_s = verified_s, tried_s
+    assert tracker._is_due(frame(1, now_s)) is due
+
+
+def test_nothing_is_searched_or_checked_before_its_time(tracker, monkeypatch):
+    tracker._config = DYADIC
+    begins: list[str] = []
+    monkeypatch.setattr(tracker, "_searched", lambda *_: begins.append("search"))
+    monkeypatch.setattr(tracker, "_checked", lambda *_: begins.append("check"))
+    for verified_s, checked_s, begun in ((9.875, 9.0, []), (9.874, 9.0, ["search"]), (9.875, 8.999, ["check"])):
+        begins.clear()
+        tracker._background.calls.clear()
+        tracker._verified_s, tracker._checked_s = verified_s, checked_s
+        tracker._begin_in_background(bright(), 10.0, _Followed(at(), VERIFIED, bright()))
+        for call in tracker._background.calls:
+            call(None)
+        assert begins == begun
+    contrast = float(bright().rgb[::8, ::8].std())
+    for least, dark in ((contrast, False), (1.001 * contrast, True)):
+        tracker._config = replace(DYADIC, min_contrast=least)
+        assert tracker._is_dark(bright()) is dark
+
+
+def test_a_velocity_as_old_as_the_bound_is_continued_and_a_scale_as_uncertain_relates_frames(tracker, monkeypatch):
+    tracker._config = DYADIC
+    for time_s in (1.0, 1.25):
+        tracker._past.append((time_s, at(4 * (time_s - 1))))
+    assert tracker._expected(1.75).position_in_world[0] == 3.0
+    assert tracker._expected(1.751).position_in_world[0] == 1.0
+    query = SimpleNamespace(lens_prior=None, prior=None)
+    monkeypatch.setattr(tracker, "_alone", lambda query: query)
+    monkeypatch.setattr(tracker, "_query", lambda *_: query)
+    monkeypatch.setattr(tracker, "_checked_size", lambda _: (64, 48))
+    monkeypatch.setattr(live_tracker, "RigPhoto", lambda query, pose: pose)
+    tracker._views.add(frame(1), at(0.0), 0)
+    tracker._views.add(frame(2), at(4.0), 0)
+    for sigma, count in ((0.25, 2), (0.251, 0)):
+        tracker._fusion = SimpleNamespace(scale=(0.5, sigma))
+        assert len(tracker._rig(query)) == count
+
+
 # ------------------------------------------------------------------ what a search leads to
 
 

@@ -189,6 +189,7 @@ def test_only_a_fit_beyond_doubt_excludes_a_mirror_image() -> None:
     ("inliers", "localized", "searched"),
     [
         ((100, 51, 20), (True, False, False), [0, 1]),  # similar rooms are told apart by verification
+        ((100, 50, 20), (True, False, False), [0, 1]),
         ((100, 49, 20), (True, False, False), [0]),
         ((100, 49, 20), (False, True, True), [0, 1]),
         ((20, 100, 60, 55, 52), (False,) * 5, [1, 2, 3]),  # three at most
