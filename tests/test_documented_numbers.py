@@ -17,18 +17,25 @@ from test_bench import poses
 
 from service.accuracy import DEFAULT_ACCURACY
 from service.bench.bench_photos import BenchPhoto
-from service.bench.datasets import LAYOUTS
+from service.bench.datasets import LAYOUTS, MIN_LONG_SIDE_PX
+from service.bench.evaluate import BOUNDS
 from service.bench.field_queries import FieldQuery, decoded, send
 from service.bench.field_random import random_row
 from service.bench.field_rows import FOCAL_FACTORS, K1, TOLD, Row
 from service.bench.fleet_simulation import FLEETS
 from service.bench.gpu import LIMIT_S, PARTS
 from service.bench.gpu_shared import FULL
+from service.bench.live import LINK
+from service.bench.live_film import FILM
+from service.bench.live_odometry import ODOMETRY
 from service.bench.modifications import MODIFICATIONS, require_modifications
 from service.bench.paper.plan import MAIN, cells
+from service.bench.peer.comparison import MIN_INLIERS
+from service.bench.peer.photo_matching import MATCHING as PEER_MATCHING
 from service.bench.pose_metrics import Units
-from service.bench.scene_modifications import SCENE_MODIFICATIONS, require_scene_modifications
+from service.bench.scene_modifications import FAINT, OPAQUE, SCENE_MODIFICATIONS, require_scene_modifications
 from service.bench.start_poses import start_pose
+from service.bench.street import STREET
 from service.cli.server import _CONNECTIONS_S
 from service.coverage.calibration import MIN_PHOTOS
 from service.coverage.measurement import COVERAGE
@@ -38,7 +45,14 @@ from service.estimators.search_config import SEARCH
 from service.estimators.shutter_check import ShutterCheckConfig
 from service.geometry import pose_distance
 from service.jobs.config import JobsConfig
+from service.jobs.service import _RENEWALS
+from service.jobs.worker import _BATCH_S
+from service.live.fusion import FUSION
+from service.live.live_tracker import LIVE
+from service.live.pace import GOOD_PX, MAX_USEFUL_PX
+from service.live.recent_views import MOST as MOST_VIEWS
 from service.photos.decode_config import DEFAULTS
+from service.pose.absolute_pose.device_priors import DEVICE_PRIORS
 from service.pose.refinement.refinement_config import REFINEMENT
 from service.pose.retrieval.floaters import FLOATERS
 from service.pose.retrieval.free_views import FREE_VIEWS
@@ -46,15 +60,25 @@ from service.pose.retrieval.index_builder import PARTS as WHOLE
 from service.pose.retrieval.inverted_views import INVERTED
 from service.pose.retrieval.viewpoints import VIEWPOINTS
 from service.pose.training_photos.corners import CORNERS
+from service.pose.training_photos.digest import DIGEST
 from service.pose.training_photos.patch_matching import PATCHES
 from service.pose.training_photos.patch_pose import PATCH_POSE
 from service.pose.training_photos.surface_points import TRIANGULATION
 from service.pose.verification.captured_volume import CAPTURE
 from service.pose.verification.gate import VERIFICATION
 from service.pose.verification.mirror_images import MIRROR
+from service.readings_in_scene import ANCHOR_HEADING_SIGMA, ANCHOR_SIGMA_M
+from service.registration.gathering import SCENE_UP_SIGMA
+from service.registration.quantiles import chi_square_quantile
+from service.scene_manager.camera_frame import CAMERA_FRAME_CONFIG
 from service.smoothing import SMOOTHING
 from service.types import LENS_PRIORS, Camera, Intrinsics, LensPrior
+from service.web.metrics import _MOST_VALUES
+from service.web.routes.live import _BURST_S, _HELLO_S
+from service.web.schemas.shared import ShareIn
 from service.web.settings import Settings
+from service.web.shared_state import RENEW_S
+from viewer.scene_cache import MAX_SPLATS
 
 LENS = Intrinsics(240, 180, 200.0, 204.0, 124.0, 86.0)
 
@@ -369,3 +393,86 @@ def test_a_coverage_map_is_measured_as_said() -> None:
     assert MIN_PHOTOS == 4
     bounds = said(document, "`localized` within # degrees and # % of the distance")
     assert bounds == (DEFAULT_ACCURACY.deg, 100 * (DEFAULT_ACCURACY.share or 0))
+
+
+# ------------------------------------------------------------------ live sessions, fleets, readings
+
+
+def test_live_sessions_are_as_said() -> None:
+    settings, document = Settings(scenes=[]), "live.md"
+    pattern = "lists them): # sessions, # of a client (a key, or without keys an address), # MB, # frames a second"
+    limits = said(document, pattern)
+    assert limits[:2] == (settings.live_sessions, settings.live_sessions_of_client)
+    assert limits[2:] == (settings.live_frame_bytes / 1e6, settings.live_fps)
+    assert said(document, "average over two seconds, # s without a frame") == (settings.live_idle_s,)
+    assert _BURST_S == 2
+    assert said(document, "The first message is JSON, within # s") == (_HELLO_S,)
+    assert said(document, "no hello within # s") == (_HELLO_S,)
+    good, quality, most = said(document, "# pixels on the long side and JPEG quality # are good; above # pixels")
+    assert (good, most) == (GOOD_PX, MAX_USEFUL_PX)
+    assert quality == 80
+    assert said(document, "above # megapixels they are refused") == (LIVE.max_pixels / 1e6,)
+    assert said(document, "by at most # cm and # degrees a frame") == (100 * FUSION.step, FUSION.step_deg)
+    bounds = said(document, "the standard deviation exceeds # degrees or # % of the distance")
+    assert bounds == (FUSION.most_turn_deg, 100 * FUSION.most_share)
+    assert said(document, "After three seconds without a frame the odometry counts as begun anew") == ()
+    assert FUSION.most_gap_s == 3
+    assert said(document, "up to four of the last ones that show different things") == ()
+    assert 1 + MOST_VIEWS == 4
+    assert said(document, "found in the last ten metres") == ()
+    assert FUSION.way == 10
+
+
+def test_a_fleets_times_are_as_said() -> None:
+    document = "scale.md"
+    lease_s, every_s = said(document, "has a lease of # s, by the database's clock, which its front renews every # s")
+    assert JobsConfig().lease_s == lease_s == _RENEWALS * every_s
+    assert said(document, "Records are stored every # s") == (_BATCH_S,)
+    assert said(document, "A live session has a lease of # s, renewed every # s") == (3 * RENEW_S, RENEW_S)
+
+
+def test_readings_and_frames_are_trusted_as_said() -> None:
+    turned_deg, metres = said("api.md", "# degrees for what a manifest says is up or north, # m for its anchor")
+    assert SCENE_UP_SIGMA == ANCHOR_HEADING_SIGMA == np.radians(turned_deg)
+    assert metres == ANCHOR_SIGMA_M
+    # Of a Gaussian: the quantile of one degree of freedom has 99.9 %, and the likelihood ratio is half of it, e^-5.4.
+    (share,) = said("api.md", "A reading that contradicts the photo (beyond # % of what")
+    for freedom, bound in enumerate(DEVICE_PRIORS.chi_square, 1):
+        assert chi_square_quantile(share / 100, freedom) == pytest.approx(bound, abs=0.01)
+    (odds,) = said("api.md", "by a likelihood ratio that the wrong one has in one of # cases")
+    assert DEVICE_PRIORS.preferred == pytest.approx(chi_square_quantile(1 - 2 / odds, 1), abs=0.02)
+    (tried,) = said("scenes.md", "Where four photos or more lie in the folder, a service localizes up to # of them")
+    assert CAMERA_FRAME_CONFIG.tried == tried
+    assert CAMERA_FRAME_CONFIG.least == 4
+    assert said("scenes.md", "Of more than # photos every second, third and so on") == (DIGEST.max_photos,)
+
+
+def test_what_the_service_keeps_and_shows_is_as_large_as_said() -> None:
+    settings = Settings(scenes=[])
+    assert said("deploy.md", "Beyond `SPLATFIX_CACHE_BYTES` (# GB)") == (settings.cache_bytes / 1e9,)
+    assert said("deploy.md", "the first hundred each, and of the others together") == ()
+    assert _MOST_VALUES == 100
+    assert said("api.md", "`expires_in_s`, by default # days") == (ShareIn().expires_in_s / 86_400,)
+    assert said("viewer.md", "Of a large scene the # most") == (MAX_SPLATS,)
+
+
+def test_benches_measure_what_is_said() -> None:
+    document = "benchmarks.md"
+    assert said(document, "a service as it is taken: # x # at # frames a second") == (640, 480, FILM.fps)
+    delay_ms, spread_ms, lost = said(document, "with # +- # ms of delay and # % of frames lost")
+    assert (LINK.delay_s, LINK.spread_s, LINK.loss) == (delay_ms / 1e3, spread_ms / 1e3, lost / 100)
+    assert said(document, "another place and a pause of # s") == (FILM.locked_s,)
+    assert said(document, "a fifth of the picture hidden") == ()
+    assert FILM.occluded_share == 1 / 5
+    assert said(document, "Frames bring an odometry that drifts by # % of the way") == (100 * ODOMETRY.drift,)
+    ratio, nearest = said(document, "matching (ratio #, mutual), pairs (the # nearest poses")
+    assert (PEER_MATCHING.ratio, PEER_MATCHING.pairs_of_photo) == (ratio, nearest)
+    assert said(document, "of a peer those with # inliers or more") == (MIN_INLIERS,)
+    assert said(document, "Of photos in several sizes the smallest of at least # px") == (MIN_LONG_SIDE_PX,)
+    bounds = said(document, "the share of photos within # cm and # degree up to # m and # degrees")
+    assert (100 * BOUNDS[0][0], BOUNDS[0][1], *BOUNDS[-1]) == bounds
+    assert said(document, "`floaters` (a factor of # large faint and # opaque ones)") == (FAINT, OPAQUE)
+    millions, metres = said(document, "a synthetic street of # million Gaussians: houses, cars and trees along # m")
+    # A unit is three metres.
+    assert (STREET.count, 3 * STREET.length) == (1e6 * millions, metres)
+    assert said(document, "at ten times that distance, and # floaters, of up to # units") == (STREET.floaters, 40)
