@@ -73,6 +73,7 @@ from service.registration.quantiles import chi_square_quantile
 from service.scene_manager.camera_frame import CAMERA_FRAME_CONFIG
 from service.smoothing import SMOOTHING
 from service.types import LENS_PRIORS, Camera, Intrinsics, LensPrior
+from service.web.hints import EXAMPLES
 from service.web.metrics import _MOST_VALUES
 from service.web.routes.live import _BURST_S, _HELLO_S
 from service.web.schemas.shared import ShareIn
@@ -476,3 +477,17 @@ def test_benches_measure_what_is_said() -> None:
     # A unit is three metres.
     assert (STREET.count, 3 * STREET.length) == (1e6 * millions, metres)
     assert said(document, "at ten times that distance, and # floaters, of up to # units") == (STREET.floaters, 40)
+
+
+def test_hints_show_the_examples_of_the_document() -> None:
+    text = " ".join((ROOT / "docs/api.md").read_text("utf-8").split())
+    for name in ("intrinsics", "prior", "up_in_camera", "gps", "heading", "times_s"):
+        assert json.dumps(EXAMPLES[name]) in text, name
+    prior, (first, second) = EXAMPLES["prior"], EXAMPLES["rig"]["cameras"]
+    assert EXAMPLES["truth"] == {name: prior[name] for name in ("position", "quaternion_wxyz")}
+    # The second camera is beside the first, as far as the document's.
+    assert first["intrinsics"] == second["intrinsics"] == EXAMPLES["intrinsics"]
+    assert json.dumps(first["rig_from_camera"]) in text
+    beside = re.findall(r'"rig_from_camera": (\[\[.*?\]\])', text)[1]
+    assert np.array(second["rig_from_camera"])[:, 3].tolist() == np.array(json.loads(beside))[:, 3].tolist()
+    assert np.array_equal(np.array(second["rig_from_camera"])[:, :3], np.eye(4)[:, :3])
