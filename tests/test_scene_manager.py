@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from fake_service import until
 
 from service.errors import (
     BadInput,
@@ -147,6 +149,25 @@ def test_a_scene_is_loaded_when_it_is_asked_for_and_prepared_once(make):
         other = make("a", **options)
         other.hold("a")
         assert other.evicted == []
+
+
+def test_the_thread_loads_at_once_what_is_asked_for_and_ends_when_it_is_told(make):
+    """Without being woken it would look again after five seconds."""
+    of = make("ab")
+    of.entry("b").required = True
+    of.scenes.start()
+    for name in ("b", "a"):  # the first one is required
+        if name == "a":
+            with pytest.raises(SceneNotReady):
+                of.scenes.get(name)
+        until(lambda name=name: of.states()[name] == "ready", name, 2)
+    began = time.perf_counter()
+    of.scenes.close()
+    assert not of.scenes._thread.is_alive()
+    assert time.perf_counter() - began < 2
+    # A scene that fails while the process ends is no news.
+    of.scenes._requested.append(of.entry("a"))
+    assert of.scenes._next() is None
 
 
 def test_names_are_of_scenes(make):
