@@ -267,7 +267,6 @@ def test_of_equal_counts_the_first_pose_is_kept(monkeypatch) -> None:
 
 def test_a_verdict_of_the_same_rank_replaces_none(monkeypatch) -> None:
     searching = state()
-    searching.config = replace(searching.config)
     first, second = (SimpleNamespace(num_inliers=n, pose=HERE, correction=None) for n in (1, 2))
     monkeypatch.setattr(search_state, "only_colours_doubt", lambda *_: False)
     monkeypatch.setattr(SearchState, "verify", lambda self, refined, *_, **__: told_verdict())
