@@ -14,7 +14,7 @@ from service.errors import InvalidImage
 from service.geometry import se3_exp
 from service.live import live_tracker
 from service.live.live_tracker import LIVE, LiveTracker, _Followed, _Found, _resized
-from service.live.live_values import FusedOdometry, LiveFrame, LiveTask
+from service.live.live_values import FusedOdometry, LiveAnswer, LiveFrame, LiveTask
 from service.live.odometry_scale import ScaleMemory
 from service.live.pace import Pace
 from service.live.recent_views import RecentViews
@@ -100,6 +100,51 @@ def test_in_the_dark_nothing_is_searched(tracker, contrast, dark):
     assert float(query.rgb[::8, ::8].std()) == pytest.approx(contrast)
     tracker._begin_in_background(query, 1.0, None)
     assert len(tracker._background.calls) == (not dark)
+
+
+@pytest.mark.parametrize(
+    ("past", "due", "idle", "dark", "expected"),
+    [
+        (False, False, True, False, ["move", "take over", "query", "begin None", "keep", "answer None"]),
+        (False, False, False, False, ["move", "take over", "keep", "answer None"]),
+        (True, True, False, False, ["move", "take over", "query", "follow", "begin seen", "keep", "answer seen"]),
+        (True, True, True, True, ["move", "take over", "query", "begin None", "keep", "answer None"]),
+        (True, False, True, False, ["move", "take over", "query", "begin None", "keep", "answer None"]),
+        (True, False, False, False, ["move", "take over", "keep", "answer None"]),
+    ],
+)
+def test_a_frame_is_followed_or_searched_for_then_kept_and_answered(
+    tracker, monkeypatch, past, due, idle, dark, expected
+):
+    done: list[str] = []
+    tracker._fusion = SimpleNamespace(move=lambda *given: done.append("move"), resets=4)
+    tracker._background.idle = idle
+    if past:
+        tracker._past.append((0.0, at()))
+    for name, step in {
+        "_checked_size": lambda frame: (64, 48),
+        "_take_over": lambda: done.append("take over"),
+        "_is_due": lambda frame: due,
+        "_query": lambda frame, size: done.append("query") or "query",
+        "_is_dark": lambda query: dark,
+        "_followed": lambda query, time_s: done.append("follow") or "seen",
+        "_begin_in_background": lambda query, time_s, followed: done.append(f"begin {followed}"),
+        "_keep": lambda frame: done.append("keep"),
+    }.items():
+        monkeypatch.setattr(tracker, name, step)
+    told = LiveAnswer(7, 20.0, "lost", (64, 48))
+    monkeypatch.setattr(tracker, "_answer", lambda frame, size, followed: done.append(f"answer {followed}") or told)
+    answer = tracker.use(replace(frame(7, 20.0), odom_from_camera=at(2.0)))
+    assert done == expected
+    assert replace(answer, used_s=told.used_s) == told
+    assert 0 < answer.used_s < 10
+    # The odometry relates the frame to those before it.
+    ((kept, odom),) = tracker._views._kept
+    assert (kept.id, odom.position_in_world[0], tracker._views._segment) == (7, 2.0, 4)
+    done.clear()
+    tracker.use(frame(8, 21.0))
+    assert done == expected[1:]
+    assert len(tracker._views._kept) == 1
 
 
 # ------------------------------------------------------------------ when to follow and when to search
