@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from starlette.websockets import WebSocketDisconnect
 from test_scene_placement import MB, placement, run_job
 
 from service.accuracy import Accuracy
@@ -25,6 +27,7 @@ from service.errors import CorruptScene, InvalidAccuracy, InvalidIntrinsics, Inv
 from service.geometry import look_at, moved, project, reprojection_error_px
 from service.jobs.left_over_photos import LeftOverPhotos
 from service.lenses.lens_estimate import LENS_MEMORY, LensEstimate, LensMeasurement, Viewpoint, updated
+from service.live.mailbox import Mailbox
 from service.photos import exif_gps
 from service.photos.camera_identity import EXIF_FOCAL, CameraIdentity, exif_focal_prior
 from service.photos.images import _target, resized
@@ -33,6 +36,7 @@ from service.registration.known_places.known_place import KnownPlaces
 from service.results import Status
 from service.scene_formats import manifest, side_file
 from service.types import BoxPrior, Camera, GaussianPosePrior, GeoAnchor, Intrinsics, Pose
+from service.web.routes import live as live_route
 
 HERE = Pose(np.eye(4))
 LENS = Intrinsics(320, 240, 250.0, 250.0, 160.0, 120.0)
@@ -339,6 +343,89 @@ def test_left_over_photos_are_looked_for_as_soon_as_it_is_time(monkeypatch: pyte
         monkeypatch.setattr(LeftOverPhotos, "_found", lambda self, now=now: looked.append(now) or set())
         left.delete_old()
     assert looked == [10.0]
+
+
+# ------------------------------------------------------------------ a live session
+
+
+class Steps:
+    """Messages at their times, then the client leaves."""
+
+    def __init__(self, *messages: tuple[float, str | bytes]) -> None:
+        self.now, self._left = 0.0, list(messages)
+
+    def time(self) -> float:
+        return self.now
+
+    async def receive(self) -> dict[str, Any]:
+        if not self._left:
+            return {"type": "websocket.disconnect"}
+        self.now, message = self._left.pop(0)
+        return {"type": "websocket.receive", "text" if isinstance(message, str) else "bytes": message}
+
+
+def session_of(steps: Steps, **settings: Any) -> Any:
+    session: Any = live_route._Session.__new__(live_route._Session)
+    session._loop = session._socket = steps
+    session._settings = SimpleNamespace(**{"live_fps": 2, "live_frame_bytes": 4, "live_idle_s": 8.0} | settings)
+    session._heard_at, session._caller, session._mailbox = 0.0, None, Mailbox()
+    return session
+
+
+@pytest.mark.parametrize(
+    ("times", "used"),
+    [
+        ([0.0] * 4, 4), ([0.0] * 5, 4),  # two seconds of two frames
+        ([0.0] * 4 + [0.5, 1.0, 1.5], 7), ([0.0] * 4 + [0.5, 0.5], 5),
+        ([0.0] * 4 + [9.0] * 5, 8),  # no more than that is saved up
+    ],
+)  # fmt: skip
+def test_frames_are_limited_on_average_over_two_seconds(times, used, monkeypatch) -> None:
+    taken: list[Any] = []
+    monkeypatch.setattr(live_route, "read_frame", lambda message, last: taken.append(last) or SimpleNamespace(id=1))
+    session = session_of(Steps(*((time_s, b"frame"[:4]) for time_s in times)))
+    with pytest.raises((live_route._End, WebSocketDisconnect)) as ended:
+        asyncio.run(session._frames())
+    assert len(taken) == used
+    assert taken[0] is None
+    assert (getattr(ended.value, "code", None) == live_route.TOO_MANY) is (used < len(times))
+    assert session._heard_at == times[min(used, len(times) - 1)]
+
+
+def test_a_message_of_the_limit_is_received_and_a_text_is_no_frame() -> None:
+    for message, received in ((b"1234", True), ("1234", True), (b"12345", False), ("12345", False)):
+        session = session_of(Steps((1.0, message)))
+        if received:
+            assert asyncio.run(session._receive()) == message
+        else:
+            with pytest.raises(live_route._End, match="at most 4 bytes, not 5"):
+                asyncio.run(session._receive())
+    with pytest.raises(InvalidRequest, match="binary"):
+        asyncio.run(session_of(Steps((1.0, "1234")))._frames())
+    with pytest.raises(WebSocketDisconnect):
+        asyncio.run(session_of(Steps())._receive())
+
+
+@pytest.mark.parametrize(("heard_at", "valid", "code"), [(1.0, False, "KEY_GONE"), (0.999, True, "TIMEOUT")])
+def test_a_session_ends_without_frames_and_with_its_key(heard_at, valid, code, monkeypatch) -> None:
+    slept: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        slept.append(seconds)
+
+    monkeypatch.setattr(live_route.asyncio, "sleep", sleep)
+    session = session_of(Steps())
+    session._loop.now, session._heard_at = 9.0, heard_at  # after just the time that is allowed, 8 s, or more
+    session._caller = "somebody"
+    session._state = SimpleNamespace(keys=SimpleNamespace(still_valid=lambda caller: valid))
+    with pytest.raises(live_route._End) as ended:
+        asyncio.run(session._watch())
+    assert ended.value.code == getattr(live_route, code)
+    assert slept == [1.0]
+    session._settings.live_idle_s, session._heard_at, session._loop.now = 2.0, 0.0, 9.0
+    with pytest.raises(live_route._End, match="no frame for 2 s"):
+        asyncio.run(session._watch())
+    assert slept == [1.0, 0.5]
 
 
 # ------------------------------------------------------------------ figures of the benches
