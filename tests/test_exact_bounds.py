@@ -44,6 +44,7 @@ from service.live.live_values import OdometryFacts
 from service.pose.absolute_pose import device_priors, fisheye
 from service.pose.absolute_pose.device_priors import DEVICE_PRIORS, PriorResidual, agreement, prefers
 from service.pose.absolute_pose.fisheye import FISHEYE, LensModels
+from service.pose.absolute_pose.p3p import polish_distances
 from service.pose.features.rendered_views import View, backprojected
 from service.pose.features.unknown_background import UNKNOWN_BACKGROUND, has_white_border, shows_background
 from service.pose.matching import match_stages
@@ -772,3 +773,20 @@ def test_samples_as_old_as_the_memory_are_kept_and_frames_of_one_time_are_one() 
     for time_s in (0.0, 3.0, 3.0, 6.0):
         fusion.move(time_s, HERE)
     assert [sample.time_s for sample in fusion._samples] == [0.0, 3.0, 6.0]
+
+
+@pytest.mark.parametrize("near", [None, 0, 1, 2])
+def test_no_distance_of_a_minimal_pose_is_zero(near: int | None) -> None:
+    """Distances that are exact already: nothing is changed, and the triangle's corners lie in front of the camera."""
+    distances = np.array([1.0, 1.5, 2.0])
+    if near is not None:
+        distances[near] = 0.0
+    cosines = np.array([0.5, 0.25, 0.125])
+    pairs = ((0, 1), (0, 2), (1, 2))
+    squares = [
+        distances[i] ** 2 + distances[j] ** 2 - 2 * c * distances[i] * distances[j]
+        for (i, j), c in zip(pairs, cosines, strict=True)
+    ]
+    polished = distances.copy()
+    assert bool(polish_distances.py_func(polished, cosines, np.array(squares))) is (near is None)
+    assert np.array_equal(polished, distances)

@@ -18,6 +18,7 @@ from test_scene_placement import MB, placement, run_job
 from service.accuracy import Accuracy
 from service.bench import evaluate, field_table, gpu_equality, live, live_odometry, rigs
 from service.bench.modified_photo import _edge_is_inside
+from service.bench.peer.comparison import PEERS
 from service.bench.peer.photo_matching import MATCHING, PhotoFeatures, matched, pairs_of_cameras
 from service.bench.pose_files import _has_intrinsics, _pose_of
 from service.bench.pose_metrics import COARSE, Outcome
@@ -30,12 +31,14 @@ from service.lenses.lens_estimate import LENS_MEMORY, LensEstimate, LensMeasurem
 from service.live.mailbox import Mailbox
 from service.photos import exif_gps
 from service.photos.camera_identity import EXIF_FOCAL, CameraIdentity, exif_focal_prior
-from service.photos.images import _target, resized
+from service.photos.images import _target, encode_image, resized
+from service.registration import register
 from service.registration.known_places import place_table, scene_points, trajectory_places
 from service.registration.known_places.known_place import KnownPlaces
+from service.registration.observations import Evidence
 from service.results import Status
-from service.scene_formats import manifest, side_file
-from service.types import BoxPrior, Camera, GaussianPosePrior, GeoAnchor, Intrinsics, Pose
+from service.scene_formats import manifest, side_file, training_files
+from service.types import BoxPrior, Camera, GaussianPosePrior, GeoAnchor, Intrinsics, NamedCamera, Pose
 from service.web.routes import live as live_route
 
 HERE = Pose(np.eye(4))
@@ -536,3 +539,53 @@ def test_what_a_client_hears_as_a_frame_is_taken_shows_that_frame() -> None:
     for step, anew in ((0.5, 0), (0.501, 1)):
         two: Any = [SimpleNamespace(odom=HERE), SimpleNamespace(odom=at(step))]
         assert live_odometry._segments(two) == [0, anew]
+
+
+# ------------------------------------------------------------------ photos of training cameras, and registrations
+
+
+@pytest.mark.parametrize(
+    ("photo", "camera", "read"),
+    [
+        # 1.8 % and 2.2 % from the camera's shape; exactly 2 %.
+        ((100, 50), (1000, 509), True), ((100, 50), (1000, 491), True),
+        ((100, 50), (1000, 511), False), ((100, 50), (1000, 490), False),
+        ((50, 49), (50, 50), False),
+    ],
+)  # fmt: skip
+def test_a_training_photo_has_its_cameras_shape(
+    tmp_path: Path, photo: tuple[int, int], camera: tuple[int, int], read: bool
+) -> None:
+    data = encode_image(np.full((photo[1], photo[0], 3), 128, np.uint8), "png")
+    (tmp_path / "a.png").write_bytes(data)
+    lens = Intrinsics(*camera, 100.0, 100.0, 0.5 * camera[0], 0.5 * camera[1])
+    found = training_files.photos_beside(tmp_path, None)(NamedCamera("a.png", Camera(lens, HERE)))
+    assert (found is not None) is read
+
+
+def test_a_training_photo_may_be_exactly_as_large_as_files_may_be(tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "a.png").write_bytes(bytes(10))
+    for limit, found in ((10, tmp_path / "a.png"), (9, None)):
+        monkeypatch.setattr(training_files, "_MAX_PHOTO_BYTES", limit)
+        assert training_files.training_photo_path(tmp_path, "a.png") == found
+
+
+@pytest.mark.parametrize("stated", [(), ("position",), ("rotation",), ("position", "rotation")])
+@pytest.mark.parametrize("told", [("position",), ("rotation",), ("position", "rotation")])
+def test_noise_is_told_of_what_was_measured_and_came_without_one(
+    told: tuple[str, ...], stated: tuple[str, ...], monkeypatch
+) -> None:
+    monkeypatch.setattr(register, "is_stated", lambda kind, observations: kind in stated)
+    noise = SimpleNamespace(position_sigma=2.0, rotation_sigma=0.1, factors={"position": 3.0, "rotation": 5.0})
+    fit: Any = SimpleNamespace(of_kind=lambda kind: np.array([False, kind in told]), noise=noise)
+    expected = {"position": 6.0, "rotation": 0.5}
+    found = register._noise(fit, Evidence([]))
+    assert found == {kind: value for kind, value in expected.items() if kind in told and kind not in stated}
+
+
+def test_the_peers_detect_as_colmap_and_hloc_configure_them() -> None:
+    """hloc/extractors/dog.py: first octave 0, peak threshold 0.01; COLMAP's defaults are those of its library."""
+    assert {name: (peer.sift, peer.best_photos) for name, peer in PEERS.items()} == {
+        "sift_best10": ({}, 10),
+        "dog_direct": ({"first_octave": 0, "peak_threshold": 0.01}, None),
+    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -188,3 +189,19 @@ def test_mutual_nearest_uses_each_index_once() -> None:
         if similarity[i, j] == similarity[i].max() == similarity[:, j].max() >= 0.5
     }
     assert {i for i, _ in expected} - {10, 11} <= set(pairs[:, 0].tolist()) | {i for i, j in expected if j in (20, 21)}
+
+
+def test_networks_run_on_one_thread_a_job(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    from service.matchers import networks
+
+    monkeypatch.setenv(networks.WEIGHTS_DIR, str(tmp_path))
+    monkeypatch.setattr(networks, "_read", lambda path: path)
+    before = torch.get_num_threads()
+    try:
+        for load in (MATCHERS.load("xfeat").create, lambda: networks._loaded("file", lambda weights: weights)):
+            torch.set_num_threads(2)
+            load()
+            assert torch.get_num_threads() == 1
+    finally:
+        torch.set_num_threads(before)
