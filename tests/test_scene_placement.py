@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,8 +20,10 @@ from service.errors import (
     SceneTooLarge,
     SceneUnloaded,
 )
-from service.jobs.engine import HeldScenes
+from service.jobs.embedded_engine import EngineConfig
+from service.jobs.engine import EngineLost, HeldScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
+from service.jobs.replica import Replica
 from service.jobs.scene_coordinator import SceneCoordinator
 from service.scene_manager.status import AUTO, SceneReadiness, SceneStatus, StoredScene
 
@@ -255,7 +258,7 @@ class FakeReplica:
         self.scenes: set[str] = set()
         self.loads: list[str] = []
         self.held: dict[str, tuple[str, ...]] = {}
-        self.dead, self.go_on = False, asyncio.Event()
+        self.dead, self.refuses, self.go_on = False, False, asyncio.Event()
         self.go_on.set()
 
     def __getattr__(self, name: str) -> Method:
@@ -287,22 +290,21 @@ class FakeReplica:
         assert not {i for held in self.held.values() for i in held} & set(ids), "dropped in use"
         self.scenes -= set(ids)
 
-    async def _hold(self, drop, stored, ids):
+    async def _hold(self, token, drop, stored, ids):
         await self._drop(drop)
         fresh = [scene.id for scene in stored if scene.id not in self.scenes]
         self.scenes |= set(fresh)
         self.loads += fresh
         await self.go_on.wait()
-        if "torn" in ids:
+        if "torn" in ids or self.refuses:
             self.scenes.discard("torn")
             return CorruptScene("it is torn.", where="scene"), [SceneStatus("torn", "failed")]
-        token = f"{id(self)}.{len(self.held)}"
         self.held[token] = tuple(ids)
         statuses = [SceneStatus(i, "ready", memory_bytes=100) for i in ids]
         return HeldScenes(token, tuple(ids), (0.0, 0.0, 0.0)), statuses
 
     async def _release(self, token: str) -> None:
-        del self.held[token]
+        self.held.pop(token, None)  # one that was refused, too
 
 
 class Fleet:
@@ -355,6 +357,112 @@ def test_a_load_is_made_once_for_all_who_wait():
             await coordinator.hold("f", "x")
 
     with_fleet(check)
+
+
+def test_a_scene_in_memory_is_held_before_its_replica_answers():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        await coordinator.release((await coordinator.hold_later("f", "x")).held.token)
+        (replica,) = fleet.replicas
+        replica.go_on.clear()
+        held = await asyncio.wait_for(coordinator.hold("f", "x"), 5)
+        assert (await coordinator.scene("x")).jobs == 1
+        with pytest.raises(SceneInUse):
+            await coordinator.remove("x")
+        replica.go_on.set()
+        await asyncio.sleep(0.01)
+        assert replica.held == {held.held.token: ("x",)}
+        replica.refuses = True
+        await coordinator.hold("f", "x")  # is taken back
+        await asyncio.sleep(0.01)
+        assert (await coordinator.scene("x")).jobs == 1
+        await coordinator.release(held.held.token)
+        assert replica.held == {}
+        assert [coordinator._placement.jobs(name) for name in coordinator._placement.replicas()] == [0]
+
+    with_fleet(check, replicas=1)
+
+
+def test_a_job_waits_in_its_replica_for_the_scenes_that_are_promised(monkeypatch):
+    """Calls of the coordinator and of a front may overtake each other."""
+
+    async def check() -> None:
+        replica = Replica(EngineConfig("view_index"))
+        task = FakeTask(id="t", held="promised")
+        job = asyncio.ensure_future(anext(replica.localize(task)))  # pyright: ignore[reportArgumentType]
+        await asyncio.sleep(0.01)
+        assert not job.done()
+        held, _ = await replica.hold("promised", (), (), ("x",))
+        assert isinstance(held, HeldScenes)
+        assert held.token == "promised"
+        assert await asyncio.wait_for(job, 5) == ([], "of own")
+        await replica.release("promised")
+        assert engine.released == ["own"]
+        late = anext(replica.localize(task))  # pyright: ignore[reportArgumentType]
+        with pytest.raises(EngineLost):
+            await late
+        assert replica._held == {}
+
+    engine = FakeEngine()
+    monkeypatch.setattr("service.jobs.replica.EmbeddedEngine", lambda config: engine)
+    monkeypatch.setattr("service.jobs.replica._ON_ITS_WAY_S", 0.1)
+    asyncio.run(check())
+
+
+@dataclass
+class FakeTask:
+    id: str
+    held: str
+
+
+class FakeEngine:
+    """Holds scenes at once, and localizes in no time."""
+
+    def __init__(self) -> None:
+        self.released: list[str] = []
+
+    def start(self) -> None: ...
+
+    def scenes(self) -> list[SceneStatus]:
+        return []
+
+    def hold_later(self, asked: str, take) -> None:
+        take(HeldScenes("own", (asked,), (0.0, 0.0, 0.0)))
+
+    def localize(self, task: FakeTask, on_record) -> str:
+        return f"of {task.held}"
+
+    def release(self, token: str) -> None:
+        self.released.append(token)
+
+    def cancel(self, task_id: str) -> None: ...
+
+
+def test_fronts_that_start_at_once_share_replicas(monkeypatch):
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        go_on = asyncio.Event()
+        built: list[FakeReplica] = []
+
+        async def built_in(self: FakeReplica) -> list[SceneStatus]:
+            built.append(self)
+            if len(built) == 2:
+                raise Lost
+            await go_on.wait()
+            return []
+
+        monkeypatch.setattr(FakeReplica, "_built_in", built_in)
+        first, second = (asyncio.ensure_future(coordinator.start(3)) for _ in range(2))
+        with pytest.raises(Lost):
+            await first
+        assert len(fleet.replicas) == 3
+        third = asyncio.ensure_future(coordinator.start(3))  # instead of the one that has ended
+        await asyncio.sleep(0.01)
+        go_on.set()
+        await third
+        await asyncio.gather(second, return_exceptions=True)
+        assert len(fleet.replicas) == 4
+        assert len(coordinator._replicas) == 3
+
+    with_fleet(check, replicas=0)
 
 
 def test_a_load_that_nobody_waits_for_any_more_leaves_a_scene_that_may_go():
@@ -413,7 +521,6 @@ def test_a_scene_that_fails_is_tried_again_after_5_seconds_then_10_and_300_at_mo
         assert fleet.loads.count("torn") == 9
 
     clock = SimpleNamespace(now=1000.0, monotonic=lambda: clock.now)
-    monkeypatch.setattr("service.jobs.scene_coordinator.time", clock)
     monkeypatch.setattr("service.jobs.fleet_scenes.time", clock)
     with_fleet(check)
 
@@ -529,7 +636,7 @@ def test_what_a_dead_front_held_is_let_go(monkeypatch):
         await coordinator.release(alive.held.token)
 
     monkeypatch.setattr("service.jobs.scene_coordinator._WATCH_S", 0.05)
-    monkeypatch.setattr("service.jobs.scene_coordinator._FRONT_S", 0.2)
+    monkeypatch.setattr("service.jobs.scene_holds._FRONT_S", 0.2)
     with_fleet(check)
 
 

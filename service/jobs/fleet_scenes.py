@@ -34,6 +34,8 @@ class FleetScene:
     """When a request has it loaded again after it failed, on the monotonic clock."""
     failures: int = 0
     """Since it was loaded last."""
+    background_rgb: tuple[float, float, float] | None = None
+    """As a replica said when the scene was held last; None before."""
 
     def loaded(self) -> None:
         """Note that a replica has loaded it."""

@@ -31,7 +31,8 @@ from service.jobs.placement import PlacementConfig
 from service.jobs.ray_calls import call, stream
 from service.jobs.ray_config import RayConfig
 from service.jobs.replica import Replica, SetUp
-from service.jobs.scene_coordinator import HeldAt, SceneCoordinator
+from service.jobs.scene_coordinator import SceneCoordinator
+from service.jobs.scene_holds import HeldAt
 from service.live.live_values import LiveTask
 from service.scene_formats.size_estimate import estimated_bytes
 from service.scene_manager.status import (
@@ -221,10 +222,11 @@ class RayEngine:
             raise EngineLost
         self._running[task.id] = held.replica
         try:
-            for kind, value in stream(held.replica.localize, task):
-                if kind == "answer":
-                    return replace(value, result=with_left_out(value.result, held.held.left_out))
-                on_record(*value)
+            for records, answer in stream(held.replica.localize, task):
+                for record in records:
+                    on_record(*record)
+                if answer:
+                    return replace(answer, result=with_left_out(answer.result, held.held.left_out))
             raise EngineLost
         except BaseException:
             self.cancel(task.id)  # it may be `on_record` that failed

@@ -11,17 +11,35 @@ import os
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 from typing import Any
 
 from service.errors import SceneNotFound
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
-from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask
+from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask
+from service.jobs.model import JobRecord
 from service.live.live_values import LiveFrame, LiveTask
 from service.scene_manager.status import SceneReadiness, SceneStatus, StoredScene
+from service.types import Query
 
 SetUp = Callable[[EmbeddedEngine], None]
 """Called in the replica before its engine starts; for scenes that are in no file."""
+
+Record = tuple[JobRecord, Query | None]
+
+_BETWEEN_RECORDS_S = 0.05
+_ON_ITS_WAY_S = 10.0
+"""A coordinator's call that takes longer to come will not come."""
+
+
+@dataclass(slots=True)
+class _Held:
+    """Scenes that are held, or will be."""
+
+    scenes: asyncio.Future[HeldScenes | Exception] = field(default_factory=asyncio.Future)
+    attempts: set[str] = field(default_factory=set)
+    """Under way with them."""
 
 
 class Replica:
@@ -30,8 +48,8 @@ class Replica:
     def __init__(self, config: EngineConfig, set_up: SetUp | None = None) -> None:
         # The budget is the coordinator's, who says what to drop.
         self._engine = EmbeddedEngine(config)
-        self._held: dict[str, set[str]] = {}
-        """Attempts under way, by the token of their scenes."""
+        self._held: dict[str, _Held] = {}
+        """By the coordinator's token."""
         self._frames: dict[str, SimpleQueue[LiveFrame | None]] = {}
         if set_up:
             set_up(self._engine)
@@ -73,12 +91,13 @@ class Replica:
     # ------------------------------------------------------------------ jobs
 
     async def hold(
-        self, drop: Sequence[str], stored: Sequence[StoredScene], ids: Sequence[str]
+        self, token: str, drop: Sequence[str], stored: Sequence[StoredScene], ids: Sequence[str]
     ) -> tuple[HeldScenes | Exception, list[SceneStatus]]:
-        """Drop scenes, load others, and hold those that are asked for as soon as all are in memory.
+        """Drop scenes, load others, and hold those that are asked for as soon as all are in memory, as `token`.
 
         Return them, or why they can't be, and what each is then.
         """
+        held = self._known(token)
         self._drop(drop)
         known = {scene.id for scene in self._engine.scenes()}
         for scene in stored:
@@ -89,31 +108,63 @@ class Replica:
         asked = ids[0] if len(ids) == 1 else tuple(ids)
         self._engine.hold_later(asked, lambda found: loop.call_soon_threadsafe(answer.set_result, found))
         found = await answer
+        held.scenes.set_result(found)
+        if isinstance(found, Exception):
+            self._held.pop(token, None)
         statuses = [status for status in self._engine.scenes() if status.id in ids]
-        return (_portable(found) if isinstance(found, Exception) else found), statuses
+        return (_portable(found) if isinstance(found, Exception) else replace(found, token=token)), statuses
+
+    def _known(self, token: str) -> _Held:
+        return self._held.setdefault(token, _Held())
+
+    async def _own_token(self, token: str) -> str:
+        """Return the engine's token of scenes, whose `hold` may be still on its way.
+
+        Raises why they can't be held, and EngineLost where the coordinator ended before it said what to hold.
+        """
+        try:
+            found = await asyncio.wait_for(asyncio.shield(self._known(token).scenes), _ON_ITS_WAY_S)
+        except TimeoutError:
+            self._held.pop(token, None)
+            raise EngineLost from None
+        if isinstance(found, Exception):
+            raise _portable(found)
+        return found.token
 
     async def release(self, token: str) -> None:
         """Let go of scenes, and end what still runs with them."""
-        for task_id in self._held.pop(token, ()):
+        held = self._held.pop(token, None)
+        if held is None:
+            return
+        for task_id in held.attempts:
             self._engine.cancel(task_id)
-        self._engine.release(token)
+        found = await held.scenes
+        if isinstance(found, HeldScenes):
+            self._engine.release(found.token)
 
     async def cancel(self, task_id: str) -> None:
         """End an attempt at its next record."""
         self._engine.cancel(task_id)
 
-    async def localize(self, task: LocalizeTask) -> AsyncIterator[tuple[str, Any]]:
-        """Yield `("record", (record, shown))` for each record, then `("answer", EngineAnswer)`."""
-        self._held.setdefault(task.held, set()).add(task.id)
+    async def localize(self, task: LocalizeTask) -> AsyncIterator[tuple[list[Record], EngineAnswer | None]]:
+        """Yield the records since the last time, 20 times a second at most, at last with the answer.
 
-        def work(put: Callable[[tuple[str, Any]], None]) -> EngineAnswer:
-            return self._engine.localize(task, lambda *record: put(("record", record)))
-
+        The job's thread doesn't wake this one at each record, which would take 1 ms of the job.
+        """
+        self._known(task.held).attempts.add(task.id)
+        records: list[Record] = []
         try:
-            async for message in _streamed(work):
-                yield message
+            own = replace(task, held=await self._own_token(task.held))
+            job = _on_thread(lambda: self._engine.localize(own, lambda *record: records.append(record)))
+            while not job.done():
+                await asyncio.wait([job], timeout=_BETWEEN_RECORDS_S)
+                count = len(records)
+                if count or job.done():
+                    yield records[:count], job.result() if job.done() else None
+                    del records[:count]
         finally:
-            self._held.get(task.held, set()).discard(task.id)
+            if held := self._held.get(task.held):
+                held.attempts.discard(task.id)
 
     async def live(self, session: str, task: LiveTask) -> AsyncIterator[tuple[str, Any]]:
         """Yield `("frame?", None)` where a frame is wanted, `("record", LiveAnswer)`, at last `("answer", None)`."""
@@ -124,9 +175,10 @@ class Replica:
                 put(("frame?", None))
                 return frames.get()
 
-            self._engine.live(task, next_frame, lambda answer: put(("record", answer)))
+            self._engine.live(own, next_frame, lambda answer: put(("record", answer)))
 
         try:
+            own = replace(task, held=await self._own_token(task.held))
             async for message in _streamed(work):
                 yield message
         finally:
@@ -166,6 +218,20 @@ async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) ->
         yield kind, value
         if kind == "answer":
             return
+
+
+def _on_thread(work: Callable[[], Any]) -> asyncio.Future[Any]:
+    """Begin work on a thread of its own; return its future result, or its error, which can be sent."""
+    loop, done = asyncio.get_running_loop(), asyncio.Future()
+
+    def run() -> None:
+        try:
+            loop.call_soon_threadsafe(done.set_result, work())
+        except Exception as error:
+            loop.call_soon_threadsafe(done.set_exception, _portable(error))
+
+    threading.Thread(target=run, name="job", daemon=True).start()
+    return done
 
 
 def _portable(error: Exception) -> Exception:

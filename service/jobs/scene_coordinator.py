@@ -10,40 +10,22 @@ from __future__ import annotations
 import asyncio
 import logging
 import secrets
-import time
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from service.errors import Failure, SplatfixError
 from service.jobs.engine import HeldScenes
 from service.jobs.fleet_scenes import FleetScene, FleetScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
+from service.jobs.scene_holds import HeldAt, Hold, SceneHolds
 from service.scene_manager.scene_errors import scene_in_use, scene_not_ready, scene_without_file
 from service.scene_manager.status import AUTO, SceneNote, SceneReadiness, SceneStatus, StoredScene
 
 _log = logging.getLogger(__name__)
 
 _WATCH_S = 1.0
-_FRONT_S = 30.0
-"""A front without a heartbeat for so long is taken to have ended, and what it held is released."""
-
-
-@dataclass(frozen=True, slots=True)
-class HeldAt:
-    """Scenes that are held, and the replica where they are."""
-
-    held: HeldScenes
-    replica: str
-    """Its name: an answer with a handle takes some ms longer."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Hold:
-    front: str
-    replica: str
-    ids: tuple[str, ...]
 
 
 class ReplicaLost(Exception):
@@ -64,9 +46,9 @@ class SceneCoordinator:
         self._spawn, self._lost, self._expected_bytes = spawn, lost, expected_bytes
         self._placement = Placement(config)
         self._replicas: dict[str, Any] = {}
+        self._starting: set[asyncio.Task[None]] = set()
         self._scenes = FleetScenes(self._placement, config.budget_bytes)
-        self._holds: dict[str, _Hold] = {}
-        self._fronts: dict[str, float] = {}
+        self._holds = SceneHolds()
         self._changed = asyncio.Event()
         self._tasks: set[asyncio.Task[Any]] = set()
 
@@ -76,10 +58,18 @@ class SceneCoordinator:
         """Start replicas, up to so many, and load the scenes that are required; return when the replicas answer."""
         if not self._tasks:
             self._in_background(self._watch())
-        await asyncio.gather(*(self._start_replica() for _ in range(count - len(self._replicas))))
+        # Those that start count, too: another front may have asked, and more than there are cores for never start.
+        for _ in range(count - len(self._replicas) - len(self._starting)):
+            self._start_in_background(self._start_replica())
+        await asyncio.gather(*map(asyncio.shield, self._starting))
         for scene_id, scene in self._scenes.items():
             if scene.required and scene.awaited:
                 self._in_background(self._preload(scene_id))
+
+    def _start_in_background(self, start: Coroutine[Any, Any, None]) -> None:
+        task = self._in_background(start)
+        self._starting.add(task)
+        task.add_done_callback(self._starting.discard)
 
     async def _start_replica(self) -> None:
         # Fronts keep handles by these names, also of a coordinator before this one.
@@ -99,11 +89,9 @@ class SceneCoordinator:
             for name, handle in list(self._replicas.items()):
                 with suppress(ReplicaLost):
                     await self._asked(name, handle.ping.remote())
-            late = time.monotonic() - _FRONT_S
-            for front in [front for front, heard in self._fronts.items() if heard < late]:
+            for front, tokens in self._holds.ended_fronts().items():
                 _log.warning("front %s has ended: the scenes that it used are released", front)
-                del self._fronts[front]
-                for token in [token for token, hold in self._holds.items() if hold.front == front]:
+                for token in tokens:
                     await self.release(token)
 
     async def _asked(self, name: str, answer: Awaitable[Any]) -> Any:
@@ -119,9 +107,8 @@ class SceneCoordinator:
             return
         _log.error("replica %s ended", name)
         self._placement.remove_replica(name)
-        for token in [token for token, hold in self._holds.items() if hold.replica == name]:
-            del self._holds[token]
-        self._in_background(self._start_again())
+        self._holds.forget_replica(name)
+        self._start_in_background(self._start_again())
         self._notify()
 
     async def _start_again(self) -> None:
@@ -135,7 +122,7 @@ class SceneCoordinator:
 
     async def heard(self, front: str) -> dict[str, int]:
         """Note that a front is alive; return each replica's jobs."""
-        self._fronts[front] = time.monotonic()
+        self._holds.heard(front)
         return {name: self._placement.jobs(name) for name in self._placement.replicas()}
 
     # ------------------------------------------------------------------ the list of scenes
@@ -154,7 +141,7 @@ class SceneCoordinator:
     async def remove(self, scene_id: str) -> None:
         """Forget a scene. Raises SceneNotFound, SceneInUse."""
         self._scenes.named(scene_id)
-        if jobs := self._jobs(scene_id):
+        if jobs := self._holds.jobs(scene_id):
             raise scene_in_use(jobs)
         del self._scenes[scene_id]
         await self._drop_copies(scene_id)
@@ -189,7 +176,7 @@ class SceneCoordinator:
         return await self._status(next(name for name, other in self._scenes.items() if other is scene), scene)
 
     async def _status(self, scene_id: str, scene: FleetScene) -> SceneStatus:
-        copies, jobs = self._placement.copies(scene_id), self._jobs(scene_id)
+        copies, jobs = self._placement.copies(scene_id), self._holds.jobs(scene_id)
         uploaded = scene.stored is not None and scene.stored.uploaded
         ready = [name for name, copy in copies.items() if copy.ready]
         if ready:
@@ -220,9 +207,6 @@ class SceneCoordinator:
             skipped_rasterizers=tuple(sorted({name for each in found for name in each.skipped_rasterizers})),
         )
 
-    def _jobs(self, scene_id: str) -> int:
-        return sum(scene_id in hold.ids for hold in self._holds.values())
-
     # ------------------------------------------------------------------ use
 
     async def where(self, scene_id: str) -> Any:
@@ -241,13 +225,21 @@ class SceneCoordinator:
         return self._replicas.get(name)
 
     async def hold(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
-        """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded."""
+        """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded.
+
+        Their replica isn't waited for: what it is asked with the token waits there until it has heard of it.
+        """
         ids, left_out = self._scenes.chosen(asked)
         for scene_id in ids:
             self._scenes.require_usable(scene_id)
         choice = self._placement.choose(ids)
         if choice is not None and self._all_ready(choice, ids):
-            with suppress(ReplicaLost):
+            if background_rgb := self._scenes[ids[0]].background_rgb:
+                token, hold, call = self._send_hold(front, choice, ids)
+                self._holds.record(token, hold)
+                self._in_background(self._confirm_hold(token, hold, call))
+                return HeldAt(HeldScenes(token, ids, background_rgb, left_out), choice.replica)
+            with suppress(ReplicaLost):  # it was never held
                 return await self._hold_at(front, choice, ids, left_out)
         for scene_id in ids:
             if not self._placement.copies(scene_id):
@@ -264,7 +256,7 @@ class SceneCoordinator:
                     self._scenes.require_usable(scene_id)
             choice = self._placement.choose(ids)
             if choice is None:  # all is in use, or a replica has to start first
-                await self._change()
+                await self._changed.wait()
                 continue
             try:
                 return await self._hold_at(front, choice, ids, left_out)
@@ -280,8 +272,7 @@ class SceneCoordinator:
         if hold is None:
             return
         self._placement.release(hold.replica, hold.ids)
-        handle = self._replicas.get(hold.replica)
-        if handle:
+        if handle := self._replicas.get(hold.replica):
             with suppress(ReplicaLost):
                 await self._asked(hold.replica, handle.release.remote(token))
         for scene_id in hold.ids:
@@ -292,14 +283,7 @@ class SceneCoordinator:
 
     async def _hold_at(self, front: str, choice: Choice, ids: tuple[str, ...], left_out: tuple[str, ...]) -> HeldAt:
         """Carry out a choice: drop, load, hold."""
-        # Nothing is awaited up to the call, so that replicas get calls in order.
-        self._placement.take(choice, ids)
-        stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
-        call = self._replicas[choice.replica].hold.remote(choice.drop, stored, ids)
-        for scene_id in ids:
-            if extra := self._placement.extra_copy(scene_id):
-                self._in_background(self._copy(extra, scene_id))
-        task = self._in_background(self._finish_hold(front, choice.replica, ids, call))
+        task = self._in_background(self._finish_hold(*self._send_hold(front, choice, ids)))
         try:
             # Shielded: who leaves must not cancel a load that others wait for.
             held = await asyncio.shield(task)
@@ -308,30 +292,49 @@ class SceneCoordinator:
             raise
         return HeldAt(replace(held, left_out=left_out), choice.replica)
 
+    def _send_hold(self, front: str, choice: Choice, ids: tuple[str, ...]) -> tuple[str, Hold, Awaitable[Any]]:
+        """Have a replica carry out a choice; return the token, the hold, and what answers. Awaits nothing."""
+        self._placement.take(choice, ids)
+        stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
+        token = secrets.token_hex(8)
+        call = self._replicas[choice.replica].hold.remote(token, choice.drop, stored, ids)
+        for scene_id in ids:
+            if extra := self._placement.extra_copy(scene_id):
+                self._in_background(self._copy(extra, scene_id))
+        return token, Hold(front, choice.replica, ids), call
+
     async def _copy(self, extra: Choice, scene_id: str) -> None:
         """Load another copy of a scene, beside the jobs."""
         with suppress(ReplicaLost, SplatfixError):
             held = await self._hold_at("", extra, (scene_id,), ())
             await self.release(held.held.token)
 
-    async def _finish_hold(self, front: str, name: str, ids: tuple[str, ...], call: Awaitable[Any]) -> HeldScenes:
+    async def _finish_hold(self, token: str, hold: Hold, call: Awaitable[Any]) -> HeldScenes:
         """Put on record what became of a call to hold scenes. Raises why they can't be held, and ReplicaLost."""
-        found: HeldScenes | Exception
         try:
-            found, statuses = await self._asked(name, call)
-        except ReplicaLost:
+            found = await self._answer(hold, call)
+            if isinstance(found, Exception):
+                self._placement.release(hold.replica, hold.ids)
+                raise found
+            self._holds.record(token, hold)
+            return found
+        finally:
             self._notify()
-            raise
+
+    async def _confirm_hold(self, token: str, hold: Hold, call: Awaitable[Any]) -> None:
+        """Take back a hold that was promised, where the replica can't keep it: who uses it hears so there."""
+        with suppress(ReplicaLost):
+            if isinstance(await self._answer(hold, call), Exception):
+                await self.release(token)
+
+    async def _answer(self, hold: Hold, call: Awaitable[Any]) -> HeldScenes | Exception:
+        """Return a replica's answer to a call to hold scenes, and note what it says of them. Raises ReplicaLost."""
+        found, statuses = await self._asked(hold.replica, call)
         for status in statuses:
-            self._note_loaded(name, status, found)
-        if isinstance(found, Exception):
-            self._placement.release(name, ids)
-            self._notify()
-            raise found
-        if front:
-            self._fronts.setdefault(front, time.monotonic())
-        self._holds[found.token] = _Hold(front, name, ids)
-        self._notify()
+            self._note_loaded(hold.replica, status, found)
+        scene = self._scenes.get(hold.ids[0])
+        if scene and isinstance(found, HeldScenes):
+            scene.background_rgb = found.background_rgb
         return found
 
     def _note_loaded(self, name: str, status: SceneStatus, found: HeldScenes | Exception) -> None:
@@ -390,9 +393,6 @@ class SceneCoordinator:
 
         task.add_done_callback(ended)
         return task
-
-    async def _change(self) -> None:
-        await self._changed.wait()
 
     def _notify(self) -> None:
         self._changed.set()
