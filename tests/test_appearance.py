@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from service.interfaces import Frame
+from service.pose.verification import appearance as module
 from service.pose.verification.appearance import (
     APPEARANCE,
     BlockStatistics,
@@ -192,6 +193,23 @@ def test_shares_are_the_best_of_what_is_not_negative(seed: int) -> None:
         assert np.all(shares[:, c] >= 0)
         for share, rise in zip(shares[:, c], slope, strict=True):
             assert abs(rise) < 2e-3 * size if share > 0 else rise > -2e-3 * size
+
+
+def test_the_ridge_of_the_shares_is_relative_and_absolute(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "APPEARANCE", replace(APPEARANCE, ridge=0.5))
+    rng = np.random.default_rng(1)
+    render, luma = rng.normal(0, 1, (20, 3)).astype(np.float32), rng.normal(0, 1, (20, 1)).astype(np.float32)
+    for of_channel, of_luma in ((0.7, 0.4), (-2.0, 0.4), (0.7, -2.0)):
+        found = _shares(of_channel * render + of_luma * luma, render, luma)
+        for c in range(3):
+            parts = np.concatenate([render[:, c : c + 1], luma], 1).astype(float)
+            told = parts.T @ (parts @ [of_channel, of_luma])
+            square = parts.T @ parts
+            square[np.diag_indices(2)] = square.diagonal() * 1.5 + 0.5
+            both = np.linalg.solve(square, told)
+            alone = np.diag(1 / square.diagonal()) @ told
+            best = [0, alone[1]] if both[0] < 0 else [alone[0], 0] if both[1] < 0 else both
+            assert (found[0][c], found[1][c]) == pytest.approx(np.maximum(best, 0), rel=1e-4)
 
 
 def test_colours_of_pixels_correlate_but_for_the_quarter_that_fits_worst() -> None:

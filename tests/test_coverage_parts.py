@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from service.coverage import scene_drawing
 from service.coverage.calibration import (
     MIN_PHOTOS,
     Calibration,
@@ -261,6 +262,22 @@ def test_a_scene_is_drawn_with_its_cameras_to_scale_and_two_opposite_renders() -
     first, second = image[26 + 10, 600 + 290], image[26 + 200 + 6 + 10, 600 + 290]
     assert first == pytest.approx([127.5, 255, 127.5], abs=1)
     assert second == pytest.approx([127.5, 0, 127.5], abs=1)
+
+
+def test_a_plan_leaves_out_haze_unless_all_is_haze(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[np.ndarray] = []
+    plan = scene_drawing._plan
+
+    def noted(surfaces: np.ndarray, *rest: Any) -> np.ndarray:
+        shown.append(surfaces)
+        return plan(surfaces, *rest)
+
+    monkeypatch.setattr(scene_drawing, "_plan", noted)
+    corners = np.array([[x, y, 0.0] for x in (0, 10) for y in (0, 4)])
+    for opacities, kept in (([0.3, 0.31, 0.2, 0.9], [1, 3]), ([0.3] * 4, range(4))):
+        scene = replace(scene_at(corners), opacities=np.array(opacities, np.float32))
+        drawn_scene(scene, COLOURED, (), scene.info)
+        assert np.array_equal(shown.pop(), corners[list(kept)])
 
 
 def test_a_scene_without_views_or_extent_is_drawn_without_renders() -> None:

@@ -37,7 +37,7 @@ from service.registration.known_places import place_table, scene_points, traject
 from service.registration.known_places.known_place import KnownPlaces
 from service.registration.observations import Evidence
 from service.results import Status
-from service.scene_formats import manifest, side_file, training_files
+from service.scene_formats import manifest, normalizations, side_file, training_files
 from service.types import BoxPrior, Camera, GaussianPosePrior, GeoAnchor, Intrinsics, NamedCamera, Pose
 from service.web.routes import live as live_route
 
@@ -568,6 +568,17 @@ def test_a_training_photo_may_be_exactly_as_large_as_files_may_be(tmp_path: Path
     for limit, found in ((10, tmp_path / "a.png"), (9, None)):
         monkeypatch.setattr(training_files, "_MAX_PHOTO_BYTES", limit)
         assert training_files.training_photo_path(tmp_path, "a.png") == found
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_opposite_directions_have_a_rotation_of_their_own(axis: int) -> None:
+    source, own = np.eye(3)[axis], np.diag([-1.0, -1.0, 1.0])
+    half = normalizations.rotation_between(source, -source)
+    assert half @ source == pytest.approx(-source)
+    assert half @ half == pytest.approx(np.eye(3))
+    assert np.linalg.det(half) == pytest.approx(1)
+    for cosine, is_own in ((-1 + 0.9e-9, True), (-1 + 1e-9, False), (-1 + 2e-9, False)):
+        assert (normalizations.rotation_between(source, cosine * source, own) is own) is is_own
 
 
 @pytest.mark.parametrize("stated", [(), ("position",), ("rotation",), ("position", "rotation")])

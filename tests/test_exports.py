@@ -101,6 +101,14 @@ def test_a_nerfstudio_frame_has_blenders_axes_and_the_lens():
     assert matrix[2, 1] > 0  # y points up
     assert np.allclose(matrix[:3, 3], [1, 2, 3])
     assert (frame["file_path"], frame["fl_y"], frame["p2"]) == ("a/b.jpg", 510.0, 0.002)
+    for model, distortion, told in (
+        ("PINHOLE", (), "OPENCV"),
+        ("SIMPLE_RADIAL_FISHEYE", (0.1,), "OPENCV_FISHEYE"),
+        ("OPENCV_FISHEYE", (0.1, 0.0, 0.0, 0.0), "OPENCV_FISHEYE"),
+    ):
+        lens = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, model, distortion)
+        frame = json.loads(exported("nerfstudio", "a.jpg", CREATED, result(lens)))
+        assert (frame["camera_model"], frame.get("k1", 0.0)) == (told, sum(distortion))
 
 
 def test_a_tum_line_is_time_position_quaternion_xyzw():

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -79,6 +80,24 @@ def test_every_pixel_that_is_drawn_in_slabs_equals_the_reference(monkeypatch, an
         assert worst(ours, right) < 1e-5
     assert truth.alpha.max() > 0.5
     assert len(drawn) > 3
+
+
+def test_a_packed_scene_is_mapped_from_its_folder_and_written_anew_where_that_is_damaged(tmp_path: Path) -> None:
+    scene, folder = make_scene(20, 1, 0), tmp_path / "packed"
+
+    def is_mapped(found: pack.Packed) -> bool:
+        alike = all(np.array_equal(getattr(found, n), getattr(whole, n)) for n in pack._ARRAYS)
+        return alike and isinstance(found.order.base, np.memmap)
+
+    whole = pack.pack(scene)
+    assert is_mapped(pack.mapped_pack(scene, folder))
+    np.save(tmp_path / "short.npy", whole.order[:-1])
+    for damage in (b"", b"no array", (tmp_path / "short.npy").read_bytes()):
+        (folder / "order.npy").write_bytes(damage)
+        assert is_mapped(pack.mapped_pack(scene, folder))
+    assert {file.name for file in folder.iterdir()} == {f"{name}.npy" for name in pack._ARRAYS}
+    (tmp_path / "file").touch()
+    assert not is_mapped(pack.mapped_pack(scene, tmp_path / "file" / "packed"))
 
 
 def test_slabs_are_in_order_and_have_all_blocks() -> None:

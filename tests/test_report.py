@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 from service.cli import diagnostics
 from service.cli.app import app
 from service.cli.diagnostics import Finding
+from service.client import Client, ServiceError
 from service.errors import InvalidRequest
 
 
@@ -36,7 +37,7 @@ def reported(job: str, url: str, *options: str) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def test_a_report_has_the_job_its_trace_and_the_machine_but_no_key_and_no_photo(shared, tmp_path):
+def test_a_report_has_the_job_its_trace_and_the_machine_but_no_key_and_no_photo(shared, tmp_path, monkeypatch):
     job = finished(shared, post(shared, prefer="", options={"steps": 3}).headers["location"])
     url, out = str(shared.base_url), str(tmp_path / "report.zip")
     parts = reported(job["id"], url, "--out", out)
@@ -51,6 +52,15 @@ def test_a_report_has_the_job_its_trace_and_the_machine_but_no_key_and_no_photo(
     with_photo = reported(job["id"], url, "--out", out, "--photo")
     # Deleted after the job, as this service is set: the report says so.
     assert "photo.jpg" in with_photo or b"photo.jpg: " in with_photo["missing.txt"]
+
+    def refused(*_: object) -> bytes:
+        raise ServiceError("x", "not now")
+
+    for name in ("trace", "photo"):
+        monkeypatch.setattr(Client, name, refused)
+    with_gaps = reported(job["id"], url, "--out", out, "--photo")
+    assert with_gaps["missing.txt"] == b"trace.json: not now\nphoto.jpg: not now"
+    assert with_gaps.keys() == with_photo.keys() - {"trace.json", "photo.jpg"} | {"missing.txt"}
 
 
 def test_an_unknown_job_or_no_service_is_one_error_and_no_file(shared, tmp_path):

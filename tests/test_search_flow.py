@@ -253,8 +253,7 @@ def test_free_views_are_matched_eight_at_most_if_the_photo_has_features(monkeypa
         asked.clear()
         searching = state()
         searching.config = replace(searching.config, free_views=most)
-        least = searching.config.verification.min_features
-        photo = SimpleNamespace(scores=np.zeros(least + features))
+        photo = SimpleNamespace(scores=np.zeros(30 + features))
         index = SimpleNamespace(views=(), free_views=SimpleNamespace(of=lambda *_: found))
         searching.images = SimpleNamespace(features=lambda: photo)  # type: ignore[assignment]
         searching.tools = SimpleNamespace(prepared=index, scene=None, rasterizer=None, matcher=None)  # type: ignore[assignment]

@@ -153,6 +153,18 @@ def test_without_covariances_those_of_others_are_taken():
     assert [f is not None and float(f.covariance[0, 0]) for f in found] == pytest.approx([4e-4, 3e-4, 2e-4])
 
 
+def test_without_any_covariance_a_thousandth_of_a_radian_and_of_a_unit_are_taken():
+    """Only how they compare with the motion matters to the poses."""
+    poses = jittered(walk(3))
+    unknown = smoothed([TimedPose(0.1 * i, pose) for i, pose in enumerate(poses)])
+    told = smoothed([TimedPose(0.1 * i, pose, np.eye(6) * 1e-6) for i, pose in enumerate(poses)])
+    for a, b in zip(unknown, told, strict=True):
+        assert a is not None
+        assert b is not None
+        assert np.array_equal(a.pose.world_from_camera, b.pose.world_from_camera)
+        assert np.array_equal(a.covariance, b.covariance)
+
+
 def test_the_third_pose_is_the_first_evidence_of_the_covariances():
     """The first two tell the velocity. A third one off by d has d^2 / its prediction's variance, of 6 components."""
     rest, off = walk(1)[0], np.array([0, 0, 0, 0.3, 0, 0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import tempfile
 import threading
+import time
 from pathlib import Path
 
 import cv2
@@ -135,11 +136,16 @@ def test_a_crash_on_the_way_leaves_the_frames_before_it(monkeypatch, tmp_path):
     assert [frame.number for frame in read_video(written("mp4", "mp4v", 8))] == [0, 1, 2]
 
 
-def test_a_reader_that_stops_early_leaves_no_process():
+def test_a_reader_that_stops_early_leaves_no_process(monkeypatch, tmp_path):
+    """Nor waits for the next frame."""
+    slow = child_that(tmp_path, "if number == 1: time.sleep(20)", "        if number % every == 0:")
+    monkeypatch.setattr(video, "_CHILD", slow)
     children = Path(f"/proc/self/task/{threading.get_native_id()}/children")
     others = children.read_text().split()  # of tests before this one
     frames = read_video(written("mp4", "mp4v", 8))
     next(frames)
     assert len(children.read_text().split()) == len(others) + 1
+    began = time.monotonic()
     frames.close()
+    assert time.monotonic() - began < 10
     assert children.read_text().split() == others
