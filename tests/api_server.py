@@ -11,12 +11,13 @@ import socket
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import httpx
 import numpy as np
@@ -26,7 +27,7 @@ from fastapi import FastAPI
 from PIL import Image
 from stand_ins import FileEvent, make_scene, packed, set_up_engine
 from subprocess_engine import SubprocessEngine
-from two_fronts import KEYS, THROUGH_A_GATEWAY, Made, two_fronts
+from two_fronts import FRONTS, KEYS, THROUGH_A_GATEWAY, Made, relay_to, two_fronts
 
 import service.estimators
 import service.web.app
@@ -38,6 +39,7 @@ from service.web.schemas.error_examples import EXAMPLES
 from service.web.settings import Settings
 
 ROOT = Path(__file__).parents[1]
+T = TypeVar("T")
 ESTIMATORS = str(ROOT / "tests" / "fake_estimators")
 IN_SUBPROCESS = os.environ.get("SPLATFIX_TEST_ENGINE") == "subprocess"
 """Run all tests of the API on the engine of `subprocess_engine`; by hand, since each server takes seconds to start."""
@@ -74,6 +76,14 @@ def create_app(
         fake = ESTIMATORS in service.estimators.__path__
         small = {name: packed(scene) for name, scene in (scenes or {}).items()}
         app.state.made = Made(settings, small, keys, GO_ON if fake or small else None)
+    return app
+
+
+def with_viewer_at(port: int, app: FastAPI, keys: KeyRing | None = None) -> FastAPI:
+    """Give an app, which has these keys, a viewer that the test stands in for."""
+    app.include_router(relay_to(port, keys).router)
+    if hasattr(app.state, "made"):
+        app.state.made = replace(app.state.made, viewer_port=port)
     return app
 
 
@@ -118,10 +128,44 @@ def until(condition, seconds: float = 20) -> None:
         time.sleep(min(max(0.005, waited / 8), 0.05))
 
 
+def at_each_front(ask: Callable[[], T]) -> list[T]:
+    """Call what sends one request, once for each front: behind a gateway they answer in turn."""
+    return [ask() for _ in range(FRONTS)]
+
+
+def key_of(client: httpx.Client) -> str:
+    """Return the key that a program needs to ask as the test's client does; empty unless it goes through a gateway."""
+    return KEYS.get(client.base_url.port or 0, "")
+
+
 def key_line(client: httpx.Client) -> str:
     """Return the line with the key for a request that a test writes itself; empty unless it goes through a gateway."""
-    key = KEYS.get(client.base_url.port or 0)
+    key = key_of(client)
     return f"Authorization: Bearer {key}\r\n" if key else ""
+
+
+def photo_files(data: Path) -> list[str]:
+    """Return the names of the files of photos that a service keeps in its folder, or two in their object store."""
+    folder = data / "objects" / "photos" if THROUGH_A_GATEWAY else data / "photos"
+    return [path.name for path in folder.iterdir()]
+
+
+def scene_files(data: Path, scene_id: str) -> list[str]:
+    """Return the names of the files of a scene that was uploaded to a service, or to two."""
+    entry, folder = data / "objects" / "scenes" / f"{scene_id}.json", data / "scenes" / scene_id
+    if THROUGH_A_GATEWAY:
+        return (
+            sorted(file["path"] for file in json.loads(entry.read_text())["value"]["files"]) if entry.exists() else []
+        )
+    return sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+
+
+def traces_of_uploads(data: Path) -> list[Path]:
+    """Return all that uploads of scenes have left on disk, of whole ones and of others."""
+    places = [data / "scenes", data / "scenes" / ".incoming"]
+    if THROUGH_A_GATEWAY:
+        places = [data / "objects" / "scenes", data / "objects" / "uploads", *data.glob("front*/incoming")]
+    return [path for place in places if place.exists() for path in place.iterdir() if path not in places]
 
 
 def assert_as_shown(problem: dict[str, Any]) -> None:
@@ -148,8 +192,7 @@ def _without_values(text: str) -> str:
 
 def until_ready(client: httpx.Client) -> None:
     """Wait until the scenes are loaded and prepared, which takes long where other processes use the CPU."""
-    # Twice: behind a gateway the fronts answer in turn.
-    until(lambda: all(client.get("/readyz").status_code == 200 for _ in range(2)), 120)
+    until(lambda: {answer.status_code for answer in at_each_front(lambda: client.get("/readyz"))} == {200}, 120)
 
 
 @contextmanager

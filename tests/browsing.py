@@ -60,11 +60,17 @@ def is_ready(url: str) -> bool:
     return all(HTTP.get(f"{url}/readyz").status_code == 200 for _ in range(2))
 
 
+def entrance(address: str) -> str:
+    """Return the start page of a service; where the tests go through a gateway, with the key that opens a session."""
+    url = httpx.URL(address)
+    key = KEYS.get(url.port or 0)
+    return str(url.copy_with(path="/", query=f"key={key}".encode() if key else None, fragment=None))
+
+
 def sign_in(context: BrowserContext, address: str) -> None:
     """Get a session where the tests go through a gateway, whose service has keys."""
-    url = httpx.URL(address)
-    if key := KEYS.get(url.port or 0):
-        context.request.get(str(url.copy_with(path="/", query=None, fragment=None)), params={"key": key})
+    if KEYS.get(httpx.URL(address).port or 0):
+        context.request.get(entrance(address))
 
 
 def serious(page: Page) -> list[str]:

@@ -7,7 +7,7 @@ import json
 import re
 
 import pytest
-from api_server import ROOT, create_app, fake_estimators, photo, serving, settings, until
+from api_server import ROOT, create_app, fake_estimators, key_of, photo, serving, settings, until
 from fake_service import FakeService
 from node import node
 from stand_ins import make_scene
@@ -33,7 +33,7 @@ def test_a_photo_is_localized_in_node(shared):
     module = (
         IMPORT
         + """
-const service = new Client(process.argv[2]);
+const service = new Client(process.argv[2], { key: process.argv[4] });
 const file = new File([Buffer.from(process.argv[3], "base64")], "a.jpg");
 const steps = [], codes = [];
 const truth = { position: [0, 0, 0], quaternion_wxyz: [1, 0, 0, 0] };
@@ -50,7 +50,7 @@ console.log(JSON.stringify({ steps, codes, seed: stored.seed, name: stored.photo
   picture: picture.size > 100 }));
 """
     )
-    told = json.loads(node(module, str(shared.base_url), base64.b64encode(photo()).decode()))
+    told = json.loads(node(module, str(shared.base_url), base64.b64encode(photo()).decode(), key_of(shared)))
     assert told["steps"] == list(range(len(told["steps"])))
     assert told["steps"]
     assert told["codes"] == [

@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from api_server import ROOT, assert_problem, create_app, serving, settings, until_ready
+from api_server import ROOT, assert_problem, create_app, key_of, serving, settings, until_ready
 from small_room import HEIGHT, INTRINSICS, WIDTH, pose_at, write_room
 from test_scenes import ply
 
@@ -90,7 +90,7 @@ def python_client(folder: Path, environment: dict[str, str]) -> subprocess.Compl
 
 def test_the_python_client_works_as_written(place, keyless):
     client, key, folder = place
-    for service, given in ((client, key), (keyless, "")):
+    for service, given in ((client, key), (keyless, key_of(keyless))):
         told = python_client(folder, environment(service, given))
         assert told.returncode == 0, told.stderr
         # Without intrinsics the lens is guessed, hence at best uncertain; the answer's form is what is tested.

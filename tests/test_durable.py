@@ -15,10 +15,12 @@ import pytest
 from api_server import (
     assert_as_shown,
     assert_problem,
+    at_each_front,
     create_app,
     events,
     finished,
     photo,
+    photo_files,
     post,
     serving,
     settings,
@@ -26,6 +28,7 @@ from api_server import (
     until_ready,
 )
 from stand_ins import make_scene
+from two_fronts import FRONTS
 
 import service.jobs.photo_store
 import service.web.app
@@ -197,12 +200,12 @@ def test_an_empty_key_is_no_key(client, stepping):
 
 
 def test_a_repeated_request_is_answered_by_a_full_service_too(client, stepping):
-    held = post(client, prefer="", options={"hold": True}).headers["location"]
-    until(lambda: client.get(held).json()["state"] == "running")
-    kept = keyed(client, "a")
-    assert keyed(client, "b").status_code == 202
-    assert keyed(client, "c").status_code == 503
-    assert keyed(client, "a").json()["id"] == kept.json()["id"]
+    held = [post(client, prefer="", options={"hold": True}).headers["location"] for _ in range(FRONTS)]
+    until(lambda: all(client.get(path).json()["state"] == "running" for path in held))
+    kept, *others = [keyed(client, f"{number}") for number in range(2 * FRONTS)]
+    assert {answer.status_code for answer in others} == {202}
+    assert {answer.status_code for answer in at_each_front(lambda: keyed(client, "c"))} == {503}
+    assert {answer.json()["id"] for answer in at_each_front(lambda: keyed(client, "0"))} == {kept.json()["id"]}
 
 
 # ------------------------------------------------------------------ the disk
@@ -255,7 +258,7 @@ def test_photos_go_with_their_job_unless_kept(stepping, tmp_path):
         gone, kept = post(client).json(), post(client, keep_photo="true").json()
         assert_problem(client.get(gone["links"]["photo"]), 404, "photo_gone")
         assert client.get(kept["links"]["photo"]).status_code == 200
-        until(lambda: [path.name for path in (tmp_path / "photos").iterdir()] == [f"{kept['id']}.jpg"])
+        until(lambda: photo_files(tmp_path) == [f"{kept['id']}.jpg"])
 
 
 def test_a_photo_can_be_looked_at_for_a_while(stepping, tmp_path):
@@ -264,7 +267,7 @@ def test_a_photo_can_be_looked_at_for_a_while(stepping, tmp_path):
         link = post(client).json()["links"]["photo"]
         assert client.get(link).status_code == 200
         until(lambda: client.get(link).status_code == 404)
-        assert not list((tmp_path / "photos").iterdir())
+        assert not photo_files(tmp_path)
 
 
 # ------------------------------------------------------------------ workers and deadlines
@@ -275,18 +278,19 @@ def test_a_stuck_worker_is_replaced_and_two_are_told(stepping, tmp_path):
     with serving(app(tmp_path, stuck_s=1.0)) as client:
         ready(client)
         for _ in range(2):
-            job = finished(client, post(client, prefer="", options={"hold": True}).headers["location"])
-            assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
-            assert post(client).json()["state"] == "succeeded"
-        told = client.get("/readyz")
-        assert (told.status_code, told.json()["failed"]) == (503, ["2 workers are stuck: restart the service."])
+            held = at_each_front(lambda: post(client, prefer="", options={"hold": True}).headers["location"])
+            for job in (finished(client, path) for path in held):
+                assert (job["state"], job["error"]["code"]) == ("interrupted", "interrupted")
+            assert {answer.json()["state"] for answer in at_each_front(lambda: post(client))} == {"succeeded"}
+        for told in at_each_front(lambda: client.get("/readyz")):
+            assert (told.status_code, told.json()["failed"]) == (503, ["2 workers are stuck: restart the service."])
         stepping.GO_ON.set()
         time.sleep(0.2)  # the abandoned threads come back, too late
         assert {job["state"] for job in client.get("/jobs").json()["jobs"]} == {"interrupted", "succeeded"}
 
 
 def test_a_job_past_its_deadline_does_not_start(client, stepping):
-    post(client, prefer="", options={"hold": True})
+    at_each_front(lambda: post(client, prefer="", options={"hold": True}))
     late = post(client, prefer="", deadline_s=0.1).headers["location"]
     in_time = post(client, prefer="", deadline_s=60).headers["location"]
     time.sleep(0.2)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from api_server import create_app, until
-from browsing import HTTP, is_ready, served
+from browsing import HTTP, entrance, is_ready, served
 from firefox import FIREFOX, XVFB, Page, firefox
 from gateway import free_port
 from PIL import Image
@@ -42,7 +42,7 @@ CANVAS = "document.querySelector('canvas').getBoundingClientRect()"
 
 
 def test_a_photo_is_localized_and_seen_in_the_viewer(page: Page, url: str) -> None:
-    page.open(f"{url}/")
+    page.open(entrance(url))
     page.wait_for("document.querySelectorAll('input[name=scene]').length")
     page.choose_file("#photo", STUDIO / "photos" / "photo_00.jpg")
     page.wait_for("document.querySelector('.badge.localized') !== null")

@@ -14,7 +14,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from api_server import ROOT, assert_problem, photo, post, ready_service, until
+from api_server import (
+    ROOT,
+    assert_problem,
+    key_line,
+    photo,
+    post,
+    ready_service,
+    scene_files,
+    traces_of_uploads,
+    until,
+)
 from PIL import Image
 from stand_ins import TURNED
 from test_scenes import TRANSFORMS, ply
@@ -178,14 +188,14 @@ def test_a_bad_archive_is_the_senders_fault_and_tells_nothing_of_our_folders(upl
     assert answer.status_code == 422, answer.text
     assert answer.json()["code"] in (CorruptScene.code, UnsupportedFormat.code)
     assert str(place) not in answer.text
-    assert [path.name for path in (place / "scenes").iterdir()] == [".incoming"]
+    assert not traces_of_uploads(place)
 
 
 def test_absolute_and_empty_names_in_an_archive_do_no_harm(uploading):
     client, place = uploading
     packed = archive(("/scene.ply", ply()), ("", b"x"), ("/oom/transforms.json", b"{}"))
     assert client.put("/scenes/named", content=packed).status_code == 201
-    assert [path.name for path in (place / "scenes" / "named").iterdir()] == ["scene.ply"]
+    assert scene_files(place, "named") == ["scene.ply"]
     until(lambda: client.get("/scenes/named").json()["state"] in ("ready", "failed"), 60)
     assert client.delete("/scenes/named").status_code == 204
 
@@ -216,7 +226,7 @@ def test_who_sends_a_body_that_nobody_reads_has_the_answer(plugins):
     """Closed at once, the connection would be reset under the sender, and the answer lost."""
     with ready_service(max_upload_bytes=1000) as client:
         body = bytes(5_000_000)
-        head = f"POST /localize HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: {len(body)}\r\n\r\n"
+        head = f"POST /localize HTTP/1.1\r\nHost: 127.0.0.1\r\n{key_line(client)}Content-Length: {len(body)}\r\n\r\n"
         with socket.create_connection((client.base_url.host, client.base_url.port)) as connection:
             connection.settimeout(20)
             connection.sendall(head.encode())

@@ -6,12 +6,22 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import httpx
 import pytest
 import websockets.sync.client
-from api_server import assert_problem, create_app, fake_estimators, photo, serving, settings, until, until_ready
+from api_server import (
+    assert_problem,
+    at_each_front,
+    create_app,
+    fake_estimators,
+    photo,
+    serving,
+    settings,
+    until,
+    until_ready,
+    with_viewer_at,
+)
 from fake_browser import FakeBrowser
 from fastapi import FastAPI
 from fastapi.routing import iter_route_contexts
@@ -27,7 +37,6 @@ from service.lenses.lens_key import LensKey
 from service.scene_manager.status import SceneNote
 from service.web.api_keys import KeyRing
 from service.web.key_file import KeyLimits, add_key
-from service.web.viewer_relay import Relay
 from viewer.viewer_server import Viewer
 
 # Every route has a decision; what is missing here fails the test.
@@ -95,8 +104,6 @@ def routes(app: FastAPI) -> Iterator[str]:
 class Upstream:
     """A viewer that keeps the tokens that sockets are opened with."""
 
-    started = 0.0
-
     def __init__(self) -> None:
         self.tokens: list[str] = []
         self._server = serve(self._answer, "127.0.0.1", 0)
@@ -134,8 +141,7 @@ def site(tmp_path_factory) -> Iterator[Site]:
     ring = KeyRing(file)
     with fake_estimators() as stepping:
         app = create_app(settings(keys_file=file, rate_limit=""), {n: make_scene(n) for n in ("room", "vault")}, ring)
-        app.include_router(Relay(viewer, ring).router)
-        with serving(app) as client:
+        with serving(with_viewer_at(viewer.port, app, ring)) as client:
             until_ready(client)
             stepping.GO_ON.set()
             made = Site(app, client, keys, {}, {}, viewer)
@@ -245,7 +251,8 @@ def test_lists_show_nothing_of_others(site, route):
 
 def test_metrics_are_of_ones_own_scenes_and_jobs(site):
     def samples(who: str) -> set[str]:
-        lines = site.ask(who, "GET", "/metrics").text.splitlines()
+        texts = at_each_front(lambda: site.ask(who, "GET", "/metrics").text)
+        lines = [line for text in texts for line in text.splitlines()]
         return {line.rpartition(" ")[0] for line in lines if not line.startswith("#")}
 
     own = 'splatfix_jobs_by_key_total{key="room",scene="room",state="succeeded"}'
@@ -316,9 +323,8 @@ def test_the_viewer_shows_what_its_user_may_see(site):
     viewer = Viewer(lambda token: Client(url, token, use_proxy=False), "127.0.0.1", 0)
     ring = site.app.state.app_state.keys
     app = create_app(settings(estimator="view_index"), keys=ring)
-    app.include_router(Relay(SimpleNamespace(port=viewer.server.get_port(), started=0.0), ring).router)
     try:
-        with serving(app) as front, ExitStack() as opened:
+        with serving(with_viewer_at(viewer.server.get_port(), app, ring)) as front, ExitStack() as opened:
             # The job of `vault` is asked for by both.
             path = f"/viewer/jobs/{site.jobs['vault']}"
             seen = {

@@ -98,8 +98,9 @@ def test_the_camera_is_where_the_page_says(page: Page) -> None:
     expect(page.locator(".verdict .badge")).to_have_text("Off")
 
 
-def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path, scene_cache: Path) -> None:
-    port, settings = free_port(), {"scenes": [scene], "cache_dir": scene_cache, "viewer": False}
+def test_a_restart_of_the_service_is_survived(browser: Browser, scene: Path, scene_cache: Path, tmp_path: Path) -> None:
+    port, folders = free_port(), {"scenes": [scene], "cache_dir": scene_cache, "data_dir": tmp_path}
+    settings = {**folders, "viewer": False}
     with served(create_app(Settings(port=port, **settings)), port) as url:
         until(lambda: is_ready(url), 240)
         page = opened(browser, f"{url}/live", 390, 844)

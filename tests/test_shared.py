@@ -63,16 +63,16 @@ def test_a_link_that_is_forged_or_expired_shows_nothing(service):
             assert_problem(service.client.get(f"/shared/{refused}/{path}"), 404, "job_not_found", "link")
 
 
-def test_nobody_else_may_frame_the_page_unless_the_operator_says_so(service, monkeypatch):
+def test_nobody_else_may_frame_the_page_unless_the_operator_says_so(service):
     headers = service.client.get(link_of(service)).headers
     assert "frame-ancestors 'none'" in headers["content-security-policy"]
     sites = ["https://a.example", "https://b.example"]
-    monkeypatch.setattr(service.app.state.app_state.settings, "embed_origins", sites)
-    headers = service.client.get("/shared/x").headers
+    with serving(create_app(settings(scenes=[], embed_origins=sites))) as client:
+        headers, others = client.get("/shared/x").headers, client.get("/").headers
     assert "frame-ancestors https://a.example https://b.example" in headers["content-security-policy"]
     assert "x-frame-options" not in headers
     # Other pages stay as they were.
-    assert service.client.get("/").headers["x-frame-options"] == "SAMEORIGIN"
+    assert others["x-frame-options"] == "SAMEORIGIN"
 
 
 def test_a_link_ends_with_the_key_that_made_it_and_outlives_a_restart(tmp_path):

@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.context import ForkServerContext
@@ -42,33 +42,27 @@ from service.web.api_keys import KeyRing
 from service.web.key_file import add_key
 from service.web.settings import Settings
 from service.web.shared_state import LocalState
+from service.web.viewer_relay import Relay
 
 THROUGH_A_GATEWAY = os.environ.get("SPLATFIX_TEST_GATEWAY") == "1"
+FRONTS = 2 if THROUGH_A_GATEWAY else 1
+"""So many processes answer a test's requests, in turn; each has a queue, workers and scenes in memory of its own."""
 _CHANGES = "changes the service in the test's process"
 _READS = "reads the state, the log or the metrics of one process"
 _MEMORY = "each front has scenes of its own in memory, unless they share an engine by Ray"
-_QUEUE = "counts on the workers or the queue of one front"
-_FOLDER = "looks into the folder of a service without a database and an object store"
-_TCP = "speaks TCP with what it takes for the service"
-_NO_KEY = "a program of its own asks, without a key"
+_FOLDER = "goes on from the folder of a service without a database"
 _HEADER = "sends X-Forwarded-Prefix, which the gateway sets itself"
 _VIEWER = "has a viewer of its own in the test's process"
 _OPEN = "is about a service without keys"
 NOT_THROUGH_A_GATEWAY: dict[str, str] = {
     # test_api.py
     "test_a_quiet_stream_is_kept_alive": _CHANGES,
-    "test_a_full_queue_refuses_and_a_cancelled_job_makes_room": _QUEUE,
-    "test_a_failing_estimator_fails_its_job_only": _READS,
     "test_a_scene_still_loading_is_not_ready": _CHANGES,
     "test_a_bug_in_a_route_is_a_problem_document_without_details": _CHANGES,
     "test_links_carry_the_sub_path_of_a_proxy": _HEADER,
-    # test_client_js.py, test_report.py
-    "test_a_photo_is_localized_in_node": _NO_KEY,
+    # test_client_js.py
     "test_scenes_are_uploaded_loaded_and_deleted_in_node": _MEMORY,
-    "test_a_report_has_the_job_its_trace_and_the_machine_but_no_key_and_no_photo": _NO_KEY,
-    "test_an_unknown_job_or_no_service_is_one_error_and_no_file": _NO_KEY,
     # test_clients.py
-    "test_the_python_client_works_as_written": _OPEN,
     "test_the_curl_lines_work_as_written[False]": _OPEN,
     # test_coverage.py
     "test_the_api_measures_in_the_background_and_tells_what_went_wrong": _CHANGES,
@@ -79,59 +73,32 @@ NOT_THROUGH_A_GATEWAY: dict[str, str] = {
     "test_a_job_that_was_there_in_every_crash_is_given_up": _FOLDER,
     "test_a_job_whose_scene_is_gone_is_interrupted_with_the_reason": _FOLDER,
     "test_a_stopped_service_finishes_or_puts_back_what_runs": _CHANGES,
+    "test_a_service_that_ends_answers_who_has_connected_and_ends_streams": _FOLDER,
     "test_a_folder_has_one_service": _FOLDER,
-    "test_a_repeated_request_is_answered_by_a_full_service_too": _QUEUE,
     "test_a_photo_that_cannot_be_written_is_not_accepted": _CHANGES,
     "test_a_result_waits_until_the_disk_has_room": _CHANGES,
-    "test_photos_go_with_their_job_unless_kept": _FOLDER,
-    "test_a_photo_can_be_looked_at_for_a_while": _FOLDER,
-    "test_a_job_past_its_deadline_does_not_start": _QUEUE,
     # test_errors.py
     "test_errors.py": "brings parts of the service into states by changing them in the test's process",
     # test_hostile.py
-    "test_a_bad_archive_is_the_senders_fault_and_tells_nothing_of_our_folders": _FOLDER,
-    "test_absolute_and_empty_names_in_an_archive_do_no_harm": _FOLDER,
-    "test_who_sends_a_body_that_nobody_reads_has_the_answer": _TCP,
     "test_a_bug_is_counted_as_500_and_has_our_headers": _CHANGES,
     # test_key_scopes.py, test_keys_api.py
-    "test_metrics_are_of_ones_own_scenes_and_jobs": _READS,
-    "test_the_viewer_asks_in_the_name_of_its_user": _VIEWER,
     "test_the_viewer_shows_what_its_user_may_see": _VIEWER,
     "test_readiness_names_no_scene_to_others": _CHANGES,
     "test_a_key_for_one_run_is_listed_and_revoked": "makes a key that only the test's process knows",
     "test_each_act_of_an_admin_is_told_in_the_log": _READS,
     "test_a_service_without_keys_makes_none_over_http": _OPEN,
     # test_live.py
-    "test_frames_are_answered_in_messages_of_the_schema": _READS,
     "test_a_client_that_leaves_is_no_error": _READS,
     # test_registration_api.py
     "test_a_job_keeps_the_revision_that_it_was_accepted_with": _READS,
     # test_scene_memory.py
-    "test_a_photo_waits_until_the_scene_in_use_makes_room": _MEMORY,
-    "test_a_scene_that_never_fits_is_refused_and_drops_no_other": _MEMORY,
-    "test_of_a_preload_list_that_is_too_long_the_first_ones_stay": _MEMORY,
     "test_a_failed_load_is_tried_again_by_a_later_request": _CHANGES,
     # test_scenes.py
-    "test_a_photo_is_looked_for_in_several_scenes": _MEMORY,
-    "test_only_what_is_preloaded_is_awaited_and_the_rest_comes_when_asked_for": _MEMORY,
-    "test_the_scene_not_asked_for_longest_makes_room": _MEMORY,
-    "test_unloading_waits_for_the_jobs_and_lets_no_new_one_in": _MEMORY,
-    "test_an_uploaded_scene_is_used_kept_and_deleted": _FOLDER,
-    "test_uploaded_scenes_are_there_after_a_restart": _FOLDER,
-    "test_what_is_no_scene_leaves_nothing": _FOLDER,
     "test_a_restart_brings_back_a_scene_that_a_waiting_job_needs": "copies the folder of a service that runs",
     # test_security.py
-    "test_a_page_opened_with_a_key_gets_a_cookie_and_a_clean_address": _HEADER,
-    "test_who_opens_a_page_without_a_valid_key_is_asked_for_one": _HEADER,
-    "test_a_token_opens_the_viewer_for_a_while": _VIEWER,
     "test_a_name_that_points_here_by_trick_is_refused": _OPEN,
-    "test_a_full_queue_answers_to_the_head": _QUEUE,
-    "test_a_key_may_have_a_share_of_the_queue": _QUEUE,
     "test_logs_have_ids_and_no_secrets": _READS,
     "test_what_viewer_and_pages_poll_is_not_logged": _READS,
-    "test_metrics_tell_what_happened": _READS,
-    # test_shared.py
-    "test_nobody_else_may_frame_the_page_unless_the_operator_says_so": _CHANGES,
     # test_pages.py
     "test_a_scene_is_added_unloaded_loaded_and_deleted": _MEMORY,
     "test_a_scenes_coverage_is_measured_and_drawn": _CHANGES,
@@ -152,6 +119,8 @@ class Made:
     keys: KeyRing | None
     go_on: FileEvent | None
     """Of the estimators of tests/fake_estimators; None: without them, and without scenes."""
+    viewer_port: int | None = None
+    """Of a viewer that the test stands in for."""
 
 
 @cache
@@ -183,6 +152,13 @@ def _database(data_folder: Path) -> str:
     return _database_server().database()
 
 
+@cache
+def _key_file(data_folder: Path) -> tuple[Path, str]:
+    """Make the file of keys of a service whose test gives none, with a key; the same when it is started again."""
+    file = data_folder / "keys.json"
+    return file, add_key(file, "tester", "admin")
+
+
 def close() -> None:
     _OPENED.close()
 
@@ -193,8 +169,15 @@ def run_front(made: Made, port: int) -> None:
     if made.go_on:
         set_up_engine(made.scenes, made.go_on, engine)
     app = service.web.app.create_app(made.settings, engine, made.keys)
+    if made.viewer_port:
+        app.include_router(relay_to(made.viewer_port, made.keys).router)
     options = {"log_level": "critical", "ws": "websockets-sansio", "ws_max_size": 2**26, "timeout_graceful_shutdown": 1}
     uvicorn.Server(uvicorn.Config(app, port=port, **options)).run()
+
+
+def relay_to(port: int, keys: KeyRing | None) -> Relay:
+    """Return what passes requests below /viewer on to a port."""
+    return Relay(SimpleNamespace(port=port, started=0.0), keys or KeyRing(None))
 
 
 @contextmanager
@@ -212,7 +195,7 @@ def two_fronts(app: FastAPI, port: int = 0) -> Iterator[str]:
         processes = []
         for number, own_port in enumerate(ports):
             own = settings.model_copy(update={"port": own_port, "data_dir": data / f"front{number}"})
-            front = Made(own, made.scenes, made.keys, made.go_on)
+            front = replace(made, settings=own)
             process = _processes().Process(target=run_front, args=(front, own_port), daemon=True)
             process.start()
             stack.callback(_end, process)
@@ -251,8 +234,7 @@ def _shared(made: Made, folder: Path) -> tuple[Settings, str]:
     changes["object_store"] = made.settings.object_store or str(data / "objects")
     key = ""
     if not (made.keys or KeyRing(made.settings.keys_file)):
-        changes["keys_file"] = folder / "keys.json"
-        key = add_key(folder / "keys.json", "tester", "admin")
+        changes["keys_file"], key = _key_file(data)
     return made.settings.model_copy(update=changes), key
 
 
