@@ -12,6 +12,7 @@ from fake_service import FakeService
 from node import node
 from stand_ins import make_scene
 from test_scenes import TRANSFORMS, archive, ply
+from two_fronts import FRONTS
 
 from service.live.live_values import LiveFrame
 from service.types import Intrinsics
@@ -108,14 +109,17 @@ const service = new Client(process.argv[2], { key: process.argv[3] }), shares = 
 const bytes = Buffer.from(process.argv[4], "base64"), onProgress = share => shares.push(share);
 const code = error => codes.push(error.code);
 const state = async () => (await service.scenes()).find(scene => scene.id === "cellar").state;
+const atEachFront = async ask => { for (let k = 0; k < +process.argv[6]; k++) await ask(); };
 const added = await service.uploadScene("cellar", new Blob([bytes]), { name: "cellar.zip", onProgress });
 const ready = await service.waitUntilReady("cellar"), { training_cameras } = await service.scene("cellar");
 await service.uploadScene("cellar", new Blob([bytes])).catch(code);
 await service.uploadScene("junk", new File(["no scene"], "junk.txt")).catch(code);
-await service.unloadScene("cellar");
-while (await state() !== "unloaded") await new Promise(resolve => setTimeout(resolve, 20));
+await atEachFront(() => service.unloadScene("cellar"));
+await atEachFront(async () => {
+  while (await state() !== "unloaded") await new Promise(resolve => setTimeout(resolve, 20));
+});
 await service.waitUntilReady("cellar").catch(code);
-await service.loadScene("cellar");
+await atEachFront(() => service.loadScene("cellar"));
 const again = (await service.waitUntilReady("cellar")).state;
 await service.deleteScene("cellar");
 await service.scene("cellar").catch(code);
@@ -135,7 +139,7 @@ console.log(JSON.stringify({ added, ready, again, training_cameras, shares, code
         until(lambda: http.get("/scenes/room", headers={"Authorization": f"Bearer {key}"}).json()["state"] == "ready")
         folder = archive(cellar__scene_dot_ply=ply(), cellar__transforms_dot_json=json.dumps(TRANSFORMS))
         sent = [base64.b64encode(data).decode() for data in (folder, photo())]
-        told = json.loads(node(module, str(http.base_url), key, *sent))
+        told = json.loads(node(module, str(http.base_url), key, *sent, str(FRONTS)))
     assert (told["added"]["uploaded"], told["ready"]["state"], told["again"]) == (True, "ready", "ready")
     assert told["ready"]["gaussians"] > 0
     assert len(told["training_cameras"]) == len(TRANSFORMS["frames"])

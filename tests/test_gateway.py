@@ -150,6 +150,9 @@ def test_an_uploaded_scene_is_there_at_both_fronts_until_it_is_deleted(fleet, st
         house = archive(scene_dot_ply=ply(), transforms_dot_json=json.dumps(TRANSFORMS))
         assert client.put("/scenes/house", content=house).status_code == 201
         assert answers("/scenes/house/anchors") == answers("/scenes/house") == [200, 200]
+        # Each front loads it: who waits until it is ready must not be told by the other one that nobody has asked.
+        states = {front.get("/scenes/house", headers=headers).json()["state"] for front in fleet.fronts}
+        assert states <= {"loading", "preparing", "ready"}
         assert [client.put("/scenes/house", content=ply()).status_code for _ in fleet.fronts] == [409, 409]
         held = post(client, prefer="", scene="house", options={"hold": True}).json()["links"]["self"]
         assert [client.delete("/scenes/house").status_code for _ in fleet.fronts] == [409, 409]

@@ -116,9 +116,13 @@ class FakeEngine:
     def __init__(self) -> None:
         self.ids: set[str] = set()
         self.used: set[str] = set()
+        self.loaded: list[str] = []
 
     def add(self, scene) -> None:
         self.ids.add(scene.id)
+
+    def load(self, scene_id: str) -> None:
+        self.loaded.append(scene_id)
 
     def remove(self, scene_id: str) -> None:
         if scene_id not in self.ids:
@@ -134,7 +138,7 @@ def test_what_one_front_adds_and_deletes_the_others_see(fronts):
     watch = CatalogueWatch(second, engine)  # type: ignore[arg-type]
     upload(first, "house", ply())
     watch.look()
-    assert engine.ids == {"house"}
+    assert (engine.ids, engine.loaded) == ({"house"}, ["house"])
     (seen,) = second.scenes()
     assert not seen.path.exists()  # fetched when it is loaded
     seen.remote.fetch(seen.path)

@@ -60,8 +60,6 @@ NOT_THROUGH_A_GATEWAY: dict[str, str] = {
     "test_a_scene_still_loading_is_not_ready": _CHANGES,
     "test_a_bug_in_a_route_is_a_problem_document_without_details": _CHANGES,
     "test_links_carry_the_sub_path_of_a_proxy": _HEADER,
-    # test_client_js.py
-    "test_scenes_are_uploaded_loaded_and_deleted_in_node": _MEMORY,
     # test_clients.py
     "test_the_curl_lines_work_as_written[False]": _OPEN,
     # test_coverage.py

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from contextlib import suppress
 
 from service.errors import SceneInUse, SceneNotFound, SplatfixError
 from service.jobs.engine import Engine
@@ -43,6 +44,9 @@ class CatalogueWatch:
         for scene in found:
             self._going.discard(scene.id)
             self._engine.add(scene)
+            # As the front does that took the upload: who waits until the scene is ready may be answered by this one.
+            with suppress(SceneNotFound):  # deleted meanwhile
+                self._engine.load(scene.id)
             _log.info("scene %s is there now: another front has it", scene.id)
         for scene_id in tuple(self._going):
             try:
