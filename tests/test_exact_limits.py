@@ -16,7 +16,7 @@ from starlette.websockets import WebSocketDisconnect
 from test_scene_placement import MB, placement, run_job
 
 from service.accuracy import Accuracy
-from service.bench import evaluate, field_table, gpu_equality, live, live_odometry, rigs
+from service.bench import evaluate, field_queries, field_table, gpu_equality, live, live_odometry, rigs
 from service.bench.modified_photo import _edge_is_inside
 from service.bench.peer.comparison import PEERS
 from service.bench.peer.photo_matching import MATCHING, PhotoFeatures, matched, pairs_of_cameras
@@ -600,3 +600,20 @@ def test_the_peers_detect_as_colmap_and_hloc_configure_them() -> None:
         "sift_best10": ({}, 10),
         "dog_direct": ({"first_octave": 0, "peak_threshold": 0.01}, None),
     }
+
+
+@pytest.mark.parametrize(
+    ("error", "stays"),
+    [(COARSE, True), ((COARSE[0], 0.0), True), ((COARSE[0] + 1e-6, 0.0), False), ((0.0, COARSE[1] + 1e-6), False)],
+)
+def test_a_photo_stays_at_home_within_the_coarse_bounds(error: tuple[float, float], stays: bool, monkeypatch) -> None:
+    for name in ("read_query", "QueryImages", "ViewRenderer", "rasterizer_for"):
+        monkeypatch.setattr(field_queries, name, lambda *_, **__: None)
+    monkeypatch.setattr(field_queries, "errors", lambda *_: error)
+    one: Any = SimpleNamespace(background_rgb=None, loaded=SimpleNamespace(matcher=None), units=None)
+    sent: Any = SimpleNamespace(truth=Camera(LENS, HERE), data=b"")
+    for refined, expected in ((SimpleNamespace(pose=HERE), (stays, *error)), (None, (False, None, None))):
+        monkeypatch.setattr(
+            field_queries, "_refined_from", lambda *_, refined=refined: SimpleNamespace(refined=refined)
+        )
+        assert tuple(field_queries.home(one, sent, exact=True).values()) == expected
