@@ -57,7 +57,7 @@ def test_a_report_has_the_job_its_trace_and_the_machine_but_no_key_and_no_photo(
 
     for name in ("trace", "photo"):
         monkeypatch.setattr(Client, name, refused)
-    with_gaps = reported(job["id"], url, "--out", out, "--photo")
+    with_gaps = reported(job["id"], url, "--out", out, "--photo", key=key)
     assert with_gaps["missing.txt"] == b"trace.json: not now\nphoto.jpg: not now"
     assert with_gaps.keys() == with_photo.keys() - {"trace.json", "photo.jpg"} | {"missing.txt"}
 
