@@ -199,7 +199,7 @@ def test_networks_run_on_one_thread_a_job(monkeypatch: pytest.MonkeyPatch, tmp_p
     monkeypatch.setattr(networks, "_read", lambda path: path)
     before = torch.get_num_threads()
     try:
-        for load in (MATCHERS.load("xfeat").create, lambda: networks._loaded("file", lambda weights: weights)):
+        for load in (MATCHERS.load("xfeat").XFeat, lambda: networks._loaded("file", lambda weights: weights)):
             torch.set_num_threads(2)
             load()
             assert torch.get_num_threads() == 1
