@@ -12,12 +12,15 @@ export PYTHONDONTWRITEBYTECODE :=
 # Files are shared out among the cores; a file's tests share their servers.
 # Four on two cores, too: tests of servers mostly wait.
 PYTEST := $(BIN)/pytest -n 4 --dist loadfile
+PYRIGHT := $(BIN)/pyright --pythonpath $(BIN)/python
+# Compiles the tests' modules: each of pytest's workers would compile all of them.
+COMPILE := $(BIN)/pytest --collect-only -qq >/dev/null 2>&1
 
 GATEWAY_TESTS := $(addprefix tests/test_,$(addsuffix .py,anchors api client client_js clients coverage durable hostile \
 	key_scopes keys_api lens_memory live registration_api report rig route_policy scene_memory scenes security sequences \
-	shared web_limits pages live_page browser))
+	shared web_limits pages live_page browser firefox))
 
-.PHONY: setup demo test test-fleet test-gateway coverage newest lint check release-check studio another-day clean
+.PHONY: setup demo style test test-fleet test-gateway coverage newest lint check release-check studio another-day clean
 
 setup: .venv/ready
 
@@ -33,15 +36,18 @@ setup: .venv/ready
 demo: setup
 	$(BIN)/splatfix serve scenes/studio --port $(PORT)
 
-check: setup
+style: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	@# Meanwhile, on another core, the tests' modules are compiled: each of pytest's workers would compile all of them.
-	$(BIN)/pytest --collect-only -qq >/dev/null 2>&1 & \
-	$(BIN)/pyright --pythonpath $(BIN)/python; checked=$$?; wait; exit $$checked
 
-test: check
-	$(PYTEST) -m "not browser and not ci"
+check: style
+	$(COMPILE) & $(PYRIGHT); checked=$$?; wait; exit $$checked
+
+# Types are checked beside the tests, on another core; what is wrong with them is told after the tests.
+test: style
+	@found=$$(mktemp); $(PYRIGHT) >$$found 2>&1 & types=$$!; \
+	$(COMPILE); $(PYTEST) -m "not browser and not ci"; tested=$$?; \
+	wait $$types || tested=1; cat $$found; rm $$found; exit $$tested
 
 # What several machines share, and the peer of `bench peer`, with the packages that only they need. PostgreSQL's server
 # is the system's.
