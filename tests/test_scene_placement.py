@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -388,13 +389,17 @@ def test_a_job_waits_in_its_replica_for_the_scenes_that_are_promised(monkeypatch
     async def check() -> None:
         replica = Replica(EngineConfig("view_index"))
         task = FakeTask(id="t", held="promised")
-        job = asyncio.ensure_future(anext(replica.localize(task)))  # pyright: ignore[reportArgumentType]
+        messages = replica.localize(task)  # pyright: ignore[reportArgumentType]
+        job = asyncio.ensure_future(anext(messages))
         await asyncio.sleep(0.01)
         assert not job.done()
         held, _ = await replica.hold("promised", (), (), ("x",))
         assert isinstance(held, HeldScenes)
         assert held.token == "promised"
-        assert await asyncio.wait_for(job, 5) == ([], "of own")
+        assert await asyncio.wait_for(job, 5) == ([("first",)], None)
+        engine.go_on.set()
+        await asyncio.sleep(0.02)  # the job ends while its first record is sent
+        assert [message async for message in messages] == [([], "of own")]
         await replica.release("promised")
         assert engine.released == ["own"]
         late = anext(replica.localize(task))  # pyright: ignore[reportArgumentType]
@@ -415,10 +420,11 @@ class FakeTask:
 
 
 class FakeEngine:
-    """Holds scenes at once, and localizes in no time."""
+    """Holds scenes at once; its jobs have one record, and end when they may."""
 
     def __init__(self) -> None:
         self.released: list[str] = []
+        self.go_on = threading.Event()
 
     def start(self) -> None: ...
 
@@ -429,6 +435,8 @@ class FakeEngine:
         take(HeldScenes("own", (asked,), (0.0, 0.0, 0.0)))
 
     def localize(self, task: FakeTask, on_record) -> str:
+        on_record("first")
+        assert self.go_on.wait(5)
         return f"of {task.held}"
 
     def release(self, token: str) -> None:

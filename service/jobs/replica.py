@@ -156,11 +156,12 @@ class Replica:
         try:
             own = replace(task, held=await self._own_token(task.held))
             job = _on_thread(lambda: self._engine.localize(own, lambda *record: records.append(record)))
-            while not job.done():
+            ended = False
+            while not ended:
                 await asyncio.wait([job], timeout=_BETWEEN_RECORDS_S)
-                count = len(records)
-                if count or job.done():
-                    yield records[:count], job.result() if job.done() else None
+                ended, count = job.done(), len(records)  # the job may end while they are sent
+                if count or ended:
+                    yield records[:count], job.result() if ended else None
                     del records[:count]
         finally:
             if held := self._held.get(task.held):
