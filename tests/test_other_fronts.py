@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +15,7 @@ from test_store_contracts import FAILURE, NONE, new_job, record
 
 from service.errors import CorruptScene, SceneNotFound, StorageFailed
 from service.jobs import left_over_photos, shared_jobs
+from service.jobs.engine import HeldScenes
 from service.jobs.left_over_photos import LeftOverPhotos
 from service.jobs.live_job import LiveJob
 from service.jobs.model import Batch, Ending, JobSpec, StoredJob
@@ -337,7 +338,7 @@ class ReplicaEngine(Engine):
         self.calls: list[tuple[str, Any]] = []
         self.there = {"w": SceneStatus("w", "ready")}
         self.looks = 0
-        self.found: Any = "held"
+        self.found: Any = HeldScenes("own", ("x",), (0.0, 0.0, 0.0))
 
     def readiness(self) -> SceneReadiness:
         self.looks += 1
@@ -387,53 +388,59 @@ def test_a_replica_waits_until_its_scenes_are_prepared(replica):
 
 def test_a_replica_drops_loads_and_holds_what_it_is_told(replica):
     stored = [StoredScene(name, Path(name)) for name in ("w", "x")]
-    found, statuses = asyncio.run(replica.hold(["gone"], stored, ("x",)))
+    found, statuses = asyncio.run(replica.hold("t", ["gone"], stored, ("x",)))
     assert replica._engine.calls == [("load", "w"), ("add", "x"), ("load", "x"), ("hold", "x")]
-    assert (found, [status.id for status in statuses]) == ("held", ["x"])
+    assert ((found.token, found.ids), [status.id for status in statuses]) == (("t", ("x",)), ["x"])
     replica._engine.calls.clear()
     replica._engine.found = CorruptScene("it is torn.", where="scene")
-    found, _ = asyncio.run(replica.hold(["x"], [], ("w", "y")))
+    found, _ = asyncio.run(replica.hold("u", ["x"], [], ("w", "y")))
     assert replica._engine.calls == [("unload", "x"), ("hold", ("w", "y"))]
     assert isinstance(found, CorruptScene)
+    assert set(replica._held) == {"t"}
     assert set(replica._engine.there) == {"w"}
 
 
 def test_letting_go_of_scenes_ends_what_runs_with_them(replica):
-    replica._held["token"] = {"j.1"}
-    asyncio.run(replica.release("token"))
-    assert (replica._engine.cancelled, replica._engine.released, replica._held) == (["j.1"], ["token"], {})
-    asyncio.run(replica.release("other"))
-    assert (replica._engine.cancelled, replica._engine.released) == (["j.1"], ["token", "other"])
-    asyncio.run(replica.cancel("k.1"))
-    assert replica._engine.cancelled == ["j.1", "k.1"]
+    async def run() -> None:
+        await replica.hold("token", [], [], ("x",))
+        replica._held["token"].attempts.add("j.1")
+        await replica.release("token")
+        await replica.release("other")  # isn't known: without effect
+        await replica.cancel("k.1")
+
+    asyncio.run(run())
+    assert (replica._engine.cancelled, replica._engine.released) == (["j.1", "k.1"], ["own"])
+    assert replica._held == {}
 
 
 def test_attempts_are_noted_while_they_run(replica):
     noted: list[Any] = []
 
     def localize(task: Any, put: Any) -> str:
-        noted.append({token: set(ids) for token, ids in replica._held.items()})
+        noted.append((task.held, replica._held["token"].attempts.copy()))
         put("a record", "a photo")
         return "the answer"
 
     async def run() -> list[Any]:
-        task = SimpleNamespace(held="token", id="j.1")
+        await replica.hold("token", [], [], ("x",))
+        task = HeldTask("token", "j.1")
         return [message async for message in replica.localize(task)]
 
     replica._engine.localize = localize
-    assert asyncio.run(run()) == [("record", ("a record", "a photo")), ("answer", "the answer")]
-    assert noted == [{"token": {"j.1"}}]
-    assert replica._held == {"token": set()}
+    assert asyncio.run(run()) == [([("a record", "a photo")], "the answer")]
+    assert noted == [("own", {"j.1"})]
+    assert replica._held["token"].attempts == set()
 
 
 def test_a_live_session_gets_its_frames_and_ends(replica):
     def live(task: Any, next_frame: Any, tell: Any) -> None:
         while (frame := next_frame()) is not None:
-            tell(f"answer to {frame}")
+            tell(f"answer to {frame} with {task.held}")
 
     async def run() -> list[Any]:
+        await replica.hold("token", [], [], ("x",))
         heard, left = [], ["a", "b", None]
-        async for message in replica.live("session", None):
+        async for message in replica.live("session", HeldTask("token")):
             heard.append(message)
             if message[0] == "frame?":
                 await replica.frame("session", left.pop(0))
@@ -443,9 +450,15 @@ def test_a_live_session_gets_its_frames_and_ends(replica):
     replica._engine.live = live
     asked = ("frame?", None)
     assert asyncio.run(run()) == [
-        asked, ("record", "answer to a"), asked, ("record", "answer to b"), asked, ("answer", None)
+        asked, ("record", "answer to a with own"), asked, ("record", "answer to b with own"), asked, ("answer", None)
     ]  # fmt: skip
     assert replica._frames == {}
+
+
+@dataclass
+class HeldTask:
+    held: str
+    id: str = ""
 
 
 class Awkward(Exception):
