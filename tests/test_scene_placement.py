@@ -596,6 +596,19 @@ def test_who_needs_a_scene_waits_until_others_let_go():
     with_fleet(check, replicas=1)
 
 
+@pytest.mark.parametrize(("act", "error"), [("unload", SceneUnloaded), ("remove", SceneNotFound)])
+def test_who_waits_for_a_scene_that_is_unloaded_or_removed_is_told(act, error):
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        await coordinator.hold_later("f", ["w", "x"])
+        waiting = asyncio.ensure_future(coordinator.hold_later("f", "y"))
+        await asyncio.sleep(0.01)
+        await getattr(coordinator, act)("y")
+        with pytest.raises(error):
+            await asyncio.wait_for(waiting, 2)
+
+    with_fleet(check, replicas=1)
+
+
 def test_a_replica_that_dies_is_replaced_and_its_jobs_go_elsewhere():
     async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
         first = await coordinator.hold_later("f", "x")
