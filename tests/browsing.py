@@ -73,6 +73,12 @@ def sign_in(context: BrowserContext, address: str) -> None:
         context.request.get(entrance(address))
 
 
+def share_key(address: str, port: int) -> None:
+    """Let the keys of a service at a port be known at an address of the test's own that leads to it."""
+    if found := KEYS.get(port):
+        KEYS[httpx.URL(address).port or 0] = found
+
+
 def serious(page: Page) -> list[str]:
     """Return what axe finds serious or critical. Headings and landmarks, which viser's page and Swagger UI's lack, are
     moderate findings.

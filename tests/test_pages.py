@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from api_server import create_app
 from axe_playwright_python.sync_playwright import Axe
-from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, is_ready, launched, opened, serious, served, sign_in
+from browsing import HTTP, NEEDS_CHROMIUM, PATIENCE_MS, is_ready, launched, opened, serious, served, share_key, sign_in
 from gateway import behind_nginx, free_port
 from PIL import Image
 from playwright.sync_api import Browser, Page, Route, expect
@@ -864,6 +864,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
     slow = {"estimator": "mc_do", "options": json.dumps({"hypotheses": 4096, "refinement_steps": 10000})}
     with served(create_app(settings), port):
         until(lambda: is_ready(url), 240)
+        share_key(url, port)
         context = browser.new_context(viewport={"width": 1000, "height": 700})
         sign_in(context, url)
         page, viewer = context.new_page(), context.new_page()
