@@ -288,7 +288,8 @@ def test_other_sites_pages_may_not_act(shared):
     refused = shared.post("/localize", files={"photo": photo()}, headers=foreign)
     assert_problem(refused, 403, "forbidden", "header.origin")
     own = {"Origin": f"http://127.0.0.1:{shared.base_url.port}"}
-    assert shared.post("/localize", files={"photo": photo()}, headers=own).is_success
+    # 200: a job is sometimes done before its answer is written.
+    assert shared.post("/localize", files={"photo": photo()}, headers=own).status_code in (200, 202)
     plain = shared.get("/jobs", headers=foreign)
     assert "access-control-allow-origin" not in plain.headers
 
