@@ -2,29 +2,69 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
 import ray  # pyright: ignore[reportMissingImports]
-from ray.exceptions import RayError, RayTaskError  # pyright: ignore[reportMissingImports]
+from ray.exceptions import GetTimeoutError, RayError, RayTaskError  # pyright: ignore[reportMissingImports]
 
 from service.jobs.engine import EngineLost
+
+_LOOK_S = 1.0
+"""How often who waits looks whether the cluster is being left."""
+_LEAVE_S = 10.0
+"""How long those who wait are waited for."""
+
+_calls = threading.Condition()
+_under_way = 0
+_cluster: object | None = None
+"""The cluster that this process is in; None in none, and while it leaves one."""
+
+
+def join(**settings: Any) -> None:
+    """Become a part of a cluster, or start one; `settings` are ray.init's, unless Ray was started before."""
+    global _cluster
+    if not ray.is_initialized():
+        ray.init(**settings)
+    with _calls:
+        _cluster = _cluster or object()
+
+
+def leave() -> None:
+    """Leave the cluster. Calls that are under way end with RayError first: Ray ends a process in which another thread
+    uses a cluster that was left, or lets that thread wait for ever."""
+    global _cluster
+    with _calls:
+        _cluster = None
+        _calls.wait_for(lambda: _under_way == 0, _LEAVE_S)
+    ray.shutdown()
 
 
 def call(actor: Any, name: str, *arguments: Any) -> Any:
     """Call a method and wait for its answer. Raises what it raises, and RayError."""
+    calls = _Calls()
     with _own_errors():
-        return _waited(partial(ray.get, getattr(actor, name).remote(*arguments)))
+        return calls.waited(partial(ray.get, calls.within(partial(getattr(actor, name).remote, *arguments))))
+
+
+def send(actor: Any, name: str, *arguments: Any) -> None:
+    """Call a method whose answer nobody needs. Raises EngineLost."""
+    try:
+        _Calls().within(partial(getattr(actor, name).remote, *arguments))
+    except RayError as error:
+        raise EngineLost from error
 
 
 def stream(method: Any, *arguments: Any) -> Iterator[Any]:
     """Yield what a method yields. Raises what it raises, and EngineLost."""
+    calls = _Calls()
     try:
-        messages = method.options(num_returns="streaming").remote(*arguments)
-        while (message := _waited(partial(next, messages, None))) is not None:
+        messages = calls.within(partial(method.options(num_returns="streaming").remote, *arguments))
+        while (message := calls.waited(partial(_next, messages))) is not None:
             with _own_errors():
-                found = _waited(partial(ray.get, message))
+                found = calls.waited(partial(ray.get, message))
             yield found
     except RayTaskError:  # a bug in the replica
         raise
@@ -32,13 +72,40 @@ def stream(method: Any, *arguments: Any) -> Iterator[Any]:
         raise EngineLost from error
 
 
-def _waited(wait: Callable[[], Any]) -> Any:
-    """Return what is waited for. Raises RayError where another thread leaves the cluster meanwhile: Ray itself raises
-    SystemExit there, by which a worker's thread would end, and nobody its attempt."""
-    try:
-        return wait()
-    except SystemExit:
-        raise RayError("the cluster was left.") from None
+def _next(messages: Any, timeout: float) -> Any:
+    """Return a stream's next message; None at its end. Raises GetTimeoutError."""
+    if not ray.wait([messages], timeout=timeout)[0]:
+        raise GetTimeoutError
+    return next(messages, None)
+
+
+class _Calls:
+    """Calls in the cluster that this process is in now. Once it was left, they raise RayError."""
+
+    def __init__(self) -> None:
+        self._cluster = _cluster
+
+    def waited(self, wait: Callable[..., Any]) -> Any:
+        """Return what is waited for; `wait` takes a timeout (s)."""
+        while True:
+            try:
+                return self.within(partial(wait, timeout=_LOOK_S))
+            except GetTimeoutError:
+                continue
+
+    def within(self, do: Callable[[], Any]) -> Any:
+        """Return what Ray does in this cluster."""
+        global _under_way
+        with _calls:
+            if self._cluster is None or self._cluster is not _cluster:
+                raise RayError("this process is in no cluster, or in another one by now.")
+            _under_way += 1
+        try:
+            return do()
+        finally:
+            with _calls:
+                _under_way -= 1
+                _calls.notify_all()
 
 
 class _own_errors:

@@ -28,7 +28,7 @@ from service.errors import SceneNotFound, SceneNotReady, SplatfixError
 from service.jobs.embedded_engine import EngineConfig, with_left_out
 from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask, NextFrame, OnAnswer, OnRecord
 from service.jobs.placement import PlacementConfig
-from service.jobs.ray_calls import call, stream
+from service.jobs.ray_calls import call, join, leave, send, stream
 from service.jobs.ray_config import RayConfig
 from service.jobs.replica import Replica, SetUp
 from service.jobs.scene_coordinator import SceneCoordinator
@@ -81,21 +81,22 @@ class RayEngine:
 
     def _join(self) -> None:
         """Become a part of the cluster, or start one."""
-        if not ray.is_initialized():
-            if not self._ray.address and "RAY_AUTH_TOKEN_PATH" not in os.environ:
-                # Ray listens on all addresses, and runs whatever it is sent: with a token of this process only.
-                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
-            local = {
+        if self._ray.address:
+            where: dict[str, Any] = {"address": self._ray.address}
+        else:
+            where = {
                 "address": "local",
                 "num_cpus": max(1, round(self._ray.replicas * self._ray.cpus)),
                 "include_dashboard": False,
                 # Ray's default is a share of the machine's memory, which scenes need.
                 "object_store_memory": 500_000_000,
             }
-            # Ray's default, 15, lets replicas wait for all else on the machine.
-            os.environ.setdefault("RAY_worker_niceness", "0")
-            where: dict[str, Any] = {"address": self._ray.address} if self._ray.address else local
-            ray.init(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
+            if "RAY_AUTH_TOKEN_PATH" not in os.environ:
+                # Ray listens on all addresses, and runs whatever it is sent: with a token of this process only.
+                os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+        # Ray's default, 15, lets replicas wait for all else on the machine.
+        os.environ.setdefault("RAY_worker_niceness", "0")
+        join(**where, namespace="splatfix", log_to_driver=False, configure_logging=False)
 
     def _connect(self) -> None:
         """Find the coordinator or start it, with its replicas, and add all scenes to it."""
@@ -126,7 +127,7 @@ class RayEngine:
             with suppress(Exception):
                 self.release(token)
         if not self._ray.address:
-            ray.shutdown()
+            leave()
 
     def _beat(self) -> None:
         while not self._closed.wait(_HEARTBEAT_S):
@@ -207,7 +208,7 @@ class RayEngine:
         if self._held.pop(token, None):
             # Not waited for: who lets go needs no answer.
             with suppress(Exception):  # of a lost cluster nothing is held
-                self._coordinator.release.remote(token)
+                send(self._coordinator, "release", token)
 
     def _is_there(self, scene_id: str) -> bool:
         return self.scene(scene_id).memory_bytes is not None
@@ -250,12 +251,13 @@ class RayEngine:
         try:
             for kind, value in stream(held.replica.live, session, task):
                 if kind == "frame?":
-                    held.replica.frame.remote(session, next_frame())
+                    send(held.replica, "frame", session, next_frame())
                 elif kind == "record":
                     on_answer(value)
         except BaseException:
             if self._held.get(task.held) is held:  # it may be a callback that failed: the session ends
-                held.replica.frame.remote(session, None)
+                with suppress(EngineLost):
+                    send(held.replica, "frame", session, None)
             raise
 
     def render(self, scene_id: str, picture: PictureSpec) -> bytes:
@@ -294,10 +296,6 @@ class RayEngine:
             raise
         except RayError as error:
             self._connect_again(coordinator, error)
-        except Exception:
-            # A call that another thread leaves the cluster under fails in any way.
-            if self._coordinator is coordinator:
-                raise
         raise _CoordinatorGone("the engine is started again.", where="scene", hint="Try again later.") from None
 
     def _connect_again(self, lost: Any, error: Exception) -> None:
@@ -317,7 +315,7 @@ class RayEngine:
             # Its head was started again, or is away: the replicas of the cluster before can't be called any more.
             self._coordinator = None
             self._forget_replicas()
-            ray.shutdown()
+            leave()
             self._join()
             self._connect()
         except Exception as again:  # of any kind, where the head is away
