@@ -10,6 +10,7 @@ import copy
 import os
 import threading
 from collections.abc import AsyncIterator, Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
@@ -29,6 +30,8 @@ SetUp = Callable[[EmbeddedEngine], None]
 Record = tuple[JobRecord, Query | None]
 
 _BETWEEN_RECORDS_S = 0.05
+_JOBS = ThreadPoolExecutor(256, "job")
+"""A thread is used again: one of its own for each job would have to get its memory from the system anew."""
 _ON_ITS_WAY_S = 10.0
 """A coordinator's call that takes longer to come will not come."""
 
@@ -222,17 +225,15 @@ async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) ->
 
 
 def _on_thread(work: Callable[[], Any]) -> asyncio.Future[Any]:
-    """Begin work on a thread of its own; return its future result, or its error, which can be sent."""
-    loop, done = asyncio.get_running_loop(), asyncio.Future()
+    """Begin work on a thread; return its future result, or its error, which can be sent."""
 
-    def run() -> None:
+    def run() -> Any:
         try:
-            loop.call_soon_threadsafe(done.set_result, work())
+            return work()
         except Exception as error:
-            loop.call_soon_threadsafe(done.set_exception, _portable(error))
+            raise _portable(error) from None
 
-    threading.Thread(target=run, name="job", daemon=True).start()
-    return done
+    return asyncio.get_running_loop().run_in_executor(_JOBS, run)
 
 
 def _portable(error: Exception) -> Exception:
