@@ -21,7 +21,7 @@ from test_engine_contract import SLOW, query, ray_engine
 
 from service.errors import SceneError
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
-from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask
+from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask
 from service.photos.images import read_query
 from service.results import StageTiming
 from service.scene_manager.status import StoredScene
@@ -128,10 +128,17 @@ def test_what_waits_for_a_cluster_that_is_left_ends_at_once(engine, service, mon
     """As after a kill of its head; Ray raises SystemExit in the threads that wait, which would end those of workers."""
     from ray.exceptions import RayError
 
+    from service.jobs.ray_calls import stream
+
     job = post(service, prefer="", options={"steps": 200, "pause_s": 0.1}).json()
     until(lambda: service.get(job["links"]["self"]).json()["records"] >= 2)
     (running,) = engine._running.values()
     before, connect, seen = engine._coordinator, engine._connect, []
+    held = engine.hold("room")
+    records = stream(
+        engine._held[held.token].replica.localize, task(held, "between two records", steps=200, pause_s=0.1)
+    )
+    next(records)
 
     def lost() -> None:
         monkeypatch.setattr(engine, "_connect", connect)
@@ -152,6 +159,9 @@ def test_what_waits_for_a_cluster_that_is_left_ends_at_once(engine, service, mon
     engine._connect_again(before, RayError("lost"))  # leaves the cluster, and starts another
     until(lambda: len(seen) == len(threads), 5)
     assert [error for error in seen if not isinstance(error, Exception)] == []
+    with pytest.raises(EngineLost):  # Ray would end the process
+        next(records)
+    engine.release(held.token)
     until(lambda: service.get(job["links"]["self"]).json()["attempt"] == 2, 30)
     service.delete(job["links"]["self"])
     finished(service, job["links"]["self"])

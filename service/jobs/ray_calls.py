@@ -17,7 +17,7 @@ _LOOK_S = 1.0
 _LEAVE_S = 10.0
 """How long those who wait are waited for."""
 
-_calls = threading.Condition()
+_lock = threading.Condition()
 _under_way = 0
 _cluster: object | None = None
 """The cluster that this process is in; None in none, and while it leaves one."""
@@ -28,7 +28,7 @@ def join(**settings: Any) -> None:
     global _cluster
     if not ray.is_initialized():
         ray.init(**settings)
-    with _calls:
+    with _lock:
         _cluster = _cluster or object()
 
 
@@ -36,9 +36,9 @@ def leave() -> None:
     """Leave the cluster. Calls that are under way end with RayError first: Ray ends a process in which another thread
     uses a cluster that was left, or lets that thread wait for ever."""
     global _cluster
-    with _calls:
+    with _lock:
         _cluster = None
-        _calls.wait_for(lambda: _under_way == 0, _LEAVE_S)
+        _lock.wait_for(lambda: _under_way == 0, _LEAVE_S)
     ray.shutdown()
 
 
@@ -96,16 +96,16 @@ class _Calls:
     def within(self, do: Callable[[], Any]) -> Any:
         """Return what Ray does in this cluster."""
         global _under_way
-        with _calls:
+        with _lock:
             if self._cluster is None or self._cluster is not _cluster:
                 raise RayError("this process is in no cluster, or in another one by now.")
             _under_way += 1
         try:
             return do()
         finally:
-            with _calls:
+            with _lock:
                 _under_way -= 1
-                _calls.notify_all()
+                _lock.notify_all()
 
 
 class _own_errors:

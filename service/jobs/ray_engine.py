@@ -1,4 +1,5 @@
-"""The engine whose scenes are in other processes, on this or other machines, by Ray. The only file with ray.
+"""The engine whose scenes are in other processes, on this or other machines, by Ray, which only this file and
+`ray_calls` know.
 
 Actors, not Ray Serve: an attempt, its cancel, a live session's frames and the scenes that are held for it must reach
 one certain replica, which Serve's handles choose themselves; where scenes go is decided by `placement`. One actor of
