@@ -878,13 +878,7 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
         asked: dict = {"files": {"photo": PHOTO.read_bytes()}}
         asked |= {"headers": {"Authorization": f"Bearer {key}"}} if key else {}
         job = HTTP.post(f"{url}/localize", data=slow, timeout=90, **asked).json()
-        began = time.monotonic()
-        page.goto(f"{url}/#/jobs/{job['id']}")
-        expect(page.locator(".line")).to_contain_text("step ")
-        viewer.bring_to_front()
-        viewer.goto(f"{url}/viewer/jobs/{job['id']}/")
-        viewer.get_by_text("running", exact=True).wait_for(timeout=PATIENCE_MS)
-        opened_s = time.monotonic() - began
+        opened_s = _opened(page, viewer, url, job["id"])
         viewer.evaluate("window.old = true")
     lost = page.get_by_role("alert")
     expect(lost).to_contain_text("Reconnecting")
@@ -899,13 +893,28 @@ def _restarted(browser: Browser, settings: Settings, url: str, key: str) -> None
         page.bring_to_front()
         expect(lost).to_be_hidden()
         expect(page.locator(".line")).to_contain_text("step ")
-        # Machines that draw slowly need longer to open both at all.
-        assert time.monotonic() - ready < max(5, opened_s)
+        took_s = time.monotonic() - ready
         stages = page.locator(".stages li").all_inner_texts()
         assert len(stages) == len(set(stages))
+        # Machines that draw slowly need longer to open both at all, and a page looks for the service once a second.
+        assert took_s < 5 or took_s < 1 + max(opened_s, _opened(page, viewer, url, job["id"]))
+        page.bring_to_front()
         page.get_by_role("button", name="Cancel").click()
         page.locator(".badge.cancelled").wait_for()
         context.close()
+
+
+def _opened(page: Page, viewer: Page, url: str, job_id: str) -> float:
+    """Seconds until a page and a viewer show a job that runs."""
+    began = time.monotonic()
+    for tab, address in ((page, f"{url}/#/jobs/{job_id}"), (viewer, f"{url}/viewer/jobs/{job_id}/")):
+        tab.goto("about:blank")
+        tab.bring_to_front()
+        tab.goto(address)
+        if tab is page:
+            expect(page.locator(".line")).to_contain_text("step ")
+    viewer.get_by_text("running", exact=True).wait_for(timeout=PATIENCE_MS)
+    return time.monotonic() - began
 
 
 def test_no_view_is_wider_than_a_phone(browser: Browser, url: str) -> None:
