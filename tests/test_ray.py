@@ -136,7 +136,7 @@ def test_what_waits_for_a_cluster_that_is_left_ends_at_once(engine, service, mon
     before, connect, seen = engine._coordinator, engine._connect, []
     held = engine.hold("room")
     records = stream(
-        engine._held[held.token].replica.localize, task(held, "between two records", steps=200, pause_s=0.1)
+        engine._held[held.token].replica.localize, task(held, "between two records", steps=200, pause_s=0.1), held
     )
     next(records)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +22,7 @@ from service.errors import (
     SceneUnloaded,
 )
 from service.jobs.embedded_engine import EngineConfig
-from service.jobs.engine import EngineLost, HeldScenes
+from service.jobs.engine import HeldScenes
 from service.jobs.placement import Choice, Placement, PlacementConfig
 from service.jobs.replica import Replica
 from service.jobs.scene_coordinator import SceneCoordinator
@@ -259,8 +259,10 @@ class FakeReplica:
         self.scenes: set[str] = set()
         self.loads: list[str] = []
         self.held: dict[str, tuple[str, ...]] = {}
-        self.dead, self.refuses, self.go_on = False, False, asyncio.Event()
+        self.dead, self.size, self.go_on = False, 100, asyncio.Event()
         self.go_on.set()
+        self.answer = asyncio.Event()
+        self.answer.set()
 
     def __getattr__(self, name: str) -> Method:
         async def call(*arguments):
@@ -297,15 +299,18 @@ class FakeReplica:
         self.scenes |= set(fresh)
         self.loads += fresh
         await self.go_on.wait()
-        if "torn" in ids or self.refuses:
+        if "torn" in ids:
             self.scenes.discard("torn")
             return CorruptScene("it is torn.", where="scene"), [SceneStatus("torn", "failed")]
         self.held[token] = tuple(ids)
         statuses = [SceneStatus(i, "ready", memory_bytes=100) for i in ids]
         return HeldScenes(token, tuple(ids), (0.0, 0.0, 0.0)), statuses
 
-    async def _release(self, token: str) -> None:
-        self.held.pop(token, None)  # one that was refused, too
+    async def _release(self, token: str, ids) -> list[SceneStatus]:
+        self.held.pop(token, None)  # one that no job has used isn't held here
+        statuses = [SceneStatus(i, "ready", memory_bytes=self.size) for i in ids if i in self.scenes]
+        await self.answer.wait()
+        return statuses
 
 
 class Fleet:
@@ -360,7 +365,7 @@ def test_a_load_is_made_once_for_all_who_wait():
     with_fleet(check)
 
 
-def test_a_scene_in_memory_is_held_before_its_replica_answers():
+def test_a_scene_in_memory_is_held_without_its_replica():
     async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
         await coordinator.release((await coordinator.hold_later("f", "x")).held.token)
         (replica,) = fleet.replicas
@@ -369,47 +374,73 @@ def test_a_scene_in_memory_is_held_before_its_replica_answers():
         assert (await coordinator.scene("x")).jobs == 1
         with pytest.raises(SceneInUse):
             await coordinator.remove("x")
-        replica.go_on.set()
-        await asyncio.sleep(0.01)
-        assert replica.held == {held.held.token: ("x",)}
-        replica.refuses = True
-        await coordinator.hold("f", "x")  # is taken back
-        await asyncio.sleep(0.01)
-        assert (await coordinator.scene("x")).jobs == 1
-        await coordinator.release(held.held.token)
         assert replica.held == {}
+        await coordinator.release(held.held.token)
         assert [coordinator._placement.jobs(name) for name in coordinator._placement.replicas()] == [0]
 
     with_fleet(check, replicas=1)
 
 
-def test_a_job_waits_in_its_replica_for_the_scenes_that_are_promised(monkeypatch):
+def test_what_a_scene_has_grown_to_is_known_once_it_is_released():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        for name in "xy":
+            await coordinator.release((await coordinator.hold_later("f", name)).held.token)
+        (replica,) = fleet.replicas
+        assert replica.scenes == {"x", "y"}
+        replica.size = 140
+        held = await coordinator.hold("f", "x")
+        await coordinator.release(held.held.token)
+        await asyncio.sleep(0.01)
+        assert replica.scenes == {"x"}  # 140 and 100 are more than 230
+
+    with_fleet(check, budget=230, replicas=1)
+
+
+def test_a_scene_that_is_dropped_before_its_release_is_answered_stays_dropped():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        (replica,) = fleet.replicas
+        held = await coordinator.hold_later("f", "x")
+        replica.answer.clear()
+        releasing = asyncio.ensure_future(coordinator.release(held.held.token))
+        await asyncio.sleep(0.01)
+        await asyncio.wait_for(coordinator.hold_later("f", "z"), 5)
+        assert replica.scenes == {"z"}
+        replica.answer.set()
+        await releasing
+        assert coordinator._placement.copies("x") == {}
+
+    with_fleet(check, budget=150, replicas=1)
+
+
+def test_a_job_holds_in_its_replica_what_it_was_promised(monkeypatch):
     """Calls of the coordinator and of a front may overtake each other."""
 
     async def check() -> None:
         replica = Replica(EngineConfig("view_index"))
-        task = FakeTask(id="t", held="promised")
-        messages = replica.localize(task)  # pyright: ignore[reportArgumentType]
-        job = asyncio.ensure_future(anext(messages))
-        await asyncio.sleep(0.01)
-        assert not job.done()
-        held, _ = await replica.hold("promised", (), (), ("x",))
-        assert isinstance(held, HeldScenes)
-        assert held.token == "promised"
-        assert await asyncio.wait_for(job, 5) == ([("first",)], None)
+        task, promised = FakeTask(id="t", held="promised"), HeldScenes("promised", ("x",), (0.0, 0.0, 0.0))
+        await replica.release("promised", ("x",))  # before the job has come
+        messages = replica.localize(task, promised)  # pyright: ignore[reportArgumentType]
+        assert await anext(messages) == ([("first",)], None)
         engine.go_on.set()
         await asyncio.sleep(0.02)  # the job ends while its first record is sent
         assert [message async for message in messages] == [([], "of own")]
-        await replica.release("promised")
         assert engine.released == ["own"]
-        late = anext(replica.localize(task))  # pyright: ignore[reportArgumentType]
-        with pytest.raises(EngineLost):
+        held, _ = await replica.hold("kept", (), (), ("x",))
+        assert isinstance(held, HeldScenes)
+        assert held.token == "kept"
+        messages = replica.localize(replace(task, held="kept"), held)  # pyright: ignore[reportArgumentType]
+        await anext(messages)
+        await replica.release("kept", ("x",))
+        assert engine.cancelled == ["t"]
+        assert engine.released == ["own", "own"]
+        engine.missing = True
+        late = anext(replica.localize(task, promised))  # pyright: ignore[reportArgumentType]
+        with pytest.raises(SceneNotReady):
             await late
         assert replica._held == {}
 
     engine = FakeEngine()
     monkeypatch.setattr("service.jobs.replica.EmbeddedEngine", lambda config: engine)
-    monkeypatch.setattr("service.jobs.replica._ON_ITS_WAY_S", 0.1)
     asyncio.run(check())
 
 
@@ -420,10 +451,12 @@ class FakeTask:
 
 
 class FakeEngine:
-    """Holds scenes at once; its jobs have one record, and end when they may."""
+    """Its jobs have one record, and end when they may."""
 
     def __init__(self) -> None:
+        self.missing = False
         self.released: list[str] = []
+        self.cancelled: list[str] = []
         self.go_on = threading.Event()
 
     def start(self) -> None: ...
@@ -431,8 +464,13 @@ class FakeEngine:
     def scenes(self) -> list[SceneStatus]:
         return []
 
+    def hold(self, asked: str) -> HeldScenes:
+        if self.missing:
+            raise SceneNotReady("it is loading.", where="scene")
+        return HeldScenes("own", (asked,), (0.0, 0.0, 0.0))
+
     def hold_later(self, asked: str, take) -> None:
-        take(HeldScenes("own", (asked,), (0.0, 0.0, 0.0)))
+        take(self.hold(asked))
 
     def localize(self, task: FakeTask, on_record) -> str:
         on_record("first")
@@ -442,7 +480,8 @@ class FakeEngine:
     def release(self, token: str) -> None:
         self.released.append(token)
 
-    def cancel(self, task_id: str) -> None: ...
+    def cancel(self, task_id: str) -> None:
+        self.cancelled.append(task_id)
 
 
 def test_fronts_that_start_at_once_share_replicas(monkeypatch):

@@ -70,7 +70,8 @@ class Acceptance:
                 scene, background = self._first_scene(order.spec.scene), (0.0, 0.0, 0.0)
             else:
                 scene, background = held.ids[0], held.background_rgb
-                for scene_id in held.ids:
+                # Only lengths in metres need the scenes, which may be on another machine.
+                for scene_id in held.ids if order.spec.accuracy.metres is not None else ():
                     order.spec.accuracy.in_units(scene_id, self._engine.require(scene_id).metres_per_unit)
             recall = self._recall(order)
             photo = read_photo(order.photo, order.spec, background, self._config.max_frames, recall)

@@ -224,7 +224,7 @@ class RayEngine:
             raise EngineLost
         self._running[task.id] = held.replica
         try:
-            for records, answer in stream(held.replica.localize, task):
+            for records, answer in stream(held.replica.localize, task, held.held):
                 for record in records:
                     on_record(*record)
                 if answer:
@@ -250,7 +250,7 @@ class RayEngine:
             raise EngineLost
         session = secrets.token_hex(8)
         try:
-            for kind, value in stream(held.replica.live, session, task):
+            for kind, value in stream(held.replica.live, session, task, held.held):
                 if kind == "frame?":
                     send(held.replica, "frame", session, next_frame())
                 elif kind == "record":

@@ -9,16 +9,16 @@ import asyncio
 import copy
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 from typing import Any
 
 from service.errors import SceneNotFound
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
-from service.jobs.engine import EngineAnswer, EngineLost, HeldScenes, LocalizeTask
+from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask
 from service.jobs.model import JobRecord
 from service.live.live_values import LiveFrame, LiveTask
 from service.scene_manager.status import SceneReadiness, SceneStatus, StoredScene
@@ -32,15 +32,14 @@ Record = tuple[JobRecord, Query | None]
 _BETWEEN_RECORDS_S = 0.05
 _JOBS = ThreadPoolExecutor(256, "job")
 """A thread is used again: one of its own for each job would have to get its memory from the system anew."""
-_ON_ITS_WAY_S = 10.0
-"""A coordinator's call that takes longer to come will not come."""
 
 
 @dataclass(slots=True)
 class _Held:
-    """Scenes that are held, or will be."""
+    """Scenes that are held."""
 
-    scenes: asyncio.Future[HeldScenes | Exception] = field(default_factory=asyncio.Future)
+    own: str
+    """The engine's token."""
     attempts: set[str] = field(default_factory=set)
     """Under way with them."""
 
@@ -100,7 +99,6 @@ class Replica:
 
         Return them, or why they can't be, and what each is then.
         """
-        held = self._known(token)
         self._drop(drop)
         known = {scene.id for scene in self._engine.scenes()}
         for scene in stored:
@@ -108,56 +106,58 @@ class Replica:
                 self._engine.add(scene)
             self._engine.load(scene.id)
         loop, answer = asyncio.get_running_loop(), asyncio.Future()
-        asked = ids[0] if len(ids) == 1 else tuple(ids)
-        self._engine.hold_later(asked, lambda found: loop.call_soon_threadsafe(answer.set_result, found))
+        self._engine.hold_later(_asked(ids), lambda found: loop.call_soon_threadsafe(answer.set_result, found))
         found = await answer
-        held.scenes.set_result(found)
         if isinstance(found, Exception):
-            self._held.pop(token, None)
-        statuses = [status for status in self._engine.scenes() if status.id in ids]
-        return (_portable(found) if isinstance(found, Exception) else replace(found, token=token)), statuses
+            return _portable(found), self._statuses(ids)
+        self._held[token] = _Held(found.token)
+        return replace(found, token=token), self._statuses(ids)
 
-    def _known(self, token: str) -> _Held:
-        return self._held.setdefault(token, _Held())
+    def _statuses(self, ids: Sequence[str]) -> list[SceneStatus]:
+        return [status for status in self._engine.scenes() if status.id in ids]
 
-    async def _own_token(self, token: str) -> str:
-        """Return the engine's token of scenes, whose `hold` may be still on its way.
+    @contextmanager
+    def _using(self, scenes: HeldScenes, task_id: str) -> Iterator[str]:
+        """Hold scenes until an attempt ends; give the engine's token. Raises SceneError.
 
-        Raises why they can't be held, and EngineLost where the coordinator ended before it said what to hold.
+        Of scenes that are in memory the coordinator tells only the front, which saves a job the way.
         """
+        if scenes.token not in self._held:
+            self._held[scenes.token] = _Held(self._engine.hold(_asked(scenes.ids)).token)
+        held = self._held[scenes.token]
+        held.attempts.add(task_id)
         try:
-            found = await asyncio.wait_for(asyncio.shield(self._known(token).scenes), _ON_ITS_WAY_S)
-        except TimeoutError:
-            self._held.pop(token, None)
-            raise EngineLost from None
-        if isinstance(found, Exception):
-            raise _portable(found)
-        return found.token
+            yield held.own
+        finally:
+            held.attempts.discard(task_id)
+            if not held.attempts:  # here, too: the release may have come before the attempt
+                self._let_go(scenes.token)
 
-    async def release(self, token: str) -> None:
-        """Let go of scenes, and end what still runs with them."""
-        held = self._held.pop(token, None)
-        if held is None:
-            return
-        for task_id in held.attempts:
-            self._engine.cancel(task_id)
-        found = await held.scenes
-        if isinstance(found, HeldScenes):
-            self._engine.release(found.token)
+    async def release(self, token: str, ids: Sequence[str]) -> list[SceneStatus]:
+        """Let go of scenes, and end what still runs with them; return what each is."""
+        self._let_go(token)
+        return self._statuses(ids)
+
+    def _let_go(self, token: str) -> None:
+        if held := self._held.pop(token, None):
+            for task_id in held.attempts:
+                self._engine.cancel(task_id)
+            self._engine.release(held.own)
 
     async def cancel(self, task_id: str) -> None:
         """End an attempt at its next record."""
         self._engine.cancel(task_id)
 
-    async def localize(self, task: LocalizeTask) -> AsyncIterator[tuple[list[Record], EngineAnswer | None]]:
+    async def localize(
+        self, task: LocalizeTask, scenes: HeldScenes
+    ) -> AsyncIterator[tuple[list[Record], EngineAnswer | None]]:
         """Yield the records since the last time, 20 times a second at most, at last with the answer.
 
         The job's thread doesn't wake this one at each record, which would take 1 ms of the job.
         """
-        self._known(task.held).attempts.add(task.id)
         records: list[Record] = []
-        try:
-            own = replace(task, held=await self._own_token(task.held))
+        with self._using(scenes, task.id) as token:
+            own = replace(task, held=token)
             job = _on_thread(lambda: self._engine.localize(own, lambda *record: records.append(record)))
             ended = False
             while not ended:
@@ -166,11 +166,8 @@ class Replica:
                 if count or ended:
                     yield records[:count], job.result() if ended else None
                     del records[:count]
-        finally:
-            if held := self._held.get(task.held):
-                held.attempts.discard(task.id)
 
-    async def live(self, session: str, task: LiveTask) -> AsyncIterator[tuple[str, Any]]:
+    async def live(self, session: str, task: LiveTask, scenes: HeldScenes) -> AsyncIterator[tuple[str, Any]]:
         """Yield `("frame?", None)` where a frame is wanted, `("record", LiveAnswer)`, at last `("answer", None)`."""
         frames = self._frames[session] = SimpleQueue()
 
@@ -182,9 +179,10 @@ class Replica:
             self._engine.live(own, next_frame, lambda answer: put(("record", answer)))
 
         try:
-            own = replace(task, held=await self._own_token(task.held))
-            async for message in _streamed(work):
-                yield message
+            with self._using(scenes, session) as token:
+                own = replace(task, held=token)
+                async for message in _streamed(work):
+                    yield message
         finally:
             frames.put(None)
             self._frames.pop(session, None)
@@ -199,6 +197,10 @@ class Replica:
             return await asyncio.to_thread(function, *arguments)
         except Exception as error:
             raise _portable(error) from None
+
+
+def _asked(ids: Sequence[str]) -> str | tuple[str, ...]:
+    return ids[0] if len(ids) == 1 else tuple(ids)
 
 
 async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) -> AsyncIterator[tuple[str, Any]]:

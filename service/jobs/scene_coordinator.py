@@ -227,7 +227,7 @@ class SceneCoordinator:
     async def hold(self, front: str, asked: str | Sequence[str] | None) -> HeldAt:
         """Hold scenes that are in memory together. Raises SceneError; SceneNotReady where one has to be loaded.
 
-        Their replica isn't waited for: what it is asked with the token waits there until it has heard of it.
+        Their replica isn't told: it holds them as soon as it is asked to work with them.
         """
         ids, left_out = self._scenes.chosen(asked)
         for scene_id in ids:
@@ -235,9 +235,8 @@ class SceneCoordinator:
         choice = self._placement.choose(ids)
         if choice is not None and self._all_ready(choice, ids):
             if background_rgb := self._scenes[ids[0]].background_rgb:
-                token, hold, call = self._send_hold(front, choice, ids)
-                self._holds.record(token, hold)
-                self._in_background(self._confirm_hold(token, hold, call))
+                token = self._take(choice, ids)
+                self._holds.record(token, Hold(front, choice.replica, ids))
                 return HeldAt(HeldScenes(token, ids, background_rgb, left_out), choice.replica)
             with suppress(ReplicaLost):  # it was never held
                 return await self._hold_at(front, choice, ids, left_out)
@@ -274,7 +273,8 @@ class SceneCoordinator:
         self._placement.release(hold.replica, hold.ids)
         if handle := self._replicas.get(hold.replica):
             with suppress(ReplicaLost):
-                await self._asked(hold.replica, handle.release.remote(token))
+                for status in await self._asked(hold.replica, handle.release.remote(token, hold.ids)):
+                    self._note_size(hold.replica, status)
         for scene_id in hold.ids:
             scene = self._scenes.get(scene_id)
             if scene is None or not scene.wanted:
@@ -283,7 +283,11 @@ class SceneCoordinator:
 
     async def _hold_at(self, front: str, choice: Choice, ids: tuple[str, ...], left_out: tuple[str, ...]) -> HeldAt:
         """Carry out a choice: drop, load, hold."""
-        task = self._in_background(self._finish_hold(*self._send_hold(front, choice, ids)))
+        # Taken and sent here, not in the task: nobody else may choose in between.
+        token = self._take(choice, ids)
+        stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
+        call = self._replicas[choice.replica].hold.remote(token, choice.drop, stored, ids)
+        task = self._in_background(self._finish_hold(token, Hold(front, choice.replica, ids), call))
         try:
             # Shielded: who leaves must not cancel a load that others wait for.
             held = await asyncio.shield(task)
@@ -292,16 +296,13 @@ class SceneCoordinator:
             raise
         return HeldAt(replace(held, left_out=left_out), choice.replica)
 
-    def _send_hold(self, front: str, choice: Choice, ids: tuple[str, ...]) -> tuple[str, Hold, Awaitable[Any]]:
-        """Have a replica carry out a choice; return the token, the hold, and what answers. Awaits nothing."""
+    def _take(self, choice: Choice, ids: tuple[str, ...]) -> str:
+        """Note that scenes are used as was chosen, and have crowded ones copied; return a new token."""
         self._placement.take(choice, ids)
-        stored = [scene.stored for scene in map(self._scenes.__getitem__, ids) if scene.stored]
-        token = secrets.token_hex(8)
-        call = self._replicas[choice.replica].hold.remote(token, choice.drop, stored, ids)
         for scene_id in ids:
             if extra := self._placement.extra_copy(scene_id):
                 self._in_background(self._copy(extra, scene_id))
-        return token, Hold(front, choice.replica, ids), call
+        return secrets.token_hex(8)
 
     async def _copy(self, extra: Choice, scene_id: str) -> None:
         """Load another copy of a scene, beside the jobs."""
@@ -312,32 +313,26 @@ class SceneCoordinator:
     async def _finish_hold(self, token: str, hold: Hold, call: Awaitable[Any]) -> HeldScenes:
         """Put on record what became of a call to hold scenes. Raises why they can't be held, and ReplicaLost."""
         try:
-            found = await self._answer(hold, call)
+            found, statuses = await self._asked(hold.replica, call)
+            for status in statuses:
+                self._note_loaded(hold.replica, status, found)
             if isinstance(found, Exception):
                 self._placement.release(hold.replica, hold.ids)
                 raise found
+            if scene := self._scenes.get(hold.ids[0]):
+                scene.background_rgb = found.background_rgb
             self._holds.record(token, hold)
             return found
         finally:
             self._notify()
 
-    async def _confirm_hold(self, token: str, hold: Hold, call: Awaitable[Any]) -> None:
-        """Take back a hold that was promised, where the replica can't keep it: who uses it hears so there."""
-        with suppress(ReplicaLost):
-            if isinstance(await self._answer(hold, call), Exception):
-                await self.release(token)
+    def _note_size(self, name: str, status: SceneStatus) -> None:
+        """Note what a scene in memory takes, which grows while it is prepared."""
+        copy = self._placement.copies(status.id).get(name)
+        if copy and copy.ready:  # it may have been dropped since the replica answered
+            self._note_loaded(name, status, None)
 
-    async def _answer(self, hold: Hold, call: Awaitable[Any]) -> HeldScenes | Exception:
-        """Return a replica's answer to a call to hold scenes, and note what it says of them. Raises ReplicaLost."""
-        found, statuses = await self._asked(hold.replica, call)
-        for status in statuses:
-            self._note_loaded(hold.replica, status, found)
-        scene = self._scenes.get(hold.ids[0])
-        if scene and isinstance(found, HeldScenes):
-            scene.background_rgb = found.background_rgb
-        return found
-
-    def _note_loaded(self, name: str, status: SceneStatus, found: HeldScenes | Exception) -> None:
+    def _note_loaded(self, name: str, status: SceneStatus, found: HeldScenes | Exception | None) -> None:
         scene = self._scenes.get(status.id)
         if status.memory_bytes is not None and status.state in ("preparing", "ready"):
             over = self._placement.loaded(name, status.id, status.memory_bytes, pinned=not (scene and scene.stored))
