@@ -232,6 +232,18 @@ def test_registrations_and_anchors_of_a_scene_are_shared(fronts, tmp_path, monke
     assert anchors[1].anchors("house") == ()
 
 
+def test_what_a_front_writes_it_reads_at_once_and_adds_to_what_others_wrote(fronts, monkeypatch):
+    monkeypatch.setattr(side_file, "_REFRESH_S", 600.0)
+    first, second = fronts
+    upload(first, "house", ply())
+    second.refresh()
+    files = [RegistrationFile(s.path, None, s.remote) for s in (f.find("house") for f in fronts)]
+    assert [file.current() for file in files] == [None, None]
+    files[0].add(complete())
+    assert files[0].current().revision == 1
+    assert files[1].add(complete()).revision == 2
+
+
 def test_a_copy_is_used_while_the_object_store_is_away(fronts, monkeypatch, caplog):
     first, second = fronts
     monkeypatch.setattr(side_file, "_REFRESH_S", 0.0)

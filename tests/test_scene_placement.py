@@ -684,6 +684,22 @@ def test_an_unloaded_scene_goes_with_its_last_job_and_stays_away():
     with_fleet(check)
 
 
+def test_nobody_waits_for_a_required_scene_that_is_unloaded_while_it_loads():
+    async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
+        await coordinator.release((await coordinator.hold_later("f", "x")).held.token)
+        for replica in fleet.replicas:
+            replica.go_on.clear()
+        await coordinator.add(StoredScene("late", Path("late")), True)
+        await coordinator.start(2)
+        readiness = await coordinator.readiness()
+        assert (readiness.ready, [note.scene for note in readiness.pending]) == (False, ["late"])
+        await coordinator.unload("late")
+        readiness = await coordinator.readiness()
+        assert (readiness.ready, readiness.pending) == (True, ())
+
+    with_fleet(check)
+
+
 def test_what_a_dead_front_held_is_let_go(monkeypatch):
     async def check(fleet: Fleet, coordinator: SceneCoordinator) -> None:
         await coordinator.hold_later("dead", "x")
