@@ -433,6 +433,7 @@ def test_a_job_holds_in_its_replica_what_it_was_promised(monkeypatch):
         await replica.release("kept", ("x",))
         assert engine.cancelled == ["t"]
         assert engine.released == ["own", "own"]
+        await replica.drop(("x",))  # while it is used, by a front that was taken to have ended: it stays
         engine.missing = True
         late = anext(replica.localize(task, promised))  # pyright: ignore[reportArgumentType]
         with pytest.raises(SceneNotReady):
@@ -482,6 +483,11 @@ class FakeEngine:
 
     def cancel(self, task_id: str) -> None:
         self.cancelled.append(task_id)
+
+    def unload(self, scene_id: str) -> None: ...
+
+    def remove(self, scene_id: str) -> None:
+        raise SceneInUse("a job uses it.", where="scene")
 
 
 def test_fronts_that_start_at_once_share_replicas(monkeypatch):

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 from typing import Any
 
-from service.errors import SceneNotFound
+from service.errors import SceneInUse, SceneNotFound
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.engine import EngineAnswer, HeldScenes, LocalizeTask
 from service.jobs.model import JobRecord
@@ -78,7 +78,8 @@ class Replica:
 
     def _drop(self, ids: Sequence[str]) -> None:
         for scene_id in ids:
-            with suppress(SceneNotFound):
+            # In use: by a front that was taken to have ended. Then it goes once that lets go.
+            with suppress(SceneNotFound, SceneInUse):
                 self._engine.unload(scene_id)
                 self._engine.remove(scene_id)
 
