@@ -31,7 +31,7 @@ from service.jobs.model import (
     Retention,
     StoredJob,
 )
-from service.jobs.store import JobWatch
+from service.jobs.store import JobWatch, require_share
 from service.scene_formats import load_scene
 from service.scene_manager.anchor_store import Anchor
 from service.scene_manager.scene_store import check_scene_id
@@ -59,10 +59,12 @@ class MemoryJobStore:
     def now(self) -> float:
         return time.time()
 
-    def accept(self, job: NewJob) -> StoredJob:
+    def accept(self, job: NewJob, most_queued: int | None = None) -> StoredJob:
         with self._lock:
             if known := self.find_by_key(job.client, job.idempotency_key, job.digest):
                 return known
+            if most_queued is not None:
+                require_share(self.count("queued", job.client), most_queued)
             given = {field.name: getattr(job, field.name) for field in fields(NewJob)}
             fresh: dict[str, Any] = {
                 **{"number": len(self._rows) + 1, "state": "queued", "attempt": 0, "lost": 0, "cancelled": False},

@@ -20,7 +20,7 @@ from stand_ins import make_scene
 from test_leases import CountingObserver, order
 from test_store_contracts import FAILURE, NONE, new_job, record
 
-from service.errors import PhotoGone, StorageFailed
+from service.errors import PhotoGone, QueueFull, StorageFailed
 from service.jobs.config import JobsConfig
 from service.jobs.embedded_engine import EmbeddedEngine, EngineConfig
 from service.jobs.model import Batch, StoredJob
@@ -222,6 +222,32 @@ def test_of_two_requests_with_one_key_at_two_fronts_one_is_stored(postgres, addr
         assert len(accepted) == 2
         assert len(set(accepted)) == 1
     assert len(stores[0].ids()) == 20
+    for store in stores:
+        store.close()
+
+
+def test_a_clients_share_holds_at_two_fronts_at_once(postgres, address):
+    from service.jobs.postgres_database import PostgresDatabase
+    from service.jobs.postgres_store import PostgresJobStore
+
+    stores = [PostgresJobStore(PostgresDatabase(address)) for _ in range(2)]
+    for number in range(20):
+        client, barrier, refused = f"client {number}", threading.Barrier(2), []
+
+        def send(store, name, client=client, barrier=barrier, refused=refused) -> None:
+            barrier.wait()
+            try:
+                store.accept(new_job(name, client=client), 1)
+            except QueueFull:
+                refused.append(name)
+
+        threads = [threading.Thread(target=send, args=(s, f"{number}.{k}")) for k, s in enumerate(stores)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert len(refused) == 1
+        assert stores[0].count("queued", client) == 1
     for store in stores:
         store.close()
 

@@ -264,13 +264,13 @@ def test_a_full_disk_leaves_neither_a_place_nor_a_photo(taking):
     assert taking.names() == ["reserved", "disk", "place back", "photo deleted", "released"]
 
 
-def test_a_clients_share_is_counted_before_its_job_is_stored(taking):
+def test_a_job_beyond_its_clients_share_leaves_neither_a_place_nor_a_photo(taking):
     limited = replace(ORDER, most_queued=1)
     assert taking.accept(limited).id == "new"
     taking.next = "second"
     with pytest.raises(QueueFull, match="1 jobs of this key, its share"):
         taking.accept(replace(limited, idempotency_key=None))
-    assert taking.names()[3:] == ["released"]
+    assert taking.names()[3:] == ["reserved", "photo", "place back", "photo deleted", "released"]
     assert taking.accept(replace(limited, idempotency_key=None, most_queued=2)).id == "second"
 
 

@@ -21,6 +21,7 @@ from service.errors import (
     InvalidRequest,
     JobNotFound,
     PhotoGone,
+    QueueFull,
     SceneError,
     SceneExists,
     SceneNotFound,
@@ -210,6 +211,31 @@ def test_many_threads_agree_on_one_winner(store):
     for thread in threads:
         thread.join()
     assert won == [1]
+
+
+def test_of_jobs_that_are_accepted_at_once_as_many_are_stored_as_may_wait(store):
+    store.accept(new_job("of another", client="other"))
+    refused: list[str] = []
+    barrier = threading.Barrier(8)
+
+    def send(name: str) -> None:
+        barrier.wait()
+        try:
+            store.accept(new_job(name, idempotency_key=name), 3)
+        except QueueFull:
+            refused.append(name)
+
+    threads = [threading.Thread(target=send, args=(name,)) for name in "abcdefgh"]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(refused) == 5
+    (first, *_) = accepted = [name for name in "abcdefgh" if name not in refused]
+    assert store.count("queued", "c") == len(accepted) == 3
+    assert store.accept(new_job("again", idempotency_key=first), 3).id == first
+    store.claim(store.get(first), math.inf)
+    assert store.accept(new_job("more"), 3).id == "more"
 
 
 def test_keys_belong_to_their_client(store):

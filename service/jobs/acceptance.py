@@ -5,7 +5,6 @@ order -> known by its key? -> scenes held -> photo decoded -> place reserved -> 
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,7 +19,7 @@ from service.jobs.photo_store import PhotoStore
 from service.jobs.queue import JobQueue
 from service.jobs.read_photo import Recall, read_photo
 from service.jobs.scene_wait import SceneWait
-from service.jobs.store import JobStore
+from service.jobs.store import JobStore, require_share
 from service.jobs.worker import Worker
 from service.lenses.lens_memory import LensMemory
 from service.scene_manager.status import AUTO
@@ -43,7 +42,6 @@ class Acceptance:
         self._config, self._engine, self._lenses = config, engine, lenses
         self._store, self._photos = store, photos
         self._queue, self._scene_wait, self._worker = queue, scene_wait, worker
-        self._sharing = threading.Lock()
 
     def require_capacity(self, client: str, most: int | None, key: str | None) -> None:
         """Raises QueueFull if a new job would be refused; a repeated one never is.
@@ -54,7 +52,8 @@ class Acceptance:
             return
         if self._queue.full():
             raise QueueFull(f"the queue is full: {self._queue.waiting()} jobs.", hint="Try again later.")
-        self._require_share(client, most)
+        if most is not None:
+            require_share(self._store.count("queued", client), most)
 
     def accept(self, order: JobOrder) -> StoredJob:
         """Take a job; it is on disk when this returns.
@@ -80,7 +79,7 @@ class Acceptance:
                 lens = LensUse(order.lens_owner, photo.recalled)
                 order = replace(order, spec=replace(order.spec, lens=lens))
             new = new_job(order, scene, photo)
-            job = self._stored_within_share(new, order)
+            job = self._stored(new, order)
         # Also on KeyboardInterrupt: scenes that are never released could not be unloaded.
         except BaseException:
             self._release(held)
@@ -119,28 +118,18 @@ class Acceptance:
             return None
         return partial(self._lenses.recall, order.lens_owner, order.spec.camera_id)
 
-    def _stored_within_share(self, new: NewJob, order: JobOrder) -> StoredJob:
-        """Put a job on disk unless its client has as many waiting as it may. Raises QueueFull, StorageFailed."""
-        if order.most_queued is None:
-            return self._stored(new, order.photo)
-        # One at a time: two jobs that are accepted at once must not both take the last place.
-        with self._sharing:
-            self._require_share(order.client, order.most_queued)
-            return self._stored(new, order.photo)
+    def _stored(self, new: NewJob, order: JobOrder) -> StoredJob:
+        """Put a job on disk, with its place in the queue reserved; or return the one that has its key.
 
-    def _require_share(self, client: str, most: int | None) -> None:
-        if most is not None and (waiting := self._store.count("queued", client)) >= most:
-            raise QueueFull(f"the queue is full: {waiting} jobs of this key, its share.", hint="Try again later.")
-
-    def _stored(self, new: NewJob, photo: bytes) -> StoredJob:
-        """Put a job on disk, with its place in the queue reserved; or return the one that has its key."""
+        Raises QueueFull, also where its client has as many waiting as it may, and StorageFailed.
+        """
         # Reserved first: once the job is on disk it can no longer be refused.
         self._queue.reserve()
         taken = False
         try:
             # The photo first: a stored job without its photo could not be run after a crash.
-            self._photos.accept(new.id, photo)
-            job = self._store.accept(new)
+            self._photos.accept(new.id, order.photo)
+            job = self._store.accept(new, order.most_queued)
             taken = job.id == new.id
             return job
         except StorageFailed as error:

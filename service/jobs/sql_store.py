@@ -31,7 +31,7 @@ from service.jobs.model import (
     StoredJob,
 )
 from service.jobs.sql_database import Connection, SqlDatabase
-from service.jobs.store import JobWatch
+from service.jobs.store import JobWatch, require_share
 from service.results import Status
 
 _ENDED_SQL = ", ".join(f"'{state}'" for state in ENDED)
@@ -58,13 +58,18 @@ class SqlJobStore:
 
     # ------------------------------------------------------------------ the life of a job
 
-    def accept(self, job: NewJob) -> StoredJob:
+    def accept(self, job: NewJob, most_queued: int | None = None) -> StoredJob:
         row = f"INSERT INTO jobs ({', '.join(_NEW_COLUMNS)}, state) VALUES ({_marks(len(_NEW_COLUMNS))}, 'queued') "
         # Where another process has stored the same key since it was looked up.
         row += "ON CONFLICT DO NOTHING"
         with self._database.transaction() as writer:
+            if most_queued is not None:
+                # Of jobs that are accepted at once, at any front, only one takes the last place.
+                self._database.lock(writer, f"share of {job.client}")
             known = _find_by_key(writer, job.client, job.idempotency_key, job.digest)
             if known is None:
+                if most_queued is not None:
+                    require_share(_count(writer, "queued", job.client), most_queued)
                 values = [getattr(job, name) for name in _NEW_COLUMNS]
                 coded = zip(_NEW_COLUMNS, values, strict=True)
                 writer.execute(row, [encode(value) if name in _CODED else value for name, value in coded])
@@ -224,9 +229,8 @@ class SqlJobStore:
             return _select(reader, f"{where}ORDER BY number DESC LIMIT ?", *given.values(), limit)
 
     def count(self, state: JobState, client: str | None = None) -> int:
-        where, values = ("state = ?", [state]) if client is None else ("state = ? AND client = ?", [state, client])
         with self._database.reading() as reader:
-            return reader.execute(f"SELECT count(*) FROM jobs WHERE {where}", values).fetchone()[0]
+            return _count(reader, state, client)
 
     def records(self, job_id: str, first: int = 0) -> list[JobRecord]:
         with self._database.reading() as reader:
@@ -286,6 +290,11 @@ def _marks(count: int) -> str:
 def _select(connection: Connection, where: str, *values: object) -> list[StoredJob]:
     rows = connection.execute(f"SELECT {', '.join(_JOB_COLUMNS)} FROM jobs {where}", values).fetchall()
     return [_job(row) for row in rows]
+
+
+def _count(connection: Connection, state: JobState, client: str | None) -> int:
+    where, values = ("state = ?", [state]) if client is None else ("state = ? AND client = ?", [state, client])
+    return connection.execute(f"SELECT count(*) FROM jobs WHERE {where}", values).fetchone()[0]
 
 
 def _find_by_key(connection: Connection, client: str, key: str | None, digest: str) -> StoredJob | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
-from service.errors import Failure
+from service.errors import Failure, QueueFull
 from service.jobs.model import Batch, Ending, JobFilter, JobRecord, JobResult, JobState, NewJob, Retention, StoredJob
 
 
@@ -44,8 +44,12 @@ class JobStore(Protocol):
         """Return the time by the clock that leases go by, in seconds since 1970."""
         ...
 
-    def accept(self, job: NewJob) -> StoredJob:
-        """Store a new job, or return the one that has its idempotency key. Raises IdempotencyConflict."""
+    def accept(self, job: NewJob, most_queued: int | None = None) -> StoredJob:
+        """Store a new job, or return the one that has its idempotency key.
+
+        `most_queued`: how many jobs of the client may wait at once; None: as many as there are. Raises
+        IdempotencyConflict, QueueFull.
+        """
         ...
 
     def find_by_key(self, client: str, key: str | None, digest: str) -> StoredJob | None:
@@ -146,3 +150,9 @@ class JobStore(Protocol):
     def close(self) -> None:
         """Close files and connections; nothing is called afterwards."""
         ...
+
+
+def require_share(waiting: int, most: int) -> None:
+    """Raise QueueFull if a client has as many jobs waiting as it may."""
+    if waiting >= most:
+        raise QueueFull(f"the queue is full: {waiting} jobs of this key, its share.", hint="Try again later.")
