@@ -151,7 +151,7 @@ def test_a_broken_file_of_keys_stops_the_start(tmp_path, text):
         KeyRing(tmp_path / "keys.json")
 
 
-def test_listening_beyond_this_machine_needs_keys_or_a_word():
+def test_listening_beyond_this_machine_needs_keys_or_a_word(stepping):
     with pytest.raises(InvalidRequest, match="everybody"):
         create_app(settings(host="0.0.0.0", keys_file=None))
     create_app(settings(host="0.0.0.0", keys_file=None, open=True))
