@@ -434,9 +434,12 @@ def test_a_job_holds_in_its_replica_what_it_was_promised(monkeypatch):
         assert engine.cancelled == ["t"]
         assert engine.released == ["own", "own"]
         await replica.drop(("x",))  # while it is used, by a front that was taken to have ended: it stays
-        engine.missing = True
-        late = anext(replica.localize(task, promised))  # pyright: ignore[reportArgumentType]
-        with pytest.raises(SceneNotReady):
+        engine.loads = True  # again, since its files have changed
+        late = asyncio.ensure_future(anext(replica.localize(task, promised)))  # pyright: ignore[reportArgumentType]
+        await asyncio.sleep(0.02)
+        assert not late.done()
+        engine.take(CorruptScene("it is torn.", where="scene"))
+        with pytest.raises(CorruptScene):
             await late
         assert replica._held == {}
 
@@ -455,7 +458,7 @@ class FakeEngine:
     """Its jobs have one record, and end when they may."""
 
     def __init__(self) -> None:
-        self.missing = False
+        self.loads = False
         self.released: list[str] = []
         self.cancelled: list[str] = []
         self.go_on = threading.Event()
@@ -465,13 +468,10 @@ class FakeEngine:
     def scenes(self) -> list[SceneStatus]:
         return []
 
-    def hold(self, asked: str) -> HeldScenes:
-        if self.missing:
-            raise SceneNotReady("it is loading.", where="scene")
-        return HeldScenes("own", (asked,), (0.0, 0.0, 0.0))
-
     def hold_later(self, asked: str, take) -> None:
-        take(self.hold(asked))
+        self.take = take
+        if not self.loads:
+            take(HeldScenes("own", (asked,), (0.0, 0.0, 0.0)))
 
     def localize(self, task: FakeTask, on_record) -> str:
         on_record("first")

@@ -9,9 +9,9 @@ import asyncio
 import copy
 import os
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field, replace
 from queue import SimpleQueue
 from typing import Any
@@ -106,9 +106,7 @@ class Replica:
             if scene.id not in known:
                 self._engine.add(scene)
             self._engine.load(scene.id)
-        loop, answer = asyncio.get_running_loop(), asyncio.Future()
-        self._engine.hold_later(_asked(ids), lambda found: loop.call_soon_threadsafe(answer.set_result, found))
-        found = await answer
+        found = await self._held_here(ids)
         if isinstance(found, Exception):
             return _portable(found), self._statuses(ids)
         self._held[token] = _Held(found.token)
@@ -117,14 +115,25 @@ class Replica:
     def _statuses(self, ids: Sequence[str]) -> list[SceneStatus]:
         return [status for status in self._engine.scenes() if status.id in ids]
 
-    @contextmanager
-    def _using(self, scenes: HeldScenes, task_id: str) -> Iterator[str]:
+    async def _held_here(self, ids: Sequence[str]) -> HeldScenes | Exception:
+        """Return scenes as soon as all are in memory, by the engine's token; or why they won't be."""
+        loop, answer = asyncio.get_running_loop(), asyncio.Future()
+        asked = ids[0] if len(ids) == 1 else tuple(ids)
+        self._engine.hold_later(asked, lambda found: loop.call_soon_threadsafe(answer.set_result, found))
+        return await answer
+
+    @asynccontextmanager
+    async def _using(self, scenes: HeldScenes, task_id: str) -> AsyncIterator[str]:
         """Hold scenes until an attempt ends; give the engine's token. Raises SceneError.
 
-        Of scenes that are in memory the coordinator tells only the front, which saves a job the way.
+        Of scenes that are in memory the coordinator tells only the front, which saves a job the way. They are waited
+        for nevertheless: the engine loads a scene again whose files have changed.
         """
         if scenes.token not in self._held:
-            self._held[scenes.token] = _Held(self._engine.hold(_asked(scenes.ids)).token)
+            found = await self._held_here(scenes.ids)
+            if isinstance(found, Exception):
+                raise _portable(found)
+            self._held[scenes.token] = _Held(found.token)
         held = self._held[scenes.token]
         held.attempts.add(task_id)
         try:
@@ -157,7 +166,7 @@ class Replica:
         The job's thread doesn't wake this one at each record, which would take 1 ms of the job.
         """
         records: list[Record] = []
-        with self._using(scenes, task.id) as token:
+        async with self._using(scenes, task.id) as token:
             own = replace(task, held=token)
             job = _on_thread(lambda: self._engine.localize(own, lambda *record: records.append(record)))
             ended = False
@@ -180,7 +189,7 @@ class Replica:
             self._engine.live(own, next_frame, lambda answer: put(("record", answer)))
 
         try:
-            with self._using(scenes, session) as token:
+            async with self._using(scenes, session) as token:
                 own = replace(task, held=token)
                 async for message in _streamed(work):
                     yield message
@@ -198,10 +207,6 @@ class Replica:
             return await asyncio.to_thread(function, *arguments)
         except Exception as error:
             raise _portable(error) from None
-
-
-def _asked(ids: Sequence[str]) -> str | tuple[str, ...]:
-    return ids[0] if len(ids) == 1 else tuple(ids)
 
 
 async def _streamed(work: Callable[[Callable[[tuple[str, Any]], None]], Any]) -> AsyncIterator[tuple[str, Any]]:
