@@ -404,8 +404,8 @@ def test_letting_go_of_scenes_ends_what_runs_with_them(replica):
     async def run() -> None:
         await replica.hold("token", [], [], ("x",))
         replica._held["token"].attempts.add("j.1")
-        await replica.release("token")
-        await replica.release("other")  # isn't known: without effect
+        assert [status.id for status in await replica.release("token", ("w",))] == ["w"]
+        assert await replica.release("other", ("y",)) == []  # isn't known: without effect
         await replica.cancel("k.1")
 
     asyncio.run(run())
@@ -424,12 +424,12 @@ def test_attempts_are_noted_while_they_run(replica):
     async def run() -> list[Any]:
         await replica.hold("token", [], [], ("x",))
         task = HeldTask("token", "j.1")
-        return [message async for message in replica.localize(task)]
+        return [message async for message in replica.localize(task, held("token"))]
 
     replica._engine.localize = localize
     assert asyncio.run(run()) == [([("a record", "a photo")], "the answer")]
     assert noted == [("own", {"j.1"})]
-    assert replica._held["token"].attempts == set()
+    assert (replica._held, replica._engine.released) == ({}, ["own"])
 
 
 def test_a_live_session_gets_its_frames_and_ends(replica):
@@ -440,7 +440,7 @@ def test_a_live_session_gets_its_frames_and_ends(replica):
     async def run() -> list[Any]:
         await replica.hold("token", [], [], ("x",))
         heard, left = [], ["a", "b", None]
-        async for message in replica.live("session", HeldTask("token")):
+        async for message in replica.live("session", HeldTask("token"), held("token")):
             heard.append(message)
             if message[0] == "frame?":
                 await replica.frame("session", left.pop(0))
@@ -453,6 +453,10 @@ def test_a_live_session_gets_its_frames_and_ends(replica):
         asked, ("record", "answer to a with own"), asked, ("record", "answer to b with own"), asked, ("answer", None)
     ]  # fmt: skip
     assert replica._frames == {}
+
+
+def held(token: str) -> HeldScenes:
+    return HeldScenes(token, ("x",), (0.0, 0.0, 0.0))
 
 
 @dataclass
