@@ -129,7 +129,8 @@ class Replica:
         Of scenes that are in memory the coordinator tells only the front, which saves a job the way. They are waited
         for nevertheless: the engine loads a scene again whose files have changed.
         """
-        if scenes.token not in self._held:
+        is_told = scenes.token in self._held
+        if not is_told:
             found = await self._held_here(scenes.ids)
             if isinstance(found, Exception):
                 raise _portable(found)
@@ -140,7 +141,7 @@ class Replica:
             yield held.own
         finally:
             held.attempts.discard(task_id)
-            if not held.attempts:  # here, too: the release may have come before the attempt
+            if not is_told:  # here, too: the release may have come before the attempt
                 self._let_go(scenes.token)
 
     async def release(self, token: str, ids: Sequence[str]) -> list[SceneStatus]:
